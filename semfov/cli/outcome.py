@@ -66,19 +66,6 @@ def picture_outcome(
         picture = opened if record.how == "windows" else None
         episode = record.page_data(picture, name=name, settings=settings, boxes=source.boxes)
     figures = _draw_episode(record, source.boxes, drawings)
-    return PictureOutcome(
-        ended="looked at" if record.decision is None else record.decision.outcome,
-        text=f"{text}\n{looks_text(record)}" if options.looks else text,
-        row=row,
-        episode=episode,
-        names=tuple(figures),
-        figures=figures,
-        files=_cut_files(record, source, options),
-    )
-
-
-def _cut_files(record: GazeRecord, source: PictureSource, options: PictureOptions) -> dict[str, bytes]:
-    """Labels in YOLO's format, and a JPEG of each object; a picture keeps its place in the folder that was named."""
     files = {}
     if options.labels is not None:
         files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
@@ -87,7 +74,15 @@ def _cut_files(record: GazeRecord, source: PictureSource, options: PictureOption
         for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
             folder = options.crops / plain_name(record.classes[label]) / source.place.parent
             files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
-    return files
+    return PictureOutcome(
+        ended="looked at" if record.decision is None else record.decision.outcome,
+        text=f"{text}\n{looks_text(record)}" if options.looks else text,
+        row=row,
+        episode=episode,
+        names=tuple(figures),
+        figures=figures,
+        files=files,
+    )
 
 
 def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

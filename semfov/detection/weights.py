@@ -237,7 +237,12 @@ def fetch(name: str) -> Path:
         try:
             with replacing(path) as temporary:
                 source.fetch(temporary)
-                _verify(temporary, entry)
+                size = temporary.stat().st_size
+                if size != entry.size:
+                    raise DataError(f"{entry.file}: expected {entry.size} bytes, got {size}")
+                digest = sha256(temporary)
+                if digest != entry.sha256:
+                    raise DataError(f"{entry.file}: expected sha256 {entry.sha256}, got {digest}")
         except DataError as error:
             faults.append(str(error))
         else:
@@ -246,12 +251,3 @@ def fetch(name: str) -> Path:
         f"cannot fetch the weights {name!r} ({'; '.join(faults)}); put {entry.file} ({entry.size} bytes, sha256 "
         f"{entry.sha256}) into {path.parent}, or give its path as weights={'; ' * bool(entry.remark)}{entry.remark}"
     )
-
-
-def _verify(path: Path, entry: _Weights) -> None:
-    size = path.stat().st_size
-    if size != entry.size:
-        raise DataError(f"{entry.file}: expected {entry.size} bytes, got {size}")
-    digest = sha256(path)
-    if digest != entry.sha256:
-        raise DataError(f"{entry.file}: expected sha256 {entry.sha256}, got {digest}")

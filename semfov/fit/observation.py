@@ -119,7 +119,16 @@ def fit_fom(config: FitObservationConfig) -> None:
         model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
-    written = _write_report(config, model, _fit_all(config, sampler, statistics, model), samples[held_out])
+    edges, classes = config.edges, sampler.eye.detector.classes
+    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
+    methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
+    for method in methods:
+        models[f"Dirichlet, {method}"] = _fit_published(config, sampler, statistics, method)
+    models["Dirichlet with class prior"] = _fit_published(config, sampler, statistics, "newton", prior=True)
+    models["the same, tempered 0.1"] = _fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
+    if config.method == "discriminative":
+        models["discriminative"] = model
+    written = _write_report(config, model, models, samples[held_out])
     print("written:")
     for file in [path, *written]:
         print(f"  {file}")
@@ -178,22 +187,6 @@ def _statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Itera
     for samples in shards:
         statistics.update(samples.scores, (samples.labels, model.level(samples.distance)))
     return statistics
-
-
-def _fit_all(
-    config: FitObservationConfig, sampler: _Looker, statistics: DirichletStatistics, model: FovealObservationModel
-) -> dict[str, FovealObservationModel]:
-    """Fit the models that the report compares: raw scores, the published estimators, and the requested model."""
-    edges, classes = config.edges, sampler.eye.detector.classes
-    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
-    methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
-    for method in methods:
-        models[f"Dirichlet, {method}"] = _fit_published(config, sampler, statistics, method)
-    models["Dirichlet with class prior"] = _fit_published(config, sampler, statistics, "newton", prior=True)
-    models["the same, tempered 0.1"] = _fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
-    if config.method == "discriminative":
-        models["discriminative"] = model
-    return models
 
 
 def _count_misses(
