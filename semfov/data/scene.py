@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -222,35 +223,42 @@ class ComposedScenes(ABC):
         return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)
 
 
-class Crowded:
-    """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
+class ChosenScenes:
+    """Scenes that are chosen from one or more sets of the same classes: each a set, and the position in it."""
 
-    def __init__(self, scenes: Scenes, share: float) -> None:
-        check(0 < share <= 1, "share", "above 0 and at most 1", share)
-        check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
-        counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
-        order = sorted(range(len(scenes)), key=lambda index: -counts[index])
-        self._scenes, self._chosen = scenes, sorted(order[: math.ceil(share * len(scenes))])
-        self.classes = scenes.classes
-        every = scenes.ids
-        self.ids: list[int] | list[str] = [every[index] for index in self._chosen]  # type: ignore[assignment]
-        self.fingerprint = json_sha256([scenes.fingerprint, self.ids])
+    def __init__(self, chosen: Sequence[tuple[Scenes, int]], ids: list[int] | list[str], fingerprint: str) -> None:
+        self._chosen, self.classes, self.ids, self.fingerprint = chosen, chosen[0][0].classes, ids, fingerprint
 
     def __len__(self) -> int:
         return len(self._chosen)
 
     def __getitem__(self, index: int) -> Scene:
         """Decode a scene."""
-        return self._scenes[self._chosen[index]]
+        scenes, place = self._chosen[index]
+        return scenes[place]
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a scene, without decoding its image."""
-        return self._scenes.annotation(self._chosen[index])
+        scenes, place = self._chosen[index]
+        return scenes.annotation(place)
 
     def targets(self, index: int) -> list[int]:
         """List the classes of a scene that may be searched for."""
-        return self._scenes.targets(self._chosen[index])
+        scenes, place = self._chosen[index]
+        return scenes.targets(place)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a scene depend on."""
-        return self._scenes.digest(self._chosen[index])
+        scenes, place = self._chosen[index]
+        return scenes.digest(place)
+
+
+def crowded(scenes: Scenes, share: float) -> ChosenScenes:
+    """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
+    check(0 < share <= 1, "share", "above 0 and at most 1", share)
+    check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
+    counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
+    order = sorted(range(len(scenes)), key=lambda index: -counts[index])
+    chosen = sorted(order[: math.ceil(share * len(scenes))])
+    ids: list[int] | list[str] = [scenes.ids[index] for index in chosen]  # type: ignore[assignment]
+    return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))

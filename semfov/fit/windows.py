@@ -14,7 +14,7 @@ import torch
 
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Crowded, Scenes
+from semfov.data.scene import Scenes, crowded
 from semfov.errors import check
 from semfov.fit.outputs import training_of, write_outputs
 from semfov.fit.photographs import fit_photographs
@@ -174,8 +174,8 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
         "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
-        "crowded": Mosaics(Crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
-        "judged crowded": Mosaics(Crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
+        "crowded": Mosaics(crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
+        "judged crowded": Mosaics(crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
     }
 
 

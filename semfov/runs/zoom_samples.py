@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scene, Scenes
+from semfov.data.scene import ChosenScenes, Scenes
 from semfov.observation.matching import match
 from semfov.runs.looks import one_thread
 from semfov.runs.samples import Sampler, Samples
@@ -25,37 +25,6 @@ COLUMNS, ROWS, TILE = 8, 6, (480, 360)
 
 Such a mosaic is so large that the overview reduces it by more than three octaves.
 """
-
-
-class _HeldOutMosaics:
-    """Mosaics of which every n-th is composed of photographs that no other mosaic shows."""
-
-    def __init__(self, training: Mosaics, held: Mosaics, every: int) -> None:
-        self._training, self._held, self._every = training, held, every
-        self.classes, self.ids = training.classes, list(training.ids)
-        self.fingerprint = f"{training.fingerprint} {held.fingerprint} {every}"
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def _of(self, index: int) -> Mosaics:
-        return self._training if index % self._every else self._held
-
-    def __getitem__(self, index: int) -> Scene:
-        """Compose a mosaic."""
-        return self._of(index)[index]
-
-    def annotation(self, index: int) -> Annotation:
-        """The objects of a mosaic."""
-        return self._of(index).annotation(index)
-
-    def targets(self, index: int) -> list[int]:
-        """The classes of a mosaic that may be searched for."""
-        return self._of(index).targets(index)
-
-    def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a mosaic depend on."""
-        return self._of(index).digest(index)
 
 
 class MosaicSampler(Sampler):
@@ -77,7 +46,8 @@ class MosaicSampler(Sampler):
         near, far = (
             Mosaics(some, COLUMNS, ROWS, tile=TILE, count=config.mosaics, seed=config.seed) for some in (training, held)
         )
-        return eye, _HeldOutMosaics(near, far, config.holdout)
+        chosen = [(near if index % config.holdout else far, index) for index in range(len(near))]
+        return eye, ChosenScenes(chosen, near.ids, f"{near.fingerprint} {far.fingerprint} {config.holdout}")
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
         """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
