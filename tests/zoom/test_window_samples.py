@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.observation import FitObservationConfig, _count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
-from semfov.runs.zoom_samples import MosaicSampler, _choose_windows, _HeldOutMosaics
+from semfov.runs.setup import split_photographs
+from semfov.runs.zoom_samples import MosaicSampler, _choose_windows
 from semfov.zoom.lattice import Lattice
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
@@ -31,17 +31,6 @@ def test_windows_are_of_all_magnifications():
     assert not torch.equal(windows, _choose_windows(LATTICE, 5, 1, "scene"))
 
 
-@pytest.mark.slow
-def test_every_nth_mosaic_is_made_of_held_out_photographs():
-    kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
-    both = _HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
-    assert len(both) == 6
-    for index in range(6):
-        own = Mosaics(held if index % 3 == 0 else kept, 2, 2, tile=(64, 48), count=6)
-        assert both.digest(index) == own.digest(index)
-        assert torch.equal(both[index].image, own[index].image)
-
-
 @pytest.fixture
 def sampler(detector, monkeypatch, tmp_path):
     detector.classes = ("person", "cat", "cup")
@@ -50,6 +39,16 @@ def sampler(detector, monkeypatch, tmp_path):
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
     config = FitObservationConfig(data=data, fixations=2, shard=1, mosaics=2, holdout=2)
     return MosaicSampler(config, tmp_path)
+
+
+def test_every_nth_mosaic_is_made_of_held_out_photographs(sampler):
+    config, classes = sampler.config, sampler.eye.detector.classes
+    training, held = split_photographs(config.data, classes, config.holdout)
+    assert len(sampler.scenes) == 2
+    for index, photographs in enumerate((held, training)):
+        own = Mosaics(photographs, 8, 6, tile=(160, 120), count=2, seed=config.seed)
+        assert sampler.scenes.digest(index) == own.digest(index)
+        assert torch.equal(sampler.scenes.annotation(index).boxes, own.annotation(index).boxes)
 
 
 @pytest.mark.slow
