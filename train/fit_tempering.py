@@ -12,10 +12,59 @@ fixation hits the target, on photographs to choose τ by and on held-out photogr
 Use the best exponent with `--belief.tempering τ`, or as the `tempering` of one policy.
 """
 
+import json
 import sys
+from typing import cast
 
-from semfov.fit.tempering import FitTemperingConfig, fit_tempering
+from semfov.belief.observers import Semantic
+from semfov.errors import check
+from semfov.eye import Eye
+from semfov.fit.outputs import write_outputs
+from semfov.fit.tempering import FitTemperingConfig, hit_rates, mean_hits
+from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
+from semfov.runs.samples import Sampler, Samples, collect_samples
+from semfov.runs.setup import make_observation
+from semfov.runs.tables import table
+
+
+def fit_tempering(config: FitTemperingConfig) -> None:
+    """Collect looks, try every exponent, and write the report."""
+    check(len(config.exponents) > 0, "exponents", "at least one value", "none")
+    sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
+    samples = sampler.all()
+    model = make_observation(None, cast(Eye, sampler.eye)) if config.calibrated else None
+    hits = {tempering: _measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
+    text = _tempering_report(hits)
+    write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
+
+
+def _measure(
+    config: FitTemperingConfig,
+    sampler: Sampler,
+    samples: Samples,
+    model: FovealObservationModel | None,
+    tempering: float,
+) -> dict[str, float]:
+    """Measure one exponent: the share of next fixations that hit the target, as means over photographs."""
+    observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
+    return mean_hits(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
+
+
+def _tempering_report(hits: dict[float, dict[str, float]]) -> str:
+    """Report the hit rates of every exponent and the best exponent as Markdown."""
+    best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
+    rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
+    return "\n".join(
+        [
+            f"Best exponent on the photographs to choose by: {best:g}. The table shows the percentage of next "
+            "fixations that hit the target, as a mean over all numbers of looks and over photographs.",
+            "",
+            *table([["tempering", "photographs to choose by", "held-out photographs"], *rows]),
+            "",
+        ]
+    )
+
 
 main = command(fit_tempering, FitTemperingConfig, __doc__)
 

@@ -12,10 +12,55 @@ decisions and to choose their threshold. The folder `out` gets the model (`<name
 looks are stored, photograph by photograph, in the folder `cache`: the same command continues an interrupted fit.
 """
 
+import json
 import sys
+from dataclasses import replace
 
-from semfov.fit.verification import FitVerificationConfig, fit_verification
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.errors import DataError
+from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.searches import open_photographs
+from semfov.fit.verification import FitVerificationConfig, fit_in_folds, verification_report
 from semfov.runs.command import command
+from semfov.runs.scene_run import store_folder
+from semfov.runs.setup import make_eye, make_learned, make_scenes
+from semfov.runs.store import cell_store
+
+
+def fit_verification(config: FitVerificationConfig) -> None:
+    """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
+    eye = make_eye(config.detector, config.sensor)
+    evidence = make_learned(TargetEvidence, config.target_model, eye)
+    scenes = make_scenes(config.data, eye.detector.classes)
+    left_out = set()
+    if config.fitted is not None:
+        data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
+        ids = make_scenes(data, eye.detector.classes).ids
+        holdout = evidence.metadata.get("training", {}).get("holdout", 5)
+        left_out = {name for number, name in enumerate(ids) if number % holdout}
+    chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
+    if len(chosen) < config.folds:
+        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
+    size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
+    store = cell_store(store_folder(config.cache) / "searches", eye.settings(), *size, components)
+    photographs = open_photographs(
+        eye,
+        scenes,
+        chosen,
+        size,
+        classes=config.classes,
+        absent=config.absent,
+        max_area=config.max_target_area,
+        seed=config.seed,
+        store=store,
+    )
+    fitted = fit_in_folds(photographs, evidence, config)
+    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
+    path = model_path(config, eye.detector.name)
+    fitted.model.save(path)
+    text, figures = verification_report(fitted, f"{len(photographs)} photographs")
+    write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
+
 
 main = command(fit_verification, FitVerificationConfig, __doc__)
 

@@ -11,10 +11,125 @@ and a report that evaluates it on mosaics of held-out photographs. If the lookin
 continue.
 """
 
+import json
 import sys
+from collections.abc import Mapping
+from typing import get_args
 
-from semfov.fit.windows import FitZoomConfig, fit_zoom
+import torch
+
+from semfov.errors import check
+from semfov.fit.outputs import write_outputs
+from semfov.fit.photographs import fit_photographs
+from semfov.fit.windows import (
+    FitZoomConfig,
+    RefitPart,
+    _figures_of,
+    fit_closer_looks,
+    fit_counts,
+    fit_decision,
+    fit_looks,
+    judge_windows,
+    look_at_all,
+    make_kinds,
+    make_mosaics,
+    make_store,
+    make_window_eye,
+    survey_again,
+    training_looks,
+)
+from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
+from semfov.fit.windows_kinds import PICTURE_KINDS
+from semfov.io.files import inside
 from semfov.runs.command import command
+from semfov.runs.setup import make_scenes
+from semfov.runs.tables import table
+from semfov.zoom.evidence import GlimpseEvidence
+from train.zoom_choice import choose_foresight, choose_patience
+
+_PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
+"""Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
+
+_FURTHER = 1e-3
+"""Highest learning rate of a prediction that is fitted further."""
+
+_JUDGED = ("judged", "judged far", "judged crowded")
+"""Mosaics of held-out photographs on which foresight is chosen."""
+
+
+def fit_zoom(config: FitZoomConfig) -> None:
+    """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
+    eye = make_window_eye(config)
+    mosaics = make_mosaics(config, eye.detector.classes)
+    pictures = {**mosaics, **make_kinds(config, eye.detector.classes)}
+    store = make_store(config, eye)
+    lines: list[str] = []
+    figures = "{}"
+    check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
+    refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
+    looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
+    looked += ["crowded", "judged crowded"] * ("survey" in refit)
+    looked += [*config.kinds] * ("presence" in refit)
+    looked += [f"judged {kind}" for kind in PICTURE_KINDS] * ("presence" in refit and config.evidence is not None)
+    examples = look_at_all(config, eye, pictures, store, looked)
+    if config.evidence is None:
+        model = fit_looks(config, eye, mosaics["near"], examples)
+        text, figures = judge_windows(model, examples["judged"])
+        tried = choose_patience(model, eye, mosaics["judged"], store)
+        lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
+    else:
+        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
+        model.check_compatible(eye.settings())
+        if "presence" in refit:
+            lines += _fit_further(config, model, examples)
+    if "survey" in refit:
+        measured = survey_again(config, model, examples)
+        figures = json.dumps({**json.loads(figures), **measured}, indent=1)
+        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
+        chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
+        lines += [*_figures_of(measured), "", chosen, "", *table(tried), ""]
+    if "decision" in refit:
+        lines += fit_decision(config, model, eye, pictures, store)
+        # A verification belongs to the probability that it was fitted with.
+        model.verification = None
+        model.metadata.pop("verification", None)
+    if "verification" in refit:
+        check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
+        lines += fit_closer_looks(config, model, eye, pictures, store)
+    if "certainty" in refit:
+        lines += fit_counts(config, model, eye, pictures, store)
+    if "photograph" in refit and config.photographs:
+        scenes = make_scenes(config.data, eye.detector.classes)
+        lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config)]
+    path = inside(config.out, f"{eye.detector.name}.safetensors")
+    model.save(path)
+    write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
+
+
+def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+    """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
+    torch.manual_seed(config.seed)
+    judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
+    before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
+    fit_presence(
+        model.requires_grad_(True), pair_windows(training_looks(config, examples)), config.steps, rate=_FURTHER
+    )
+    model.requires_grad_(False)
+    model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
+    rows = [["", "overview, before", "after", "closer looks, before", "after"]]
+    for kind, windows in judged.items():
+        pairs = zip(before[kind], _cross_entropies(model, windows), strict=True)
+        rows.append([kind, *(f"{each:.4f}" for pair in pairs for each in pair)])
+    return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
+
+
+@torch.no_grad()
+def _cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
+    """The cross-entropy of whether a closer look shows a class, by overviews and by closer looks (NaN without any)."""
+    rows = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    first, later = (float(presence_loss(model, windows, some)) if len(some) else float("nan") for some in rows)
+    return first, later
+
 
 main = command(fit_zoom, FitZoomConfig, __doc__)
 

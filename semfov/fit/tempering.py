@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, cast
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,20 +13,15 @@ from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, check
-from semfov.eye import Eye
+from semfov.errors import DataError
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, percent_of, section
-from semfov.fit.outputs import write_outputs
 from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
-from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.progress import track
-from semfov.runs.samples import Sampler, Samples, collect_samples
+from semfov.runs.samples import Samples
 from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
-from semfov.runs.setup import make_observation
-from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
@@ -69,30 +63,7 @@ class FitTemperingConfig(FitConfig):
     out: Path = Path("runs/fit_tempering")
 
 
-def fit_tempering(config: FitTemperingConfig) -> None:
-    """Collect looks, try every exponent, and write the report."""
-    check(len(config.exponents) > 0, "exponents", "at least one value", "none")
-    sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
-    samples = sampler.all()
-    model = make_observation(None, cast(Eye, sampler.eye)) if config.calibrated else None
-    hits = {tempering: _measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
-    text = _tempering_report(hits)
-    write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
-
-
-def _measure(
-    config: FitTemperingConfig,
-    sampler: Sampler,
-    samples: Samples,
-    model: FovealObservationModel | None,
-    tempering: float,
-) -> dict[str, float]:
-    """Measure one exponent: the share of next fixations that hit the target, as means over photographs."""
-    observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
-    return _means_of(config, _hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
-
-
-def _means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
+def mean_hits(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
     """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones."""
     means: dict[str, list[float]] = {"fitted": [], "held_out": []}
     for index, share in rates.items():
@@ -105,7 +76,7 @@ def _means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, 
     return {name: sum(values) / len(values) for name, values in means.items()}
 
 
-def _hit_rates(
+def hit_rates(
     config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
 ) -> dict[int, float]:
     """Compute the share of next fixations that hit the target in each photograph."""
@@ -155,21 +126,6 @@ def hit_rate(
     return float(share.mean()) if len(share) else None
 
 
-def _tempering_report(hits: dict[float, dict[str, float]]) -> str:
-    """Report the hit rates of every exponent and the best exponent as Markdown."""
-    best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
-    rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
-    return "\n".join(
-        [
-            f"Best exponent on the photographs to choose by: {best:g}. The table shows the percentage of next "
-            "fixations that hit the target, as a mean over all numbers of looks and over photographs.",
-            "",
-            *table([["tempering", "photographs to choose by", "held-out photographs"], *rows]),
-            "",
-        ]
-    )
-
-
 class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
 
@@ -191,15 +147,15 @@ class TemperingFit(PartFit):
         config, run, inputs = self.settings, self.run, self.inputs
         ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
         baseline = Semantic(inputs.components)
-        raw = _hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
+        raw = hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
         rates = {
-            (scores, exponent): _hit_rates(
+            (scores, exponent): hit_rates(
                 config, run.scenes, inputs.samples, inputs.fusing(scores, exponent), f"{scores} {exponent:g}"
             )
             for scores in ways
             for exponent in config.exponents
         }
-        means = {way: _means_of(config, each) for way, each in rates.items()}
+        means = {way: mean_hits(config, each) for way, each in rates.items()}
         scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
         held_out = [index for index in raw if index % config.holdout == 0]
         chosen = rates[best]
@@ -207,7 +163,7 @@ class TemperingFit(PartFit):
             torch.tensor([chosen[index] for index in held_out]).numpy(),
             torch.tensor([raw[index] for index in held_out]).numpy(),
         )
-        before = _means_of(config, raw)["held_out"]
+        before = mean_hits(config, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
             f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from semfov.errors import DataError
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words
 from semfov.fit.evidence import SUREST_OF_FEW
-from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.outputs import training_of
 from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FitConfig
@@ -29,10 +28,7 @@ from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.config import DataConfig
-from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Positive, Range, Share, Side
-from semfov.runs.setup import make_eye, make_learned, make_scenes
-from semfov.runs.store import cell_store
 from semfov.runs.tables import mean_or_dash, share, table
 
 _LEVELS = tuple(number / 100 for number in range(50, 100))
@@ -142,42 +138,7 @@ class VerificationResult(NamedTuple):
     searches: list[_VerifiedSearch]
 
 
-def fit_verification(config: FitVerificationConfig) -> None:
-    """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
-    eye = make_eye(config.detector, config.sensor)
-    evidence = make_learned(TargetEvidence, config.target_model, eye)
-    scenes = make_scenes(config.data, eye.detector.classes)
-    left_out = set()
-    if config.fitted is not None:
-        data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
-        ids = make_scenes(data, eye.detector.classes).ids
-        holdout = evidence.metadata.get("training", {}).get("holdout", 5)
-        left_out = {name for number, name in enumerate(ids) if number % holdout}
-    chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
-    if len(chosen) < config.folds:
-        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
-    size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
-    store = cell_store(store_folder(config.cache) / "searches", eye.settings(), *size, components)
-    photographs = open_photographs(
-        eye,
-        scenes,
-        chosen,
-        size,
-        classes=config.classes,
-        absent=config.absent,
-        max_area=config.max_target_area,
-        seed=config.seed,
-        store=store,
-    )
-    fitted = _fit_in_folds(photographs, evidence, config)
-    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
-    path = model_path(config, eye.detector.name)
-    fitted.model.save(path)
-    text, figures = verification_report(fitted, f"{len(photographs)} photographs")
-    write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
-
-
-def _fit_in_folds(
+def fit_in_folds(
     photographs: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
     config: FitVerificationConfig,
@@ -457,7 +418,7 @@ class VerificationFit(PartFit):
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
-        fitted = _fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
+        fitted = fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])

@@ -8,22 +8,18 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import torch
 
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes, crowded
-from semfov.errors import check
-from semfov.fit.outputs import training_of, write_outputs
-from semfov.fit.photographs import fit_photographs
+from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again
-from semfov.fit.windows_choice import choose_foresight, choose_patience, open_all
 from semfov.fit.windows_decision import Searches, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
-    Windows,
     ZoomExample,
     example_of,
     fit_presence,
@@ -37,13 +33,11 @@ from semfov.fit.windows_evidence import (
 from semfov.fit.windows_kinds import PICTURE_KINDS, PictureKind, compose_pictures
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
-from semfov.io.files import inside
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share, Whole
-from semfov.runs.setup import make_detector, make_scenes, prepare_worker, split_photographs
-from semfov.runs.tables import table
+from semfov.runs.setup import make_detector, prepare_worker, split_photographs
 from semfov.runs.window_looking import TileSize
 from semfov.runs.workers import run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
@@ -51,7 +45,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
 
-_RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "photograph"]
+RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "photograph"]
 
 
 @dataclass(frozen=True)
@@ -124,7 +118,7 @@ class FitZoomConfig(FitConfig):
     photographs: Whole = 320
     worth: Share = 0.05
     evidence: Path | None = None
-    refit: tuple[_RefitPart, ...] = ("decision", "verification", "certainty")
+    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300
@@ -134,8 +128,6 @@ class FitZoomConfig(FitConfig):
 _OTHER = ("kinds", "each", "judged_each", "tile", "seed")
 """Settings of the pictures that are no mosaics."""
 
-_PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
-"""Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
 
 _DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
 """Settings that the thresholds and the probability of presence depend on."""
@@ -146,19 +138,15 @@ _VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms",
 _COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
 """Settings that the certainty depends on."""
 
-_FURTHER = 1e-3
-"""Highest learning rate of a prediction that is fitted further."""
 
 _SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
 
-_JUDGED = ("judged", "judged far", "judged crowded")
-"""Mosaics of held-out photographs on which foresight is chosen."""
 
 _log = logging.getLogger(__name__)
 
 
-def _make_window_eye(config: FitZoomConfig) -> WindowEye:
+def make_window_eye(config: FitZoomConfig) -> WindowEye:
     """Make the eye that looks at the mosaics."""
     return WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
 
@@ -179,7 +167,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
     }
 
 
-def _make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
+def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
     """Compose the pictures of other kinds."""
     training, held_out = split_photographs(config.data, classes, config.holdout)
     pictures: dict[str, Scenes] = {}
@@ -187,6 +175,11 @@ def _make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Sc
         pictures[kind] = compose_pictures(kind, training, config.each, config.seed, config.tile)
         pictures[f"judged {kind}"] = compose_pictures(kind, held_out, config.judged_each, config.seed + 20, config.tile)
     return pictures
+
+
+def open_all(eye: WindowEye, pictures: Scenes, store: GlanceStore) -> list[StoredGlances]:
+    """Open the stored looks of each picture."""
+    return [StoredGlances(eye, pictures, index, store) for index in range(len(pictures))]
 
 
 def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
@@ -200,9 +193,9 @@ _process: dict[str, Any] = {}
 def _prepare_fit_process(config: FitZoomConfig) -> None:
     """Build the eye, the mosaics and the store once in this process."""
     prepare_worker()
-    eye = _make_window_eye(config)
+    eye = make_window_eye(config)
     classes = eye.detector.classes
-    pictures = {**make_mosaics(config, classes), **_make_kinds(config, classes)}
+    pictures = {**make_mosaics(config, classes), **make_kinds(config, classes)}
     _process.update(eye=eye, pictures=pictures, store=make_store(config, eye))
 
 
@@ -221,55 +214,6 @@ def _read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list
     opened = {n: StoredGlances(eye, pictures, n, store) for n in range(len(pictures))}
     least = eye.detector.least
     return [example_of(pictures, n, looks, least) for n, looks in opened.items() if looks.lattice.levels > 1]
-
-
-def fit_zoom(config: FitZoomConfig) -> None:
-    """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    eye = _make_window_eye(config)
-    mosaics = make_mosaics(config, eye.detector.classes)
-    pictures = {**mosaics, **_make_kinds(config, eye.detector.classes)}
-    store = make_store(config, eye)
-    lines: list[str] = []
-    figures = "{}"
-    check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[_RefitPart] = set(config.refit) if config.evidence else {*get_args(_RefitPart)}
-    looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
-    looked += ["crowded", "judged crowded"] * ("survey" in refit)
-    looked += [*config.kinds] * ("presence" in refit)
-    looked += [f"judged {kind}" for kind in PICTURE_KINDS] * ("presence" in refit and config.evidence is not None)
-    examples = look_at_all(config, eye, pictures, store, looked)
-    if config.evidence is None:
-        model = fit_looks(config, eye, mosaics["near"], examples)
-        text, figures = judge_windows(model, examples["judged"])
-        tried = choose_patience(model, eye, mosaics["judged"], store)
-        lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
-    else:
-        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
-        model.check_compatible(eye.settings())
-        if "presence" in refit:
-            lines += _fit_further(config, model, examples)
-    if "survey" in refit:
-        measured = survey_again(config, model, examples)
-        figures = json.dumps({**json.loads(figures), **measured}, indent=1)
-        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
-        chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        lines += [*_figures_of(measured), "", chosen, "", *table(tried), ""]
-    if "decision" in refit:
-        lines += fit_decision(config, model, eye, pictures, store)
-        # A verification belongs to the probability that it was fitted with.
-        model.verification = None
-        model.metadata.pop("verification", None)
-    if "verification" in refit:
-        check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        lines += fit_closer_looks(config, model, eye, pictures, store)
-    if "certainty" in refit:
-        lines += fit_counts(config, model, eye, pictures, store)
-    if "photograph" in refit and config.photographs:
-        scenes = make_scenes(config.data, eye.detector.classes)
-        lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config)]
-    path = inside(config.out, f"{eye.detector.name}.safetensors")
-    model.save(path)
-    write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
 
 
 def look_at_all(
@@ -308,40 +252,15 @@ def fit_looks(
     random.seed(config.seed)
     metadata = {**eye.settings(), **training_of(config, near, "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
-    looks = _training_looks(config, examples)
+    looks = training_looks(config, examples)
     fit_presence(model, pair_windows(looks), config.steps)
     fit_rates(model, looks, config.steps)
     return model.eval().requires_grad_(False)
 
 
-def _training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
+def training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
     """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
     return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
-
-
-def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
-    """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
-    torch.manual_seed(config.seed)
-    judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
-    before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
-    fit_presence(
-        model.requires_grad_(True), pair_windows(_training_looks(config, examples)), config.steps, rate=_FURTHER
-    )
-    model.requires_grad_(False)
-    model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
-    rows = [["", "overview, before", "after", "closer looks, before", "after"]]
-    for kind, windows in judged.items():
-        pairs = zip(before[kind], _cross_entropies(model, windows), strict=True)
-        rows.append([kind, *(f"{each:.4f}" for pair in pairs for each in pair)])
-    return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
-
-
-@torch.no_grad()
-def _cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
-    """The cross-entropy of whether a closer look shows a class, by overviews and by closer looks (NaN without any)."""
-    rows = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    first, later = (float(presence_loss(model, windows, some)) if len(some) else float("nan") for some in rows)
-    return first, later
 
 
 def survey_again(

@@ -162,11 +162,11 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 FITS = {
     "observation": "_fit_model",
-    "tempering": "_hit_rates",
+    "tempering": "hit_rates",
     "evidence": "_fit_evidence",
     "verification": "fit_in_folds",
     "map": "_fit_map_evidence",
-    "parts.windows": "fit_mosaics",
+    "parts.windows": "_fit_mosaics",
 }
 
 
@@ -362,7 +362,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.verification._fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.verification.fit_in_folds", fail)
     assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))

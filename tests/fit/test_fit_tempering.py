@@ -5,7 +5,8 @@ import torch
 
 from semfov import Detections, Grid
 from semfov.belief.observers import Semantic
-from semfov.fit.tempering import _tempering_report, hit_rate
+from semfov.fit.tempering import hit_rate
+from train.fit_tempering import _tempering_report
 
 
 def looks(count, boxes=3, classes=4):

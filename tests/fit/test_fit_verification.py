@@ -20,12 +20,12 @@ from semfov.fit.verification import (
     _STRENGTH,
     FitVerificationConfig,
     _CloserLooks,
-    _fit_in_folds,
     _shipped_mean,
     _VerifiedSearch,
     choose_confirm,
     examine,
     fit,
+    fit_in_folds,
     verify,
 )
 from semfov.gaze.policies import NonPredictive, Random
@@ -297,7 +297,7 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
         assert list(each.ends) == sorted(each.ends)
         assert each.looks >= max(each.ends, default=1)
     with pytest.raises(DataError, match="got only one kind"):
-        _fit_in_folds([], evidence, config)
+        fit_in_folds([], evidence, config)
 
 
 class Limited(Blobs):

@@ -17,7 +17,7 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.fit.verification import unverified, verify
-from semfov.fit.windows import FitZoomConfig, fit_zoom
+from semfov.fit.windows import FitZoomConfig
 from semfov.fit.windows_evidence import example_of
 from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
@@ -28,6 +28,7 @@ from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, Tiles
+from train.fit_zoom import fit_zoom
 
 
 @pytest.mark.slow

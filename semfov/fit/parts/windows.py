@@ -26,10 +26,10 @@ from semfov.fit.windows import (
     look_at_all,
     make_mosaics,
     make_store,
+    open_all,
     some_explored,
     survey_again,
 )
-from semfov.fit.windows_choice import open_all
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread

@@ -6,10 +6,11 @@ from itertools import chain, islice
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scenes
+from semfov.data.scene import Annotation
+from semfov.fit.windows import open_all
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.runs.zoom_store import GlanceStore
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -63,11 +64,6 @@ def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)
     return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
-
-
-def open_all(eye: WindowEye, pictures: Scenes, store: GlanceStore) -> list[StoredGlances]:
-    """Open the stored looks of each picture."""
-    return [StoredGlances(eye, pictures, index, store) for index in range(len(pictures))]
 
 
 def _mean_recall(
