@@ -21,7 +21,7 @@ from semfov.io.files import check_regular
 MAX_PIXELS = 89_478_485
 """Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
 
-FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "BMP", "PPM")
+_FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "BMP", "PPM")
 """Formats of photographs, which are told by the content of a file (AVIF and HEIF where Pillow has them).
 
 Pillow knows others, of which some start programs (EPS) or are made of other files.
@@ -60,7 +60,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     keep their precision. The first frame of an animation is read. Colour profiles are not applied.
 
     Args:
-        path: a file in one of `FORMATS`, whatever its name.
+        path: a file in one of `_FORMATS`, whatever its name.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
         white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
             `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.
@@ -135,13 +135,13 @@ def quiet_decoders() -> Iterator[None]:
 
 @contextmanager
 def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
-    """The Pillow image of a file in one of `FORMATS`, not decoded yet."""
+    """The Pillow image of a file in one of `_FORMATS`, not decoded yet."""
     from PIL import Image
 
     check_regular(path, f"image {Path(path)}")
     Image.init()
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
-    with Path(path).open("rb") as file, Image.open(file, formats=[n for n in FORMATS if n in Image.OPEN]) as image:
+    with Path(path).open("rb") as file, Image.open(file, formats=[n for n in _FORMATS if n in Image.OPEN]) as image:
         if image.format == "TIFF":
             _seek_picture(image)
             tags: Any = getattr(image, "tag_v2", {})

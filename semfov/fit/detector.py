@@ -119,7 +119,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     started = time.monotonic()
     print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
-    check_photographs(run)
+    _check_photographs(run)
     folder = _FolderFit(config, run)
     config, results = folder.inputs.config, folder.inputs.results
     counts = class_counts(run, range(len(run.scenes)))
@@ -180,7 +180,7 @@ def _unseen(run: Looking) -> list[int]:
     return [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
 
 
-def check_photographs(run: Looking) -> None:
+def _check_photographs(run: Looking) -> None:
     """Decode all photographs that will be looked at; raises `DataError` with all that cannot be decoded."""
     faults = []
     for index in tqdm(_unseen(run), "decoding photographs", unit="photograph", leave=False, dynamic_ncols=True):

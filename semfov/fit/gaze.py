@@ -68,7 +68,7 @@ def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, 
     centre = log_centre(groups, pictures)
     model = FixationDensity(channels, readouts=fit.readouts, units=fit.units, centre=centre)
     with tqdm(total=fit.epochs, desc=f"map, {title}", unit="epoch", leave=False) as bar:
-        fit_map(model, groups, pictures, fit, done=lambda epoch, loss: _tell(bar, loss))
+        _fit_map(model, groups, pictures, fit, done=lambda epoch, loss: _tell(bar, loss))
     maps = [maps_of(model, group, some) for group, some in zip(groups, pictures, strict=True)]
     with tqdm(total=fit.saccade_epochs, desc=f"saccades, {title}", unit="epoch", leave=False) as bar:
         fit_oculomotor(model, groups, maps, pictures, fit, done=lambda epoch, loss: _tell(bar, loss))
@@ -81,7 +81,7 @@ def _tell(bar: Any, loss: float) -> None:
     bar.update()
 
 
-def fit_map(
+def _fit_map(
     model: FixationDensity,
     groups: Sequence[Viewed],
     pictures: _Pictures,
@@ -202,7 +202,7 @@ def fit_oculomotor(
                 chosen, corner = _drawn(events[group][picture], size, generator)
                 if not len(chosen.cell):
                     continue
-                terms = {"map": for_people(maps[group][places[group][picture]], chosen), "centre bias": centre[None]}
+                terms = {"map": _for_people(maps[group][places[group][picture]], chosen), "centre bias": centre[None]}
                 log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
                 rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
                 target = rows // corner[2] * log.shape[-1] + columns // corner[2]
@@ -218,7 +218,7 @@ def fit_oculomotor(
         done(epoch, total / max(number, 1))
 
 
-def for_people(maps: Tensor, events: Events) -> Tensor:
+def _for_people(maps: Tensor, events: Events) -> Tensor:
     """The map of each event: that of its person, or the one map of the picture."""
     return maps if len(maps) == 1 else maps[events.person]
 
@@ -281,7 +281,7 @@ def score(
         events = events_of(group.paths[picture], size, raster[::-1])
         if conditional:
             events = events.some(torch.randperm(len(events.cell), generator=generator)[:_SCORED])
-        given: dict[str, Tensor] = {**terms, "map": for_people(one, events)}
+        given: dict[str, Tensor] = {**terms, "map": _for_people(one, events)}
         given = model.given(given, size, events.before) if conditional else given
         for left_out, scored in zip(without, rows, strict=True):
             log = sum((term for name, term in given.items() if name not in left_out), torch.zeros_like(one[:1]))

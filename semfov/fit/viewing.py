@@ -126,12 +126,12 @@ def _counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, i
     """Numbers of fixations of each path but its first in cells, `(paths, rows, columns)`."""
     counts = torch.zeros(len(paths), cells[0] * cells[1])
     for row, path in zip(counts, paths, strict=True):
-        at = numbers_of_cells(path[1:], size, cells)
+        at = _numbers_of_cells(path[1:], size, cells)
         row.index_add_(0, at, torch.ones(len(at)))
     return counts.unflatten(1, cells)
 
 
-def numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
+def _numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
     """Numbers of the cells that hold points; those outside the picture belong to the nearest cell."""
     x = ((points[:, 0] + 0.5) * (cells[1] / size[1])).floor().clamp(0, cells[1] - 1)
     y = ((points[:, 1] + 0.5) * (cells[0] / size[0])).floor().clamp(0, cells[0] - 1)
@@ -205,7 +205,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
                     store.write(digest, kept)
                 yield _unpacked(kept), people[str(name)]
 
-        groups += grouped(seen(), _at(data.seconds, number, 3.0), number)
+        groups += _grouped(seen(), _at(data.seconds, number, 3.0), number)
     return groups
 
 
@@ -227,7 +227,7 @@ def _unpacked(tensors: Mapping[str, Tensor]) -> FeatureMaps:
     return FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing())
 
 
-def grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:
+def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:
     """Pictures of one data set with the scanpaths in them, by the size of the pictures."""
     kept: dict[Any, list[_Seen]] = {}
     with torch.inference_mode():
@@ -266,7 +266,7 @@ def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, 
         before += [
             F.pad(path[:last].t(), (LONGEST - 1 - last, 0), value=math.nan).t()[None] for last in range(1, len(path))
         ]
-        cell.append(numbers_of_cells(path[1:], size, cells))
+        cell.append(_numbers_of_cells(path[1:], size, cells))
         person.append(torch.full((len(path) - 1,), number))
     none = torch.zeros(0, dtype=torch.long)
     return Events(torch.cat(before), torch.cat([none, *cell]), torch.cat([none, *person]))
@@ -281,13 +281,13 @@ def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3,
     cells = cells_of(group.size)
     bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
     counts = _counted(group.paths[picture], group.size, cells)
-    smooth = torch.stack([blurred(each, blur) for each in counts.sum(0) - counts]).flatten(1)
+    smooth = torch.stack([_blurred(each, blur) for each in counts.sum(0) - counts]).flatten(1)
     total = smooth.sum(1, keepdim=True)
     density = (1 - share) * torch.where(total > 0, smooth / total, bias) + share * bias
     return density.log().unflatten(1, cells)
 
 
-def blurred(counts: Tensor, sigma: float) -> Tensor:
+def _blurred(counts: Tensor, sigma: float) -> Tensor:
     """Counts `(rows, columns)` blurred by a Gaussian whose weights sum to 1 at the border too."""
     for axis in (0, 1):
         place = torch.arange(counts.shape[axis], dtype=counts.dtype)
@@ -302,7 +302,7 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
     for group, some in zip(groups, pictures, strict=True):
         if len(some):
             seen = group.counts[torch.as_tensor(some)].sum(0)
-            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
+            smooth = _blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
             total += smooth / smooth.sum()
     return ((1 - floor) * total / total.sum() + floor / total.numel()).log()
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape, check_whole, values_known
 
-Noise = Callable[[int, Tensor], Tensor]
+_Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
 
 
@@ -44,7 +44,7 @@ class Greedy(Choice):
     tensor([2])
     """
 
-    def __init__(self, noise: Noise) -> None:
+    def __init__(self, noise: _Noise) -> None:
         self.noise = noise
 
     def __call__(
@@ -58,7 +58,7 @@ class Greedy(Choice):
 class Exploratory(Greedy):
     """`Greedy`, with some fixations drawn at random so that training sees all cells."""
 
-    def __init__(self, noise: Noise, astray: float) -> None:
+    def __init__(self, noise: _Noise, astray: float) -> None:
         super().__init__(noise)
         self.astray = astray
 
@@ -89,7 +89,7 @@ class Softmax(Choice):
     tensor([1])
     """
 
-    def __init__(self, noise: Noise, inverse_temperature: float) -> None:
+    def __init__(self, noise: _Noise, inverse_temperature: float) -> None:
         check(inverse_temperature >= 0, "inverse_temperature", "0 or more", inverse_temperature)
         self.noise = noise
         self.inverse_temperature = inverse_temperature
@@ -121,7 +121,7 @@ class Relaxed(Choice):
     """
 
     def __init__(
-        self, noise: Noise, cell_of: Callable[[Tensor], Tensor], *, temperature: float = 1.0, hard: bool = True
+        self, noise: _Noise, cell_of: Callable[[Tensor], Tensor], *, temperature: float = 1.0, hard: bool = True
     ) -> None:
         self.noise = noise
         self.cell_of = cell_of
@@ -249,11 +249,11 @@ def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Gen
     return int(start), generator
 
 
-def drawn_from(noise: Tensor) -> Noise:
+def drawn_from(noise: Tensor) -> _Noise:
     """Random numbers from a table `(B, shifts, X·Y)`, so that an episode repeats."""
     return lambda shift, episodes: noise[episodes, shift]
 
 
-def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> Noise:
+def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> _Noise:
     """Random numbers from a generator as they are needed, with the dtype and device of `like`."""
     return lambda shift, episodes: torch.rand(len(episodes), cells, generator=generator).to(like)

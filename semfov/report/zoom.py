@@ -20,7 +20,7 @@ from semfov.report.episode import Data, jpeg_uri, rounded, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.zoom.hints import DETECTION_SCORE
 
-DRAWN = 500
+_DRAWN = 500
 """Largest number of objects that are drawn in the picture and listed."""
 
 _MOST_DETECTIONS = 15
@@ -105,7 +105,7 @@ def zoom_data(
         "looks": [
             _look(path, look, view, objects, quality) for look, view in zip(path, path.look_views(source), strict=True)
         ],
-        "objects": objects[:DRAWN],
+        "objects": objects[:_DRAWN],
         "count": len(objects),
         "confirmable": path.confirmable,
         "turns": path.how == "head",

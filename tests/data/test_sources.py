@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from semfov.data import sources
-from semfov.data.images import FORMATS
+from semfov.data.images import _FORMATS
 from semfov.data.sources import PHOTOGRAPHS, embedded_picture, open_stream, picture_files
 from semfov.errors import DataError, InputError
 
@@ -42,7 +42,7 @@ def test_pictures_of_a_file_and_of_a_folder(tmp_path):
 def test_a_folder_leaves_out_no_photograph_that_is_read_alone(tmp_path):
     Image.init()
     registered = Image.registered_extensions().items()
-    read = {end for end, kind in registered if kind in (*FORMATS, "MPO", "DIB")}
+    read = {end for end, kind in registered if kind in (*_FORMATS, "MPO", "DIB")}
     assert read <= {*PHOTOGRAPHS}
     for name in ("a.jpg", "b.VRT", "c.jpg"):
         (tmp_path / name).touch()

@@ -14,9 +14,9 @@ from eval.human import main as compare
 from semfov import Detector, saliency
 from semfov.data.fixations import Fixations, write_osie
 from semfov.detection import Candidates
-from semfov.fit.gaze import GazeFit, describe_viewing, fit_map, fit_oculomotor, maps_of, score, summary_of
+from semfov.fit.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
 from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
-from semfov.fit.viewing import events_of, features_of, folds, grouped, log_centre, others_of
+from semfov.fit.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 from train.fit_gaze import main
@@ -56,7 +56,7 @@ def people(seed, place, count=6):
 def viewed(shown):
     """Pictures `(image, people)` as the fit has them."""
     source = features_of(Colours("colours", ("none",), (80, 60), stride=4).eval())
-    (made,) = grouped((source.maps(image[None]), some) for image, some in shown)
+    (made,) = _grouped((source.maps(image[None]), some) for image, some in shown)
     return made
 
 
@@ -71,7 +71,7 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     losses = []
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
-    fit_map(model, [group], [fitted], fit, done=lambda epoch, loss: losses.append(loss))
+    _fit_map(model, [group], [fitted], fit, done=lambda epoch, loss: losses.append(loss))
     assert losses[-1] < losses[0] - 1
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)

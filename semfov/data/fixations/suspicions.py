@@ -48,7 +48,7 @@ def suspicions(fixations: Sequence[Fixations]) -> list[str]:
     if not records:
         return []
     points, sides = _joined(records)
-    looks = looks_like(records)
+    looks = _looks_like(records)
     found = [] if looks is None else [f"points look like {looks}"]
     outside = _outside(points, sides)
     if looks is None and outside.mean() > _MOST_OUTSIDE:
@@ -58,7 +58,7 @@ def suspicions(fixations: Sequence[Fixations]) -> list[str]:
     return [*found, *_repeats(records, points), *_durations(records)]
 
 
-def looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
+def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
     """What fixations look like that do not look like those of their frame; None if they do."""
     points, sides = _joined(fixations)
     if len(points) < 3:
@@ -154,7 +154,7 @@ def warn_of_frames(
 
     `units` says that they were read as pixels, in which case they may be fractions.
     """
-    looks = looks_like(fixations, units=units) if fixations else None
+    looks = _looks_like(fixations, units=units) if fixations else None
     if looks is None:
         return warn_outside(source, fixations, stacklevel=stacklevel + 1)
     first, total = fixations[0], sum(map(len, fixations))

@@ -59,11 +59,11 @@ class ScanpathComparison(dict[str, BesidePeople]):
         return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
 
 
-People = Fixations | Sequence[Fixations] | str | PathLike[str]
+_People = Fixations | Sequence[Fixations] | str | PathLike[str]
 """Fixations of one person or several, or a file of them (`semfov.data.fixations.read_fixations`)."""
 
 
-def compare_scanpath(scanpath: GazeRecord | Fixations, people: People) -> ScanpathComparison:
+def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> ScanpathComparison:
     """Compare a scanpath with those of people in the same picture, and the people with each other.
 
     - `MultiMatch shape`, `direction`, `length`, `position` (`multimatch`): 1 for equal scanpaths; NaN below three
