@@ -27,7 +27,7 @@ _FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "B
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
-UNKNOWN = f"not an image in a format that is read ({', '.join(FORMATS)}); convert it"
+UNKNOWN = f"not an image in a format that is read ({', '.join(_FORMATS)}); convert it"
 """What is said of the content of a file that is none of these."""
 
 _SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
