@@ -1,7 +1,6 @@
 """Log odds that windows show a class, from all looks at a picture, computed anew only where something has changed."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,7 @@ _UNKNOWN = -4.0
 """Log odds that are used where no earlier look gave any."""
 
 
-@dataclass
-class _Table:
+class _Table(NamedTuple):
     """The windows of a level that lie in a look; shape `(down, across)`, places `(down * across,)`."""
 
     span: int

@@ -16,7 +16,6 @@ from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
 
-@dataclass(frozen=True)
 class TargetLook(EvidenceLook):
     """Evidence of looks about the target in every cell; the attributes are those of `EvidenceLook` for one class."""
 
