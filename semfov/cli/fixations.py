@@ -49,6 +49,8 @@ def _size(text: str) -> tuple[int, int]:
 
 def _content(records: list[Fixations]) -> str:
     """What is in the records, in a line."""
+    if not records:
+        return "no fixations"
     people, pictures = ({getattr(each, name) for each in records} for name in ("subject", "picture"))
     sizes = sorted({each.size for each in records})
     frames = ", ".join(f"{width} × {height}" for width, height in sizes[:3]) + (", …" if sizes[3:] else "")

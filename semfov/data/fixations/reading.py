@@ -48,7 +48,7 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     if kind == ".json":
         return _json_reader(Path(source))(source, **options)
     _, header, _ = of_source(source)
-    ours = {"picture", "subject", "x", "y"} <= {*header} or "columns" in options
+    ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or "columns" in options
     return read_export(source, **options) if is_export(header) and not ours else read_table(source, **options)
 
 

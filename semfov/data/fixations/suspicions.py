@@ -46,7 +46,7 @@ def suspicions(fixations: Sequence[Fixations]) -> list[str]:
     """
     records = list(fixations)
     if not records:
-        return []
+        return ["there are no fixations"]
     points, sides = _joined(records)
     looks = _looks_like(records)
     found = [] if looks is None else [f"points look like {looks}"]

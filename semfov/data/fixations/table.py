@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -30,6 +31,12 @@ _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 _MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+_BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
+"""What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
+
+_LARGEST = 1e6
+"""Largest coordinate and side in pixels."""
 
 Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 """`(width, height)` of all frames, or of each by the name of its picture."""
@@ -89,6 +96,10 @@ def read_table(
     for name in named:
         lookup(name, (*_COLUMNS, *_SIZE, *_MORE), "column")
     where, header, rows = of_source(source)
+    by_lower = {name.lower(): name for name in reversed(header)}
+    for name in (*_COLUMNS, *_SIZE, *_MORE):
+        if name not in named and name not in header and name in by_lower:
+            named[name] = by_lower[name]
     needed = (*_COLUMNS, *(() if size is not None else _SIZE))
     missing = [named.get(name, name) for name in needed if named.get(name, name) not in header]
     if missing:
@@ -131,13 +142,19 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
         content = path.read_bytes()
         encoding = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "utf-8")
         text = content.decode(encoding)
+        before = _BEFORE.match(text)
+        text = text[before.end() :] if before else text
         first = text.partition("\n")[0]
         separator = max(",;\t", key=first.count)
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         lines = [(f"line {reader.line_num}", line) for line in reader]
     except (OSError, UnicodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
+        remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
+        raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
     header = [(name or "").strip() for name in reader.fieldnames or ()]
+    again = sorted({name for name in header if header.count(name) > 1 and name})
+    if again:
+        raise DataError(f"{path}: expected columns of different names, got several named {', '.join(again)}")
     rows = []
     for place, line in lines:
         if None in line:
@@ -211,6 +228,8 @@ def _record(
     origin: Origin,
 ) -> Fixations:
     place, line = group[0]
+    if not line["picture"]:
+        raise DataError(f"{where}: {place}, picture: expected the name of a picture, got nothing")
     for name in (*(() if size is not None else _SIZE), "x1", "y1", "x2", "y2", "found"):
         other = next((each for each in group if each[1][name] != line[name]), None)
         if other is not None:
@@ -287,6 +306,8 @@ def _number(where: str, at: str, line: Mapping[str, str], name: str) -> float:
     value = _maybe(where, at, line, name)
     if value is None:
         raise DataError(f"{where}: {at}, {name}: expected a number, got nothing")
+    if abs(value) > _LARGEST:
+        raise DataError(f"{where}: {at}, {name}: expected a number up to {_LARGEST:g}, got {value:g}")
     return value
 
 

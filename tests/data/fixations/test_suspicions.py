@@ -69,7 +69,7 @@ KINDS = {
 def test_nothing_is_said_of_plain_fixations():
     assert suspicions(people()) == []
     assert suspicions([replace(each, durations=None) for each in people(3)]) == []
-    assert suspicions([]) == []
+    assert suspicions([]) == ["there are no fixations"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

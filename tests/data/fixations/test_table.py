@@ -41,7 +41,7 @@ def test_a_frame_other_names_and_a_size(tmp_path):
         assert record.durations is None
     frame.to_csv(tmp_path / "t.csv", index=False)
     assert points_of(read_table(tmp_path / "t.csv", columns=names, size=(80, 60))) == [[[1.5, 3], [2, 4.5]]]
-    with pytest.raises(DataError, match=r"none named picture, subject, x, y among 'image', 'who', 'X', 'Y', 't'; name"):
+    with pytest.raises(DataError, match=r"none named picture, subject among 'image', 'who', 'X', 'Y', 't'; name"):
         read_table(frame, size=(80, 60))
     with pytest.raises(DataError, match="row 1, y: expected a number, got nothing"):
         read_table(frame.assign(Y=[1.0, np.nan]), columns=names, size=(80, 60))
@@ -163,3 +163,35 @@ def test_other_readers_warn_too(tmp_path):
     with pytest.warns(UserWarning, match="look like fixations of a frame"):
         read_cocosearch(tmp_path / "s.json")
     assert len(read_cocosearch(tmp_path / "s.json", screen=(512, 320))) == 1
+
+
+HEAD, ROWS = "picture,subject,x,y,width,height", "a.jpg,1,40,30,80,60\na.jpg,1,50.5,20,80,60\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"\n\n{HEAD}\n{ROWS}",
+        f"# by hand\n{HEAD}\n{ROWS}",
+        f"sep=;\n{HEAD}\n{ROWS}".replace(",", ";"),
+        f"{HEAD.title()}\n{ROWS}",
+    ],
+)
+def test_what_spreadsheets_write_before_a_table_and_capitals_are_understood(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text)
+    assert read_table(tmp_path / "a.csv")[0].points.tolist() == [[40, 30], [50.5, 20]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{HEAD},x\n{ROWS}", "several named x"),
+        (f"{HEAD}\n{ROWS}".replace("40", "1e9"), "line 2, x: expected a number up to 1e"),
+        (f"{HEAD}\n{ROWS}".replace("a.jpg", ""), "line 2, picture: expected the name of a picture"),
+        (f"{HEAD}\n{ROWS}".replace("a.jpg", "ä.jpg"), "save it as UTF-8"),
+    ],
+)
+def test_tables_that_say_too_much_or_too_little_are_refused(tmp_path, text, said):
+    (tmp_path / "a.csv").write_text(text, encoding="latin-1")
+    with pytest.raises(DataError, match=said):
+        read_table(tmp_path / "a.csv")
