@@ -8,6 +8,7 @@ again may also count as missing, which is right, too. Anything else is a finding
 
 from benchmarks.fuzz.agents import agent_arguments, detectors, settings_values
 from benchmarks.fuzz.annotations import annotation_files
+from benchmarks.fuzz.borders import dtypes, frames, labels, tables, tiff_tags
 from benchmarks.fuzz.images import image_files
 from benchmarks.fuzz.models import darknet_files, model_fields, model_files
 from benchmarks.fuzz.onnx_models import onnx_files
@@ -33,5 +34,10 @@ TARGETS = {
         look_files,
         agent_arguments,
         settings_values,
+        tiff_tags,
+        dtypes,
+        labels,
+        tables,
+        frames,
     )
 }

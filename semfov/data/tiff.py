@@ -6,6 +6,7 @@ import re
 import weakref
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from semfov.data.reduction import PixelBox
 from semfov.data.tone import White, bytes_between
 from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
 from semfov.errors import DataError
+from semfov.io.files import check_regular
 
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
@@ -61,22 +63,8 @@ class TiffPicture(LargePicture):
             self._page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
         page: Any = self._page
         count = int(page.samplesperpixel)
-        kind = "" if page.dtype is None else page.dtype.kind
-        plain = page.dtype in (np.uint8, np.uint16)
-        fits = kind in "uif" and len(page.shape) == 2 + (count > 1) and page.bitspersample == 8 * page.dtype.itemsize
-        if not (fits and (plain or white is not None)):
-            more = "give white=(low, high) or white='auto'" if fits else "convert it"
-            raise DataError(f"{path}: expected 8 or 16 bits, got {page.dtype} {page.shape}; {more}")
-        if page.photometric == _PALETTE:
-            raise DataError(f"{path}: expected grey, RGB or bands, got a palette; convert it")
-        known = tifffile.TIFF
-        if page.compression not in known.DECOMPRESSORS or page.predictor not in known.UNPREDICTORS:
-            packed = f"{page.compression.name} compression with predictor {int(page.predictor)}"
-            raise DataError(f"{path}: expected imagecodecs for {packed}; pip install imagecodecs")
         self.size = int(page.imagewidth), int(page.imagelength)
-        if max(self.size) > MOST_SIDE:
-            got = f"{self.size[0]} × {self.size[1]}"
-            raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}")
+        self._check_kind(known=white is not None)
         extra = [int(each) for each in page.extrasamples]
         self._alpha = next((kind for kind in extra if kind in (_PREMULTIPLIED, _UNASSOCIATED)), 0)
         colours = count - len(extra)
@@ -91,13 +79,37 @@ class TiffPicture(LargePicture):
         if self._alpha:
             self._channels.append(colours + extra.index(self._alpha))
         nodata = page.tags.get(_NODATA)
-        with opening(self.path, "opened"):
+        self._nodata: float | None = None
+        with suppress(ValueError):  # some programs write words
             self._nodata = None if nodata is None else float(str(nodata.value).strip("\0 "))
         if page.compression not in _ALWAYS:
             with opening(self.path, "decoded"):
                 self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
-        self._tone = tone_of(self, white, self._values, nodata=self._nodata, wide=page.dtype == np.uint16)
+        shown = len(self._channels) - bool(self._alpha)
+        self._tone = tone_of(
+            self, white, lambda box: self._values(box)[..., :shown], nodata=self._nodata, wide=page.dtype == np.uint16
+        )
         self.nothing = self._colour_of_nothing()
+
+    def _check_kind(self, *, known: bool) -> None:
+        """Raise `DataError` for a TIFF that is left to other readers; `known` says which values are white."""
+        import tifffile
+
+        page, count = self._page, int(self._page.samplesperpixel)
+        kind = "" if page.dtype is None else page.dtype.kind
+        plain = page.dtype in (np.uint8, np.uint16)
+        fits = kind in "uif" and len(page.shape) == 2 + (count > 1) and page.bitspersample == 8 * page.dtype.itemsize
+        if not (fits and (plain or known)):
+            more = "give white=(low, high) or white='auto'" if fits else "convert it"
+            raise DataError(f"{self.path}: expected 8 or 16 bits, got {page.dtype} {page.shape}; {more}")
+        if page.photometric == _PALETTE:
+            raise DataError(f"{self.path}: expected grey, RGB or bands, got a palette; convert it")
+        if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
+            packed = f"{page.compression.name} compression with predictor {int(page.predictor)}"
+            raise DataError(f"{self.path}: expected imagecodecs for {packed}; pip install imagecodecs")
+        if max(self.size) > MOST_SIDE:
+            got = f"{self.size[0]} × {self.size[1]}"
+            raise DataError(f"{self.path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}")
 
     @property
     def has_overviews(self) -> bool:
@@ -192,12 +204,20 @@ def _named_bands(metadata: Any) -> dict[str, int]:
 
 
 def is_converted(path: str | PathLike[str]) -> bool:
-    """Whether a TIFF is turned, or of other colours than grey and RGB, or grey with alpha: Pillow converts these."""
-    try:
-        with quiet_decoders(), open_pillow(path) as image:
-            tags = getattr(image, "tag_v2", {})
-    except Exception:  # files that Pillow does not read are left to other readers
-        return False
+    """Whether a TIFF is turned, or of other colours than grey and RGB: Pillow converts these, or nobody reads them."""
+    tags: Any = {}
+    check_regular(path, f"image {Path(path)}")
+    with quiet_decoders():
+        try:
+            with open_pillow(path) as image:
+                tags = getattr(image, "tag_v2", {})
+        except Exception:  # files that Pillow does not read are left to other readers
+            with suppress(Exception):
+                import tifffile
+
+                with tifffile.TiffFile(path) as file:
+                    first: Any = file.pages[0]
+                    tags = {tag.code: tag.value for tag in first.tags.values()}
     kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
     unusual = kind > _PALETTE and (kind, packed) != (_YCBCR, _JPEG)
-    return unusual or tags.get(_ORIENTATION, 1) != 1
+    return bool(unusual or tags.get(_ORIENTATION, 1) != 1)

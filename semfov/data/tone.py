@@ -21,8 +21,10 @@ def check_white(white: White | None) -> None:
     """Raise `InputError` for what is no white."""
     if white is None or (isinstance(white, str) and white == "auto"):
         return
-    pair = white if isinstance(white, tuple | list) else (0.0, white)
-    fits = len(pair) == 2 and all(is_number(each) and np.isfinite(each) for each in pair) and pair[0] < pair[1]
+    pair: Sequence[Any] = white if isinstance(white, tuple | list) else (0.0, white)
+    # Numbers of NumPy and of a tensor, such as the largest of a picture, are numbers, too.
+    plain = [each.item() if getattr(each, "ndim", None) == 0 else each for each in pair]
+    fits = len(plain) == 2 and all(is_number(each) and np.isfinite(each) for each in plain) and plain[0] < plain[1]
     check(fits, "white", "a value above 0, (black, white) with black < white, or 'auto'", white)
 
 
@@ -34,13 +36,13 @@ def black_and_white(white: White, values: NDArray[Any], nodata: float | None = N
     >>> black_and_white("auto", np.arange(101))
     (1.0, 99.0)
     """
-    if white != "auto":
+    if not isinstance(white, str):
         pair = white if isinstance(white, tuple | list) else (0.0, white)
         return float(pair[0]), float(pair[1])
     there = values[np.isfinite(values) & (values != (np.nan if nodata is None else nodata))]
     if not there.size:
         return 0.0, 1.0
-    low, high = (float(each) for each in np.percentile(there, _PERCENTILES))
+    low, high = (float(each) for each in np.percentile(there.astype(np.float64), _PERCENTILES))
     return low, high if high > low else low + 1.0
 
 

@@ -108,7 +108,7 @@ def tone_of(
     if white is None and not wide:
         return None
     assert picture.path is not None
-    if white is not None and white != "auto":
+    if white is not None and not isinstance(white, str):
         return black_and_white(white, np.zeros(0))
     seen = []
     # What cannot be decoded is refused where it is read.

@@ -58,7 +58,8 @@ def _as_tensor(values: Any, argument: str) -> Tensor:
     if isinstance(values, Tensor):
         return values
     try:
-        return torch.as_tensor(np.asarray([*values] if isinstance(values, Sequence) else values))
+        array = np.asarray([*values] if isinstance(values, Sequence) else values)
+        return torch.as_tensor(array if array.flags.writeable else array.copy())
     except (TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{argument}: expected numbers, got {type(values).__name__} ({reason[:100]})") from None

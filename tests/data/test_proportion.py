@@ -217,3 +217,21 @@ def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
     with pytest.raises(DataError, match="cannot be opened"):
         open_large(tmp_path / "c.tif")
     assert not caplog.records
+
+
+def test_a_turned_tiff_that_pillow_does_not_read_is_refused(tmp_path):
+    """Nobody would turn it."""
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8), bigtiff=True, byteorder=">", extratags=[(274, "H", 1, 6, True)])
+    with pytest.raises(DataError, match="not an image in a format that is read"):
+        open_large(tmp_path / "a.tif")
+
+
+def test_the_alpha_of_16_bits_is_no_value_of_the_picture(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    values = np.dstack([pixels(60, 80).astype(np.uint16) * 4, np.full((60, 80), 65535, np.uint16)])
+    tags = [(42113, "s", 0, "none", True)]  # a word where a number should be
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=[2], extratags=tags)
+    with pytest.warns(UserWarning, match=r"values from \d+ to 10[12]\d of 16 bits"):
+        open_large(tmp_path / "a.tif")
+    assert whole(open_large(tmp_path / "a.tif", white="auto")).max() == 255

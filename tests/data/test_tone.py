@@ -96,5 +96,7 @@ def test_what_is_no_white_and_no_band_is_refused(tmp_path):
     for bands in (0, (1, 2), (1, 2, 0), 1.5, True):
         with pytest.raises(InputError, match="bands: expected"):
             open_large(tmp_path / "a.tif", bands=bands)
+    for white in (np.float32(40), np.int64(40), torch.tensor(40.0), np.array(40)):
+        assert int(open_large(tmp_path / "a.tif", white=white).pixels((0, 0, 1, 1))[0, 0, 0]) == 128
     with pytest.raises(InputError, match="bands: expected None but for TIFFs"):
         open_large(np.zeros((4, 5, 3), np.uint8), bands=1)
