@@ -257,7 +257,7 @@ def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
         most = 1.0 if image.mode == "F" else 65535.0
         if not (pixels.min() >= 0 and pixels.max() <= most):  # also refuses NaN
             expected = f"values from 0 to {most:g} in mode {image.mode}"
-            got = f"{pixels.min():g} to {pixels.max():g}; give white=(low, high) or white='auto'"
+            got = f"{pixels.min():g} to {pixels.max():g}; give white='auto', or the values that are black and white"
             raise DataError(f"{name}: expected {expected}, got {got}")
         pixels = pixels.astype(np.float32) / np.float32(most)
     return np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels

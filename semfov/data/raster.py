@@ -43,7 +43,7 @@ class RasterPicture(LargePicture):
         if "palette" in meanings:
             raise DataError(f"{path}: expected grey, RGB or bands, got a palette; convert it (gdal_translate)")
         if not kinds <= {"uint8", "uint16"} and (white is None or any("complex" in kind for kind in kinds)):
-            got = f"{', '.join(sorted(kinds))}; give white=(low, high) or white='auto'"
+            got = f"{', '.join(sorted(kinds))}; give white='auto', or the values that are black and white"
             raise DataError(f"{path}: expected bands of 8 or 16 bits, got {got}")
         named = tuple(meanings.index(name) + 1 for name in ("red", "green", "blue") if name in meanings)
         usual = named if len(named) == 3 else None

@@ -100,7 +100,7 @@ class TiffPicture(LargePicture):
         plain = page.dtype in (np.uint8, np.uint16)
         fits = kind in "uif" and len(page.shape) == 2 + (count > 1) and page.bitspersample == 8 * page.dtype.itemsize
         if not (fits and (plain or known)):
-            more = "give white=(low, high) or white='auto'" if fits else "convert it"
+            more = "give white='auto', or the values that are black and white" if fits else "convert it"
             raise DataError(f"{self.path}: expected 8 or 16 bits, got {page.dtype} {page.shape}; {more}")
         if page.photometric == _PALETTE:
             raise DataError(f"{self.path}: expected grey, RGB or bands, got a palette; convert it")
