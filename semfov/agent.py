@@ -444,6 +444,7 @@ class ActivePerception(nn.Module):
         worth: float | None = None,
         least: float | None = None,
         start: Start = None,
+        policy: str | None = None,
         seed: int = 0,
         color: Color = "rgb",
         white: White | None = None,
@@ -451,8 +452,7 @@ class ActivePerception(nn.Module):
     ) -> GazeRecord:
         """Explore a picture: learn which classes are where, without a target.
 
-        The exploration ends at the first limit that is reached, when nothing is left to look at, or when no look is
-        expected to gain at least `worth`.
+        It ends at the first limit that is reached, or when no look is expected to gain at least `worth`.
 
         Args:
             picture: as for `search`.
@@ -462,11 +462,11 @@ class ActivePerception(nn.Module):
             seconds: longest time in seconds on this machine.
             duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
             on_look: called after each look with the record so far; returning False ends the exploration.
-            worth: least expected gain of a look: of a fovea with a learned map the further cells that are right
-                (`semfov.acquisition.ExpectedGain`; None takes 0.1), of windows the new objects (None takes 0.01), of a
-                head the further cells that are right. 0 makes all looks.
+            worth: least expected gain of a look: of a fovea with a learned map (None takes 0.1) or of a head the
+                further right cells, of windows the new objects (None takes 0.01). 0 makes all looks.
             least: score or probability from which on an object counts, as for `find_all`.
             start: first cell of a fovea or first action of a head, as for `search`.
+            policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.
             seed: seed of the generator that draws the start and breaks ties.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
@@ -481,13 +481,13 @@ class ActivePerception(nn.Module):
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
         opened = open_picture(picture, color, white, bands)
-        kind = self._kind(opened, how, shifts, duration, foveal=start is not None)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
+        kind = self._kind(opened, how, shifts, duration, foveal=start is not None or policy is not None)
+        check(policy is None or (policy == "people" and kind == "fovea"), "policy", "'people' for a fovea", policy)
         if kind == "fovea":
-            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth}
-            return _counting(self.fovea.explore(image, bounds, **given), least)
-        arguments = without_none(worth=worth, **limits)
+            given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
+            seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)
+            return _counting(self.fovea.explore(seen, bounds, **given), least)
+        arguments = without_none(worth=worth, passes=passes, seconds=seconds, on_look=on_look)
         if kind == "head":
             arguments |= without_none(start=start, duration=duration)
             return _counting(self.head.explore(opened.world, seed=seed, **arguments), least)

@@ -13,8 +13,10 @@ from semfov.detection import Detections
 from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
+from semfov.gaze import saliency
 from semfov.gaze.policies import KL, NonPredictive, Predictive, Random
 from semfov.io.state import without_settings
+from semfov.paths import GazePrediction
 from semfov.sensor import foveate
 from tests.small import Coloured
 from tests.small import agent as one_agent
@@ -432,3 +434,23 @@ def test_agents_and_streams_are_printed_in_one_line():
     assert "coloured, 2 classes" in text
     live = agent.live("red", how="fovea")
     assert repr(live) == "LivePerception: searching for “red”, how='fovea'"
+
+
+def test_an_exploration_as_people_look_follows_the_density(agent, image, monkeypatch):
+    """People who look at one place alone are followed there; the looks are those of any exploration."""
+    model = saliency.FixationDensity({"none": 1}).requires_grad_(False)
+    where = torch.full((1, 39, 52), -30.0)
+    where[0, 20:25, 30:36] = 30.0
+    terms = {"map": where, "centre bias": torch.zeros(1, 39, 52)}
+    seen = GazePrediction(model, terms, SIZE, torch.zeros(3, 6, 8, dtype=torch.uint8))
+    monkeypatch.setattr(GazePrediction, "of", classmethod(lambda cls, detector, image: seen))
+    path = agent.explore(image, policy="people", shifts=1, start=0)
+    x, y = path.fixations[1].tolist()
+    cell = 8, 6
+    assert 30 / 52 - 1 / cell[0] < x / SIZE[0] < 36 / 52 + 1 / cell[0]
+    assert 20 / 39 - 1 / cell[1] < y / SIZE[1] < 25 / 39 + 1 / cell[1]
+    assert len(agent.explore(image, policy="people", shifts=5, start=0)) == 6
+    with pytest.raises(InputError, match="policy"):
+        agent.explore(image, policy="cats")
+    with pytest.raises(InputError, match="policy"):
+        agent.explore(image, how="windows", policy="people")

@@ -33,8 +33,9 @@ from semfov.episode import LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Greedy, drawn_by, first_cell
-from semfov.paths import Ending, FoveaMoment, RecordedLook, Scanpath, Stimulus, Trace
+from semfov.gaze.choice import Choice, Greedy, drawn_by, first_cell
+from semfov.gaze.viewer import Viewer
+from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath, Stimulus, Trace
 from semfov.paths.stimulus import in_bytes
 from semfov.strategy import Strategy
 
@@ -103,6 +104,7 @@ class FoveaAgent:
         shifts: int | None = None,
         seed: int = 0,
         worth: float | None = None,
+        policy: str | None = None,
     ) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`)."""
         observer = self.exploring.observer
@@ -110,9 +112,12 @@ class FoveaAgent:
             raise InputError(
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
             )
-        episode = FoveaEpisode(self, limits=limits, start=start, shifts=_shifts(shifts, 20, limits), seed=seed)
+        viewed = None if policy is None else GazePrediction.of(self.eye.detector, image[0])
+        episode = FoveaEpisode(
+            self, limits=limits, start=start, shifts=_shifts(shifts, 20, limits), seed=seed, viewed=viewed
+        )
         grid = episode.open(image)
-        if isinstance(observer, LearnedMap):
+        if isinstance(observer, LearnedMap) and (policy is None or worth is not None):
             episode.ends = outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
         return episode.run()
 
@@ -157,6 +162,7 @@ class FoveaEpisode(Episode[Scanpath]):
             of the belief alone, which a belief that fades can reach.
         closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+        viewed: where people look in the picture; the gaze then moves as theirs does (`semfov.gaze.Viewer`).
 
     Attributes:
         ends: function from a step to the number of its outcome (`semfov.decision.OUTCOMES`), 0 to go on.
@@ -184,10 +190,11 @@ class FoveaEpisode(Episode[Scanpath]):
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
         color: Color = "rgb",
+        viewed: GazePrediction | None = None,
     ) -> None:
         super().__init__(("background", *agent.eye.detector.classes), target, (), limits, rate)
         usual = agent.exploring if target is None else agent.searching
-        self.agent, self.eye, self.color = agent, agent.eye, color
+        self.agent, self.eye, self.color, self.viewed = agent, agent.eye, color, viewed
         self.strategy = usual if strategy is None else strategy
         self.verification, self.closer = None if target is None else agent.deciding(closer), closer
         own = self.strategy.observer.thresholds
@@ -216,12 +223,16 @@ class FoveaEpisode(Episode[Scanpath]):
         self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
         start, generator = self._first
         self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target)
+        first, viewed = torch.tensor([start], device=image.device), self.viewed
+        choice: Choice = Greedy(drawn_by(generator, len(grid), image))
+        if viewed is not None:
+            choice = Viewer(viewed.model, viewed.terms, grid, first.cpu(), generator)
         self._steps: Iterator[Step] = rollout(
             self._looks,
             self.strategy.observer,
             self.strategy.policy(self.target, grid),
-            torch.tensor([start], device=image.device),
-            Greedy(drawn_by(generator, len(grid), image)),
+            first,
+            choice,
             most=self._most,
             forgetting=self.forgetting,
         )

@@ -3,6 +3,7 @@
 from semfov.gaze import acquisition, policies, saliency
 from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax, select_fixation, soft_fixation
 from semfov.gaze.policies import Policy
+from semfov.gaze.viewer import Viewer
 
 __all__ = [
     "Choice",
@@ -11,6 +12,7 @@ __all__ = [
     "Policy",
     "Relaxed",
     "Softmax",
+    "Viewer",
     "acquisition",
     "policies",
     "saliency",

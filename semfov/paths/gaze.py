@@ -249,6 +249,26 @@ class GazePrediction:
 
         return plot_gaze(self, ax=ax, **options)
 
+    def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
+        """Make a film of drawn viewers: a frame after each fixation, with the mean density of their next ones.
+
+        Args:
+            path: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film for a
+                notebook.
+            options: `people`, the number of viewers; `duration`, the seconds for which each views the picture;
+                `seconds` of a frame; `hold`, the additional seconds of the last one; and `seed`.
+
+        Returns:
+            The path, or an object that a notebook shows as an animation.
+
+        Raises:
+            InputError: an option is out of range.
+            DataError: the file cannot be written.
+        """
+        from semfov.viz.gaze import animate_gaze
+
+        return animate_gaze(self, path, **options)
+
     def report(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> Path:
         """Write an HTML page with the density, contours and scanpaths, a single file that loads nothing from elsewhere.
 

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
+from semfov.errors import check
 from semfov.paths.gaze import GazePrediction
+from semfov.viz.animation import Film, render
 from semfov.viz.drawing import draw_image
 from semfov.viz.style import GAZE, line_style, make_figure, only, overlay_colours, styled
 
@@ -20,17 +27,26 @@ MASSES = (0.8, 0.5, 0.25)
 
 
 @styled
-def plot_gaze(prediction: GazePrediction, *, ax: Axes | None = None, scanpaths: Sequence[Fixations] = ()) -> Figure:
-    """Draw the density of fixations over the grey picture, its peaks in order, and scanpaths."""
+def plot_gaze(
+    prediction: GazePrediction,
+    *,
+    ax: Axes | None = None,
+    scanpaths: Sequence[Fixations] = (),
+    cells: Tensor | None = None,
+) -> Figure:
+    """Draw a density of fixations over the grey picture, its peaks in order, and scanpaths.
+
+    Shapes: cells `(rows, columns)`, the density; None takes that of all fixations, with its peaks.
+    """
     width, height = prediction.size
     figure, (axes,) = make_figure(1, 1, width=6.4, height=6.4 * height / width + 0.35, axes=only(ax))
     draw_image(axes, prediction.image, Grid(1, 1, prediction.size), grey=True)
-    cells = prediction.cells.numpy()
-    axes.imshow(cells / cells.max(), extent=(0, width, height, 0), cmap=overlay_colours(), interpolation="bilinear")
+    shown = (prediction.cells if cells is None else cells).numpy()
+    axes.imshow(shown / shown.max(), extent=(0, width, height, 0), cmap=overlay_colours(), interpolation="bilinear")
     for order, each in enumerate(scanpaths):
         points = each.resized(prediction.size).points + 0.5
         axes.plot(*points.T, "-o", color=line_style(order, len(scanpaths))["color"], markersize=3, linewidth=1)
-    for number, peak in enumerate(prediction.peaks(), 1):
+    for number, peak in enumerate(prediction.peaks() if cells is None else [], 1):
         place = peak["x"] + 0.5, peak["y"] + 0.5
         axes.annotate(
             str(number), place, color="white", ha="center", va="center",
@@ -38,3 +54,29 @@ def plot_gaze(prediction: GazePrediction, *, ax: Axes | None = None, scanpaths: 
         )  # fmt: skip
     axes.set(title=prediction.describe(), xlim=(0, width), ylim=(height, 0))
     return figure
+
+
+def animate_gaze(
+    prediction: GazePrediction,
+    path: str | PathLike[str] | None = None,
+    *,
+    people: int = 15,
+    duration: float = 3.0,
+    seconds: float = 0.8,
+    hold: float = 2.0,
+    seed: int = 0,
+) -> Path | Film:
+    """A film of drawn viewers: a frame after each fixation, with the mean density of their next ones."""
+    check(seconds > 0 and hold >= 0, "seconds, hold", "a positive time, and 0 seconds or more", (seconds, hold))
+    viewers = prediction.scanpaths(people, seconds=duration, seed=seed)
+
+    def frame(number: int) -> Figure:
+        seen = [replace(each, points=each.points[:number], durations=None) for each in viewers] if number else []
+        cells = prediction.given(viewers, number) if number else prediction.cells
+        figure = plot_gaze(prediction, scanpaths=seen, cells=cells)
+        figure.axes[0].set_title(f"after {number} fixation{'' if number == 1 else 's'} of {people} viewers")
+        return figure
+
+    frames = render(frame(number) for number in range(max(map(len, viewers)) + 1))
+    film = Film(frames, seconds, hold, prediction.describe())
+    return film if path is None else film.save(path)[0]

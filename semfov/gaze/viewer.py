@@ -1,0 +1,61 @@
+"""The choice of the next fixation by people who view a picture freely."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.gaze.choice import Choice
+from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency.fixation_density import FixationDensity
+
+
+class Viewer(Choice):
+    """Draw each fixation from the density of people's next fixations, after the fixations so far.
+
+    A cell is drawn with the probability that the density has in it, among the cells not visited, as for any policy.
+    The values of the acquisition function do not matter.
+
+    Args:
+        model: density of people's fixations.
+        terms: its terms for the picture (`FixationDensity.terms`, without a scanpath).
+        grid: the cells over the picture.
+        start: `(B,)`, the first cell of each episode.
+        generator: random generator of the draws.
+
+    >>> model, grid = FixationDensity({"backbone8": 3}).requires_grad_(False), Grid(4, 3, (80, 60))
+    >>> terms = model.terms({"backbone8": torch.rand(1, 3, 6, 8)}, (60, 80))
+    >>> choice = Viewer(model, terms, grid, torch.tensor([5]), torch.Generator().manual_seed(0))
+    >>> visited = torch.arange(12)[None] != 7
+    >>> choice(0, torch.tensor([0]), torch.zeros(1, 12), visited, grid.centres)[1]
+    tensor([7])
+    """
+
+    def __init__(
+        self,
+        model: FixationDensity,
+        terms: Mapping[str, Tensor],
+        grid: Grid,
+        start: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.model, self.terms, self.grid, self.generator = model, terms, grid, generator
+        self.path = grid.centres.to(model.read)[start][:, None]
+
+    @torch.no_grad()
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the centre of the drawn cell and the cell; any cell where all were visited."""
+        size = self.grid.size[1], self.grid.size[0]
+        rows, free = episodes.to(self.path.device), ~visited.to(self.path.device)
+        log = torch.stack([*self.model.given(self.terms, size, self.path[rows]).values()]).sum(0)
+        density = cell_saliency(log.flatten(1).double().softmax(1).view_as(log), self.grid.columns, self.grid.rows)
+        # Where nothing is left, or the rest has no probability, all that is left is alike.
+        left = (density + torch.finfo(density.dtype).tiny) * (free | ~free.any(-1, keepdim=True))
+        cell = left.cpu().multinomial(1, generator=self.generator)[:, 0].to(visited.device)
+        following = self.path[:, -1].clone()
+        following[rows] = centres[cell].to(following)
+        self.path = torch.cat([self.path, following[:, None]], 1)
+        return centres[cell], cell
