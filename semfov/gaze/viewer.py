@@ -48,7 +48,7 @@ class Viewer(Choice):
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the centre of the drawn cell and the cell; any cell where all were visited."""
-        size = self.grid.size[1], self.grid.size[0]
+        size = int(self.grid.size[1]), int(self.grid.size[0])
         rows, free = episodes.to(self.path.device), ~visited.to(self.path.device)
         log = torch.stack([*self.model.given(self.terms, size, self.path[rows]).values()]).sum(0)
         density = cell_saliency(log.flatten(1).double().softmax(1).view_as(log), self.grid.columns, self.grid.rows)
