@@ -403,7 +403,7 @@ def test_the_kind_of_look_follows_from_the_picture(agent):
     assert agent.kind_of_look(large.permute(1, 2, 0).numpy()) == "windows"
     assert agent.kind_of_look(large, "fovea") == "fovea"
     assert agent.search(large, "red", how="fovea", shifts=1).image.shape == large.shape
-    with pytest.raises(InputError, match=r"shifts: expected None .* use passes=, or how='fovea'"):
+    with pytest.raises(InputError, match=r"shifts: expected none .* use passes=, or how='fovea'"):
         agent.search(large, "red", shifts=2)
     with pytest.raises(InputError, match="unknown kind of look 'zoom'"):
         agent.search(small, "red", how="zoom")
