@@ -46,35 +46,39 @@ def predict_gaze(options: GazeOptions) -> int:
         sources = [PictureSource("embedded scene", scene=scene)]
     drawn: list[DrawnGaze] = []
     skipped = 0
-    for source in tqdm(
-        sources, unit="picture", leave=False, disable=len(sources) == 1 or options.quiet or not sys.stderr.isatty()
-    ):
-        try:
-            image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
-            prediction = GazePrediction.of(detector, image, source=None if source.file is None else str(source.file))
-        except SemfovError as error:
-            if len(sources) == 1:
-                raise
-            skipped += 1
-            tqdm.write(f"skipped {source.name}: {error}", file=sys.stderr)
-            continue
-        paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-        drawn.append(DrawnGaze(prediction, tuple(paths)))
-        places = "; ".join(
-            f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
-            for number, peak in enumerate(prediction.peaks(), 1)
-        )
-        terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
-        mean = sum(map(len, paths)) / len(paths)
-        tqdm.write(
-            f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
-            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
-            file=sys.stdout,
-        )
-    if drawn:
-        written = _write(options, kind, drawn)
-        if written:
-            print("written:", *(f"  {path}" for path in written), sep="\n")
+    try:
+        for source in tqdm(
+            sources, unit="picture", leave=False, disable=len(sources) == 1 or options.quiet or not sys.stderr.isatty()
+        ):
+            try:
+                image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
+                prediction = GazePrediction.of(
+                    detector, image, source=None if source.file is None else str(source.file)
+                )
+            except SemfovError as error:
+                if len(sources) == 1:
+                    raise
+                skipped += 1
+                tqdm.write(f"skipped {source.name}: {error}", file=sys.stderr)
+                continue
+            paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
+            drawn.append(DrawnGaze(prediction, tuple(paths)))
+            places = "; ".join(
+                f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
+                for number, peak in enumerate(prediction.peaks(), 1)
+            )
+            terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
+            mean = sum(map(len, paths)) / len(paths)
+            tqdm.write(
+                f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
+                f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
+                file=sys.stdout,
+            )
+    finally:  # a command that is stopped has written the pictures so far
+        if drawn:
+            written = _write(options, kind, drawn)
+            if written:
+                print("written:", *(f"  {path}" for path in written), sep="\n")
     return 1 if skipped else 0
 
 

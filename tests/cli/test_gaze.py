@@ -11,6 +11,7 @@ from semfov.cli.main import main
 from semfov.data.fixations import by_picture, read_table
 from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
+from semfov.paths import GazePrediction
 
 
 class Colours(Detector):
@@ -66,6 +67,21 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert "Where most fixations are expected" in html
     assert "<script src" not in html
     assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_a_command_that_is_stopped_has_written_the_pictures_so_far(run, photos, tmp_path, monkeypatch):
+    made = GazePrediction.of
+
+    def stopped(detector, image, **options):
+        if options["source"].endswith("1.png"):
+            raise KeyboardInterrupt
+        return made(detector, image, **options)
+
+    monkeypatch.setattr(GazePrediction, "of", stopped)
+    code, out, _ = run(photos, "--people", 2, "--out", tmp_path / "gaze.csv")
+    assert code == 130
+    assert {each.picture for each in read_table(tmp_path / "gaze.csv")} == {"0.png"}
+    assert "gaze.csv" in out
 
 
 def test_the_seed_repeats_the_table(run, photos, tmp_path):
