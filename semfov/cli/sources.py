@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from glob import glob
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -28,7 +28,7 @@ class PictureSource(NamedTuple):
     file: Path | None = None
     scene: Picture | None = None
     place: Path = Path("embedded-scene")
-    shown: Mapping[str, Any] = field(default_factory=dict)
+    shown: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def boxes(self) -> Tensor | None:
