@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import field
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +17,7 @@ class Section(NamedTuple):
     """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first."""
 
     kind: str
-    options: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, str]
     where: str = "cfg"
 
     def text(self, key: str, default: str | None = None) -> str:
