@@ -10,6 +10,7 @@ import json
 import platform
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -218,14 +219,12 @@ def look_everywhere(
 
 def versions() -> dict[str, object]:
     """Versions of semfov, of its libraries and of the machine, on which numerical results depend."""
-    import kornia
-    import torchvision
-
     return {
         "semfov": __version__,
         "torch": torch.__version__,
-        "torchvision": torchvision.__version__,
-        "kornia": kornia.__version__,
+        # To import them would take seconds.
+        "torchvision": version("torchvision"),
+        "kornia": version("kornia"),
         "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
     }
 
