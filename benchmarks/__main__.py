@@ -5,8 +5,10 @@ one thread, the default, times are CPU times, which other work on the machine ch
 are elapsed times. Results go to `benchmarks/results/NAME.md` and `NAME.json`.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 
@@ -17,7 +19,7 @@ from benchmarks.kernels import fixations, half, lookahead, pictures, pyramid, ro
 from benchmarks.rollouts import rollouts
 from benchmarks.saliency import saliency
 from benchmarks.sensor import foveation
-from benchmarks.tables import begin, command, comparison_rows, page, table, write
+from benchmarks.tables import begin, command, comparison_rows, page, ratios_of, table, write
 from benchmarks.timing import Comparison, measure
 
 COMPARISONS: tuple[Callable[[], Comparison], ...] = (
@@ -51,14 +53,16 @@ def main() -> None:
     """Measure everything and write the table."""
     parser = command("benchmarks", __doc__, seconds=4.0)
     parser.add_argument("--name", default="cpu", help="name of the result files")
+    parser.add_argument("--before", type=Path, help="JSON of a run of earlier code on this machine, for a column")
     options = parser.parse_args()
     clock, about = begin(options)
+    earlier = {} if options.before is None else ratios_of(json.loads(options.before.read_text(encoding="utf-8")))
     measured, rows = [], []
     for make in COMPARISONS:
         measured.append(measure(make(), options.seconds, clock))
-        rows += comparison_rows(measured[-1])
+        rows += comparison_rows(measured[-1], earlier)
         print(" | ".join(rows[-1]), flush=True)
-    head = ["work", "peer", "semfov, ms", "peer, ms", "peer / semfov"]
+    head = ["work", "peer", "semfov, ms", "peer, ms", "peer / semfov", *(["before"] if earlier else [])]
     figures = {"machine": about, "comparisons": [asdict(each) for each in measured]}
     write(options.out, options.name, page("Benchmarks", TEXT, about, table(head, rows)), figures)
 

@@ -4,6 +4,7 @@ import argparse
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from benchmarks.machine import describe, use_threads
 from benchmarks.timing import Clock, Measured, Spread, clock_for
@@ -37,11 +38,24 @@ def spread(values: Spread) -> str:
     return f"{number(values.middle)} ({number(values.low)} to {number(values.high)})"
 
 
-def comparison_rows(measured: Measured) -> list[list[str]]:
-    """Table rows of a comparison, one for each peer."""
-    times = measured.milliseconds
+def ratios_of(figures: Mapping[str, Any]) -> dict[tuple[str, str], Spread]:
+    """Ratios by work and peer from the JSON of a run."""
+    every = [(each["name"], each["ratios"]) for each in figures["comparisons"]]
+    return {(name, peer): Spread(**ratio) for name, ratios in every for peer, ratio in ratios.items()}
+
+
+def comparison_rows(measured: Measured, earlier: Mapping[tuple[str, str], Spread] | None = None) -> list[list[str]]:
+    """Table rows of a comparison, one for each peer, with the ratios of an earlier run in a last column."""
+    times, name = measured.milliseconds, measured.name
     return [
-        [measured.name, peer, number(times["semfov"].middle), number(times[peer].middle), spread(ratio)]
+        [
+            name,
+            peer,
+            number(times["semfov"].middle),
+            number(times[peer].middle),
+            spread(ratio),
+            *([] if not earlier else [spread(earlier[name, peer]) if (name, peer) in earlier else ""]),
+        ]
         for peer, ratio in measured.ratios.items()
     ]
 
