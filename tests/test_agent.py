@@ -1,6 +1,7 @@
 """The agent as a whole, with a detector that sees coloured squares."""
 
 import copy
+import pickle
 
 import pytest
 import torch
@@ -53,6 +54,24 @@ def test_search_goes_to_the_target(agent, image):
     assert scanpath.probabilities.shape == (len(scanpath), 48, 3)
     assert torch.equal(scanpath.fixations, grid.centres[scanpath.cells])
     assert len(set(scanpath.cells.tolist())) == len(scanpath)
+
+
+def test_the_map_of_all_classes_is_made_when_it_is_read(agent, image, monkeypatch):
+    updates, update = [], Semantic.update
+
+    def counted(self, belief, look):
+        updates.append(self)
+        return update(self, belief, look)
+
+    monkeypatch.setattr(Semantic, "update", counted)
+    path = agent.search(image, "green", start=0, shifts=2)
+    looks = [each for each in updates if each is agent.exploring.observer]
+    assert looks == []
+    copied = pickle.loads(pickle.dumps(path))
+    assert len([each for each in updates if each is agent.exploring.observer]) == len(path)
+    torch.testing.assert_close(path.posterior, copied.probabilities[..., path.target])
+    assert torch.equal(path.probabilities, copied.probabilities)
+    assert copied.describe() == path.describe()
 
 
 @pytest.mark.parametrize("how", ["fovea", "windows"])

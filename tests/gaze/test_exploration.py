@@ -17,7 +17,8 @@ from semfov.gaze.acquisition import (
     TwoPeaks,
     UpperConfidenceBound,
 )
-from tests.small import values_of
+from semfov.gaze.acquisition.lookahead import sampled_likelihoods
+from tests.small import rand, values_of
 
 ACQUISITIONS = {
     "kl": KLDivergence,
@@ -119,6 +120,16 @@ def test_equals_brute_force(name, shape, model):
         values = values_of(acquisition, beta.to(dtype))
         assert values.dtype == dtype
         torch.testing.assert_close(values.double(), expected, rtol=tolerance, atol=ROUNDING[dtype])
+
+
+@pytest.mark.parametrize("samples", [0, 3])
+def test_blocks_of_cells_change_no_bit(model, samples, monkeypatch):
+    drawn = sampled_likelihoods(model, samples) if samples else None
+    value = KLDivergence(model, Grid(5, 4, (100, 80)), likelihoods=drawn)
+    beta = 0.5 + rand(20, len(model.classes) + 1)
+    expected = values_of(value, beta)
+    monkeypatch.setattr("semfov.gaze.acquisition.lookahead._BLOCK", 100)
+    assert torch.equal(values_of(value, beta), expected)
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)

@@ -80,3 +80,10 @@ def test_bad_image(image: torch.Tensor) -> None:
     for function in (opponent_colours, double_opponency, lab_colours):
         with pytest.raises(InputError, match="image: expected"):
             function(image)
+
+
+def test_rows_that_are_worked_on_together_change_no_bit(monkeypatch) -> None:
+    image = torch.rand(2, 3, 37, 50, generator=torch.Generator().manual_seed(0))
+    expected = double_opponency(image)
+    monkeypatch.setattr("semfov.gaze.saliency.opponent._PIXELS", 300)
+    assert torch.equal(double_opponency(image), expected)
