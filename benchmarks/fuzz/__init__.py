@@ -12,6 +12,7 @@ from benchmarks.fuzz.borders import dtypes, frames, labels, tables, tiff_tags
 from benchmarks.fuzz.images import image_files
 from benchmarks.fuzz.models import darknet_files, model_fields, model_files
 from benchmarks.fuzz.onnx_models import onnx_files
+from benchmarks.fuzz.onnx_outputs import onnx_outputs
 from benchmarks.fuzz.stores import look_files, part_files
 from benchmarks.fuzz.tensors import boxes_on_grids, fixations, fusion_rules, observations, saliency_maps
 
@@ -30,6 +31,7 @@ TARGETS = {
         darknet_files,
         model_fields,
         onnx_files,
+        onnx_outputs,
         part_files,
         look_files,
         agent_arguments,

@@ -62,7 +62,7 @@ class Case:
             assert "\n" not in message, message
             assert self.may, message
             assert self.names is None or message.partition(":")[0] in self.names, message
-            return type(error).__name__
+            return DataError.__name__ if isinstance(error, DataError) else InputError.__name__
         assert not (self.may if self.must is None else self.must), f"let through: {result}"
         return self.check(result) or "result"
 

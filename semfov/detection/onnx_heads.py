@@ -373,6 +373,15 @@ def _candidates(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candid
     )
 
 
+def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+    raw = _first(outputs)
+    if values_known(raw) and raw.numel():
+        low, high = map(float, raw[..., :4].aminmax())
+        form = "offsets from cells and logarithms of sizes, some of them below 0"
+        check(not 0 <= low < high <= 1, "output of the head", form, "numbers from 0 to 1, as fractions of the canvas")
+    return _decode_yolox(raw, canvas)
+
+
 def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
@@ -408,7 +417,7 @@ def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates
 
 HEADS: dict[str, _DetectionHead] = {
     "candidates": _DetectionHead(_candidates),
-    "yolox": _DetectionHead(lambda outputs, canvas, _: _decode_yolox(_first(outputs), canvas), _YOLOX),
+    "yolox": _DetectionHead(_yolox, _YOLOX),
     "yolox-decoded": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_first(outputs)), _YOLOX),
     "yolov5": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_rows(outputs, canvas))),
     "yolov8": _DetectionHead(lambda outputs, canvas, _: decode_yolov8(_rows(outputs, canvas, across=True).mT)),
