@@ -34,7 +34,7 @@ def onnx_outputs(draw: Draw, folder: Path) -> Case:
         metadata["task"] = draw.choose(("segment", "pose", "obb", "classify"), "task")
     written = boxes
     if wrong == "fractions":
-        written = boxes / np.array(canvas * 2, np.float32)
+        written = (boxes / np.array([*canvas, *canvas])).astype(np.float32)
     elif wrong == "far":
         written = boxes + 5000
     written_scores = 12 * scores - 6 if wrong == "logits" and form not in ("rtdetr", "detr") else scores
@@ -121,7 +121,7 @@ def _rtdetr(boxes: _Array, scores: _Array, canvas: tuple[int, int], probabilitie
 
 
 def _fractions(boxes: _Array, canvas: tuple[int, int]) -> _Array:
-    return _centred(boxes) / np.array(canvas * 2, np.float32)
+    return (_centred(boxes) / np.array([*canvas, *canvas])).astype(np.float32)
 
 
 def _v8(boxes: _Array, scores: _Array) -> _Array:

@@ -173,21 +173,27 @@ def _fractions(boxes: Tensor, canvas: tuple[int, int]) -> Tensor:
 def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
     """What boxes `(B, N, 4)` of one pass look like if another head has made them, in words; None for boxes in place."""
     rows = boxes.detach().reshape(-1, 4).double()
-    rows = rows[(rows != 0).any(-1)]  # empty rows of a network that selects boxes itself
+    rows = rows[(rows != 0).any(-1)][:_ENOUGH]  # empty rows of a network that selects boxes itself
     if not len(rows):
         return None
+    low, high, size = rows[:, :2], rows[:, 2:], rows.new_tensor(canvas)
+    middle = (low + high) / 2
     if not bool(rows.isfinite().all()):
         return "boxes that are not finite"
-    low, high = rows[:, :2], rows[:, 2:]
-    if float(rows.abs().max()) <= _FRACTIONS < min(canvas):
-        return "fractions of the canvas instead of pixels"
-    if float((high < low).any(-1).double().mean()) > _MOST_MISPLACED:
-        return "boxes whose right or lower edge comes first"
-    size = rows.new_tensor(canvas)
-    away = ((low + high) / 2 - size / 2).abs() > size
-    if float(away.any(-1).double().mean()) > _MOST_MISPLACED:
-        return f"boxes around {[*((low + high) / 2).median(0).values.round().long().tolist()]}, outside the canvas"
-    return None
+    spread = middle.quantile(0.9, 0) - middle.quantile(0.1, 0)
+    many = len(rows) >= _MANY and bool((spread > size / 4).all())
+
+    def mostly(odd: Tensor) -> bool:
+        return float(odd.any(-1).double().mean()) > _MOST_MISPLACED
+
+    places = middle.median(0).values.round().long().tolist()
+    forms = {
+        "fractions of the canvas instead of pixels": float(rows.abs().max()) <= _FRACTIONS < min(canvas),
+        "boxes whose right or lower edge comes first": mostly(high < low),
+        "corners of boxes that were read as their centres and sizes": many and bool((high >= 3 * low).all()),
+        f"boxes around {places}, outside the canvas": mostly((middle - size / 2).abs() > size),
+    }
+    return next((form for form, fits in forms.items() if fits), None)
 
 
 _Outputs = Mapping[str, Tensor]
@@ -195,6 +201,10 @@ _Canvas = tuple[int, int]
 
 _FRACTIONS = 2.0
 """Coordinates up to here, of all boxes of a canvas, are no pixels."""
+_ENOUGH = 100_000
+"""Number of boxes whose places are looked at."""
+_MANY = 20
+"""Number of boxes from which on all of them do not begin in the upper left corner."""
 _MOST_MISPLACED = 0.5
 """Share of the boxes of a pass that may lie elsewhere."""
 

@@ -24,7 +24,7 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-_MOST_MEMORY = 3 * 2**28
+_MOST_MEMORY = 2**29
 """Bytes for the tensors of models whose sizes depend on values, all together."""
 _MOST_SECONDS = 10.0
 """Longest pass of such a model for one image."""

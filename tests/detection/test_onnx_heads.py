@@ -228,3 +228,10 @@ def test_end_to_end_rows_are_one_hot_vectors():
 def test_boxes_of_another_head_are_told_by_their_places(box, message):
     found = heads.misplaced(torch.tensor([[box]]), (64, 64))
     assert found is None if message is None else re.search(message, found)
+
+
+def test_corners_that_were_read_as_centres_and_sizes_are_told():
+    low, size = 64 * noise(1, 84, 2).sigmoid(), 20 * noise(1, 84, 2, seed=1).sigmoid()
+    rows = torch.cat([low, low + size, noise(1, 84, 3).sigmoid()], -1)
+    assert heads.misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
+    assert "corners" in heads.misplaced(heads.decode_yolov8(rows.mT).boxes, (64, 64))
