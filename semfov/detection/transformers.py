@@ -121,7 +121,7 @@ def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, in
     >>> _size({"size": 800, "max_size": 1333}, {}), _size({"size": [480, 640]}, {})
     ({'shortest_edge': 800, 'longest_edge': 1333}, {'height': 480, 'width': 640})
     """
-    given = settings.get("size") or usual
+    given = usual if settings.get("size") in (None, {}) else settings["size"]
     if isinstance(given, int):
         given = {"shortest_edge": given, "longest_edge": settings.get("max_size")}
     elif isinstance(given, list | tuple) and len(given) == 2:
@@ -130,7 +130,7 @@ def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, in
         name: value for name, value in dict(given if isinstance(given, Mapping) else {}).items() if value is not None
     }
     kinds = [{"height", "width"}, {*_MOST}, {*_EDGES}, *({name} for name in _EDGES)]
-    whole = all(isinstance(value, int) and 0 < value <= _LARGEST for value in size.values())
+    whole = all(type(value) is int and 0 < value <= _LARGEST for value in size.values())
     wanted = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"
     check(whole and set(size) in kinds, "processor size", wanted, excerpt(settings.get("size")))
     return size

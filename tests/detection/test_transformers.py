@@ -246,7 +246,7 @@ def test_pixels_are_scaled_as_by_the_image_processor(settings, factor):
 
 
 def test_settings_that_would_be_ignored_are_refused():
-    for size in ({"height": 64}, {"width": 0, "height": 64}, "large", {"shortest_edge": 1e9}, [640]):
+    for size in ({"height": 64}, {"width": 0, "height": 64}, "large", {"shortest_edge": 1e9}, [640], 0, True):
         with pytest.raises(InputError, match="processor size: expected height and width, max_height"):
             load_detector(small("detr"), processor={"size": size})
     model = small("rt_detr")
