@@ -143,7 +143,7 @@ KNOWN = {
     "docs/detectors.md": {
         f"({_DETECTOR.threshold}), ({_DETECTOR.iou}, over all classes), ({_DETECTOR.limit})": "code",
         f"{len(COCO_CLASSES)} scores": "code",
-        "take 768 MiB and a pass 10 s": "code, tested with such models",
+        "take 512 MiB and a pass 10 s": "code, tested with such models",
         "in [0, 1]": "a range",
         "counts 1, a wrong place or a find in a photograph without the target -1, and no find 0": "a rule",
         "91 scores": "COCO's category ids with their gaps",
