@@ -7,7 +7,7 @@ import io
 import sys
 import tarfile
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -160,7 +160,7 @@ def test_one_file_is_taken_from_a_source_distribution_without_running_it(package
 )
 def test_unsuitable_distributions_are_refused(package, tmp_path, change, message):
     with pytest.raises(DataError, match=message):
-        replace(package, **change).fetch(tmp_path / "out")
+        package._replace(**change).fetch(tmp_path / "out")
 
 
 def test_a_missing_pip_is_named_in_the_error(package, tmp_path, monkeypatch):

@@ -1,6 +1,6 @@
 """The search protocol against a scalar reference and the hypergeometric formula, and with other batch sizes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -158,7 +158,7 @@ def test_controls_change_only_the_cue_or_the_goal(scenes):
     moved = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3, control="permuted"))
     assert all(episode.cue == episode.target for episode in plain + moved)
     assert all(episode.cue != episode.target and 1 <= episode.cue <= 3 for episode in wrong)
-    assert [replace(episode, cue=episode.target) for episode in wrong] == plain
+    assert [episode._replace(cue=episode.target) for episode in wrong] == plain
     assert [len(episode.goal) for episode in moved] == [len(episode.goal) for episode in plain]
     assert [episode.goal for episode in moved] != [episode.goal for episode in plain]
     assert all(episode.start not in episode.goal for episode in moved)
@@ -188,7 +188,7 @@ def test_starts_repeat_evenly_when_there_are_more_than_cells(scenes):
 def test_a_search_ends_when_no_cell_is_left(scenes, look):
     protocol = ProtocolConfig(starts=2, shifts=40)
     episodes = episodes_of(scenes, 0, 5, 5, protocol)[:1]
-    hidden = [episodes[0].__class__(**{**episodes[0].__dict__, "goal": ()})]
+    hidden = [episodes[0]._replace(goal=())]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
     candidate = Candidate(Strategy(FixedLook(look), policies.Random()))
     cells, found_at = run_episodes(hidden, candidate, looks_of(hidden, NOTHING, GRID), noise, shifts=40, batch=8)[0]
