@@ -6,6 +6,7 @@ fixation. VOCUS2 builds on the model of Itti, Koch and Niebur; the paper has no 
 
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.gaze.saliency.itti import IttiKoch, itti_koch_saliency
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.gaze.saliency.vocus2 import VOCUS2, vocus2_saliency
@@ -16,6 +17,7 @@ __all__ = [
     "IttiKoch",
     "OculomotorBias",
     "cell_saliency",
+    "features_so_far",
     "itti_koch_saliency",
     "vocus2_saliency",
 ]

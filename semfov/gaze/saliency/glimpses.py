@@ -1,0 +1,58 @@
+"""What a fovea has shown of a picture so far: the feature maps of its looks, joined by closeness."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from semfov.detection.feature_maps import FeatureMaps
+from semfov.errors import check, check_shape
+
+
+def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> FeatureMaps:
+    r"""Join the feature maps of foveated views: each place has those of the look with the closest fixation.
+
+    .. math:: \Phi(u) = \phi_{i^*}(u), \quad i^* = \arg\min_{i \le n} \lVert u - f_i \rVert
+
+    A `FixationDensity` of these maps knows only what the eye has seen. Each fixation of a scanpath takes the view that
+    was fixated nearest to it, so views from the cells of a grid serve all scanpaths.
+
+    Args:
+        views: `Detector.features` of V foveated views of one picture, maps `(V, C, h, w)`.
+        fixations: `(V, 2)`, where each view was fixated, in pixels of the picture.
+        scanpath: `(B, n, 2)`, fixations so far in pixels of the picture, NaN before a shorter path.
+
+    Returns:
+        Maps `(B, C, h, w)`, with the placement of `views`.
+
+    Raises:
+        InputError: the shapes do not fit together, or a scanpath has no fixation.
+
+    >>> from semfov.detection import Detections, Placement
+    >>> nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 1), torch.zeros(2, 0, dtype=torch.bool))
+    >>> maps = {"backbone8": torch.tensor([1.0, 2.0]).view(2, 1, 1, 1).expand(2, 1, 1, 4)}
+    >>> views = FeatureMaps(maps, (40, 10), Placement((40, 10), (1.0, 1.0), (0, 0)), nothing)
+    >>> ends = torch.tensor([[5.0, 5.0], [35.0, 5.0]])
+    >>> features_so_far(views, ends, ends[None]).maps["backbone8"].flatten().tolist()
+    [1.0, 1.0, 2.0, 2.0]
+    """
+    check_shape(fixations, "fixations", len(next(iter(views.maps.values()))), 2)
+    check_shape(scanpath, "scanpath", None, None, 2)
+    known = ~scanpath[..., 0].isnan()
+    check(bool(known.any(-1).all()), "scanpath", "at least one fixation in each", "none")
+    place = views.placement
+    points = torch.where(known[..., None], scanpath, 0.0).to(fixations)
+    chosen = torch.cdist(points, fixations.expand(len(points), -1, -1)).argmin(-1)
+    joined = {}
+    for name, maps in views.maps.items():
+        height, width = maps.shape[-2:]
+        # Centres of the pixels of the map, in pixels of the picture.
+        x = ((torch.arange(width).to(fixations) + 0.5) * (views.canvas[0] / width) - place.offset[0]) / place.scale[0]
+        y = ((torch.arange(height).to(fixations) + 0.5) * (views.canvas[1] / height) - place.offset[1]) / place.scale[1]
+        pixels = torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], -1).flatten(0, 1) - 0.5
+        away = torch.cdist(pixels.expand(len(points), -1, -1), fixations[chosen])
+        closest = away.masked_fill(~known[:, None], torch.inf).argmin(-1)
+        view = chosen.gather(1, closest)
+        taken = maps.flatten(2).transpose(1, 2)[view, torch.arange(height * width, device=view.device)]
+        joined[name] = taken.transpose(1, 2).unflatten(2, (height, width))
+    return replace(views, maps=joined)
