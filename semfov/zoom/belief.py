@@ -18,6 +18,9 @@ from semfov.zoom.odds import WindowOdds
 from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
 
+_SLIVER = 0.25
+"""Share of a window: where less is not blank, little counts as little, and the edge of a scan takes no look."""
+
 _CLEAR = 0.1
 """Number of objects from which on a cell clearly promises one."""
 
@@ -205,7 +208,8 @@ class ZoomBelief:
         """
         if level not in self._areas:
             there, ones = self._there.numpy(), np.ones(self.lattice.span(level), np.float32)
-            self._areas[level] = WindowSums(ones, there.shape, there.__getitem__).update().clip(1)
+            whole = min(len(ones), self.lattice.rows) * min(len(ones), self.lattice.columns)
+            self._areas[level] = WindowSums(ones, there.shape, there.__getitem__).update().clip(_SLIVER * whole)
         return self._sum(level, 0) / self._areas[level]
 
     @property

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from semfov.data.large import open_large
+from semfov.zoom import GlimpseEvidence
+from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
@@ -71,3 +73,20 @@ def test_slices_of_blank_ground_are_left_out():
         assert (window in seen) or blank[y1 + 16 : y2 - 16, x1 + 16 : x2 - 16].all()
     nothing = torch.ones(lattice.rows, lattice.columns, dtype=torch.bool)
     assert not_blank(usual_slices(lattice), nothing) == usual_slices(lattice)
+
+
+def test_what_is_left_to_see_of_a_window_is_of_what_is_not_blank():
+    """Nor to where little is not blank: the share that counts is of a quarter of the window at least."""
+    array, _ = scan()
+    lattice = Lattice.over((900, 600), CANVAS)
+    cells = blank_cells(open_large(array), lattice)
+    belief = ZoomBelief(lattice, GlimpseEvidence(3, 8), 1, cells)
+    assert belief.left_share == 1
+    for level in range(1, lattice.levels):
+        span = lattice.span(level)
+        unseen = belief.unseen(level)
+        for row in range(unseen.shape[0]):
+            for column in range(unseen.shape[1]):
+                part = ~cells[row : row + span, column : column + span].numpy()
+                whole = min(span, lattice.rows) * min(span, lattice.columns)
+                assert np.isclose(unseen[row, column], min(1, part.sum() / (whole / 4)))
