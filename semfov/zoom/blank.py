@@ -54,19 +54,17 @@ def _only_colour(pixels: NDArray[np.uint8]) -> tuple[int, ...] | None:
 
 def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], lattice: Lattice) -> NDArray[np.bool_]:
     """Whether all pixels of each cell have a colour, up to rounding; pixels `(3, h, w)` → `(rows, columns)`."""
-    other = np.zeros(pixels.shape[1:], bool)
-    for channel, value in zip(pixels, colour, strict=True):
-        low, high = max(value, 1) - 1, min(value, 254) + 1
-        # Bytes below the lowest wrap round to large ones.
-        other |= np.ascontiguousarray(channel) - np.uint8(low) > high - low
-    for axis, (cells, pitch, length) in enumerate(
-        [(lattice.rows, lattice.pitch[1], lattice.size[1]), (lattice.columns, lattice.pitch[0], lattice.size[0])]
-    ):
-        scale = other.shape[axis] / length
-        first, end = np.array([*_spans(cells, pitch * scale, other.shape[axis])]).T
-        # Pixels at the border of two cells count for both.
-        other = np.logical_or.reduceat(other, first, axis) | other.take(end - 1, axis)
-    return ~other
+    low, span = np.array([(max(value, 1) - 1, min(value, 254) - max(value, 1) + 2) for value in colour]).T.astype(
+        np.uint8
+    )
+    height, width = pixels.shape[1:]
+    # Bytes below the lowest wrap round to large ones.
+    other = pixels.transpose(1, 2, 0).reshape(height, -1) - np.tile(low, width) > np.tile(span, width)
+    # Pixels at the border of two cells count for both.
+    down = _spans(lattice.rows, lattice.pitch[1] * (height / lattice.size[1]), height)
+    other = np.stack([other[first:end].any(0) for first, end in down]).reshape(lattice.rows, width, -1).any(-1)
+    across = _spans(lattice.columns, lattice.pitch[0] * (width / lattice.size[0]), width)
+    return ~np.stack([other[:, first:end].any(1) for first, end in across], 1)
 
 
 def _spans(cells: int, pitch: float, length: int) -> Iterator[tuple[int, int]]:
