@@ -62,7 +62,8 @@ def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], lattice: Latt
     other = pixels.transpose(1, 2, 0).reshape(height, -1) - np.tile(low, width) > np.tile(span, width)
     # Pixels at the border of two cells count for both.
     down = _spans(lattice.rows, lattice.pitch[1] * (height / lattice.size[1]), height)
-    other = np.stack([other[first:end].any(0) for first, end in down]).reshape(lattice.rows, width, -1).any(-1)
+    other = np.stack([other[first:end].any(0) for first, end in down])
+    other = np.logical_or.reduce(other.reshape(lattice.rows, width, -1), -1)
     across = _spans(lattice.columns, lattice.pitch[0] * (width / lattice.size[0]), width)
     return ~np.stack([other[:, first:end].any(1) for first, end in across], 1)
 
