@@ -24,7 +24,7 @@ class Recorder(nn.Module):
 @pytest.mark.parametrize("columns", [1, 2, 6, 12, 24])
 def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, reference, dtype, device, columns):
     said = gathered(dtype=dtype)
-    said = type(said)(*(getattr(said, name).to(device) for name in said.__dataclass_fields__))
+    said = type(said)(*(each.to(device) for each in said))
     model, recorder = toy_map().to(device, dtype), Recorder()
     more = torch.arange(24.0, device=device).to(dtype)
     got = model.read_out(recorder, said.nearest, said, columns, more, 2 * more)
