@@ -271,9 +271,9 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
     assert one.find_all(camera, ["red", "blue"], color="bgr", **limits).targets == (1, 3)
     assert [look.number for look in one.explore(camera, color="bgr", worth=0.0, **limits)] == [0, 1, 2, 3]
     for wrong, message in (
-        ({"picture": camera, "shifts": 3}, "shifts: expected None"),
+        ({"picture": camera, "shifts": 3}, "shifts: expected none"),
         ({"picture": camera, "how": "windows"}, "how: expected 'head' or 'auto' for a scene"),
-        ({"picture": panorama, "duration": 3.0}, "duration: expected None"),
+        ({"picture": panorama, "duration": 3.0}, "duration: expected none"),
     ):
         with pytest.raises(InputError, match=message):
             one.explore(**wrong)
