@@ -69,6 +69,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, pict
 def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one_thread):
     image = torch.zeros_like(picture)
     image[1, 320:344, 640:664] = 1
+    image[:, [0, 0, -1, -1], [0, -1, 0, -1]] = 0.02  # no blank ground
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     path = agent.search(image, "red", closer=2)
     live = agent.episode(1, rate=0, closer=2)
