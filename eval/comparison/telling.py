@@ -19,13 +19,13 @@ _SHARES = (0.01, 0.02, 0.05)
 TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in _SHARES)]
 """Column headings of `Telling.rows`."""
 
-CALIBRATED = ["ECE", "by chance"]
+CALIBRATED = ["ECE", "ECE if calibrated"]
 """Column headings of `calibrated`."""
 
 ERRORS_TEXT = (
     "± is the standard error, and two numbers in brackets are a 95 % interval, both by bootstrap over scenes, since "
-    "the searches of a scene are not independent. `by chance`: the ECE that perfectly calibrated probabilities would "
-    "have in as many searches, its mean and the limit below which 95 % of them are."
+    "the searches of a scene are not independent. `ECE if calibrated`: the ECE that perfectly calibrated probabilities "
+    "would have in as many searches, its mean and the limit below which 95 % of them are."
 )
 """Caption of the errors."""
 

@@ -11,7 +11,7 @@ from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 
-SHARP = "one sharp look, highest score"
+SHARP = "one unfoveated pass, highest score"
 """Name of the highest score of the target in a sharp look at the whole scene."""
 
 
@@ -23,7 +23,7 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
     scores = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
     scores[SHARP] = torch.tensor([record["sharp"] for record in first])
     if first[0]["tiled"] is not None:
-        scores["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+        scores["unfoveated pass and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
     if first[0]["plain"] is not None:
         scores |= {name: rule[0] for name, rule in plain_rules(first).items()}
     scores[FREQUENCY] = torch.tensor([record["frequency"] for record in first])
@@ -45,8 +45,8 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     sure = {*groups, *plain}
     errors = [calibrated(scores[name], there) if name in sure else ["-", "-"] for name in scores]
     rows += [[name, *figures, *error] for name, figures, error in zip(scores, telling.rows(), errors, strict=True)]
-    decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
-                "expected", "IoU"]]  # fmt: skip
+    decided = [["", "hit rate", "false-alarm rate", "undecided", "looks, target present", "looks, target absent",
+                "place right", "expected", "IoU"]]  # fmt: skip
     for name, group in groups.items():
         present = [record for record in group if record["present"]]
         absent = [record for record in group if not record["present"]]
@@ -135,18 +135,18 @@ def sharp_finds(records: Sequence[ResultRecord]) -> list[bool]:
 
 
 def sharp_places(records: Sequence[ResultRecord]) -> Tensor:
-    """The same as `reported` for one sharp look, `(M,)`."""
+    """The same as `reported` for one unfoveated pass, `(M,)`."""
     pairs = zip(records, sharp_finds(records), strict=True)
     return torch.tensor([float(record["sharp_place"]["right"]) if found else torch.nan for record, found in pairs])
 
 
 def sharp_decisions(records: Sequence[ResultRecord], place: str) -> list[str]:
-    """Row of one sharp look (`sharp_finds`), whose share of right places is `place`."""
+    """Row of one unfoveated pass (`sharp_finds`), whose share of right places is `place`."""
     finds = [record for record, found in zip(records, sharp_finds(records), strict=True) if found]
     there = [record["sharp_place"]["overlap"] for record in finds if record["present"]]
     present = sum(record["present"] for record in records)
     return [
-        "one sharp look",
+        "one unfoveated pass",
         share(len(there), present),
         share(len(finds) - len(there), len(records) - present),
         "-",

@@ -40,7 +40,7 @@ def exploration_report(run: ExploreRun, *, pictures: bool = True) -> None:
     records, seconds = collect_records(run)
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
-    # The reference of one sharp look comes after the policies.
+    # The reference of one unfoveated pass comes after the policies.
     names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
     curves = {answer: success(records, list(names), answer) for answer in _ANSWERS}
     summary = _exploration_summary(curves, run.config.protocol.shifts, sensing(run))

@@ -28,14 +28,14 @@ from semfov.runs.exploration_protocol import (
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 
-FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
+FUSED, PAINTED = "one unfoveated pass, fused", "one unfoveated pass, boxes"
 
 # Among 0.2, 0.3 and 0.4, the score that named most cells right on the fit set, with background as an answer.
 _SURE = 0.2
 
 
 def _sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
-    """Maps of what is where from one sharp look at the whole picture.
+    """Maps of what is where from one unfoveated pass at the whole picture.
 
     - fused: scores are used as likelihoods and fused by Kaplan's rule from a uniform prior, as published.
     - boxes: every cell gets the scores of the boxes that overlap it, class by class the highest; its answer is

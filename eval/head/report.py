@@ -77,7 +77,8 @@ def _head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
 def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
     limit, ours = config.seconds, searches[OURS]
     times = _budgets(config)
-    rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", "less ours", "passes", "less ours"]]
+    less = "difference to semfov"
+    rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", less, "passes", less]]
     for way, group in searches.items():
         row = [way]
         for second in times:
@@ -94,7 +95,7 @@ def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what
     return [
         f"{len(ours)} searches in {scenes} {what}, each until the gaze rests on a cell that a target overlaps. A "
         f"search that does not succeed within {limit:g} s and {config.passes} passes counts with these numbers. Means "
-        f"over {what} ± standard errors; `less ours`: difference from ours, paired by scene.",
+        f"over {what} ± standard errors; `difference to semfov`: difference from semfov, paired by scene.",
         "",
         *table(rows),
         "",
@@ -105,7 +106,13 @@ def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, 
     ours, times = explorations[OURS], _budgets(config)
     last = times[-1]
     rows = [
-        ["", *(f"after {second:g} s" for second in times), f"less ours, after {last:g} s", "objects alone", "looks"]
+        [
+            "",
+            *(f"after {second:g} s" for second in times),
+            f"difference to semfov, after {last:g} s",
+            "objects alone",
+            "looks",
+        ]
     ]
     for way, group in explorations.items():
         row = [way]

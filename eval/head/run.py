@@ -38,7 +38,7 @@ from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Wh
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks
 
-OURS = "ours"
+OURS = "semfov"
 """Name of the method that the others are compared with."""
 
 _MOSAIC = 240.0
@@ -173,8 +173,8 @@ class HeadRun(SceneRun):
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
             OURS: lambda action: PerSecond(gain, config.speeds, action),
-            "ours, half a view apart": lambda action: PerSecond(gain, config.speeds, action, range(len(views))),
-            "ours, blind to time": lambda action: PerSecond(gain, None, action),
+            "semfov, half a view apart": lambda action: PerSecond(gain, config.speeds, action, range(len(views))),
+            "semfov, blind to time": lambda action: PerSecond(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),
             "random head and eye": lambda action: _Anywhere(views),

@@ -174,7 +174,7 @@ class Finding:
 
 SEARCH, EXPLORE = paper.TABLE_SHIFTS, (1, 5, 15)
 
-_CALIBRATED = "calibrated less raw at 5 / 15 / 30 shifts"
+_CALIBRATED = "calibrated − raw at 5 / 15 / 30 shifts"
 
 TESTED = (
     Finding("Calibration is considerably beneficial for non-predictive search.", "search", _CALIBRATED,
@@ -197,7 +197,7 @@ TESTED = (
     Finding("The same with raw scores.", "explore", "gaze shifts",
             _Overtaken("kl-raw", "random-raw", "ahead to about the 4th")),
     Finding("Exploration has no particular advantage from calibration.", "explore",
-            "KL, calibrated less raw at 1 / 5 / 15 shifts", _Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
+            "KL, calibrated − raw at 1 / 5 / 15 shifts", _Advantage("kl-calibrated", "kl-raw", EXPLORE, expected=0)),
 )  # fmt: skip
 """Findings that are tested at every score threshold."""
 

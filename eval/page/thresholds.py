@@ -60,10 +60,10 @@ class Contrast:
 CONTRASTS = tuple(
     Contrast(text.format(measure.text), finding, measure, shifts)
     for text, finding, shifts in (
-        ("search, {}: calibrated less raw", TESTED[0], SEARCH),
-        ("exploration, {}: KL less random, calibrated", TESTED[7], (1, 5, 10, 20)),
-        ("exploration, {}: KL less random, raw", TESTED[8], (1, 5, 10, 20)),
-        ("exploration by KL, {}: calibrated less raw", TESTED[9], EXPLORE),
+        ("search, {}: calibrated − raw", TESTED[0], SEARCH),
+        ("exploration, {}: KL − random, calibrated", TESTED[7], (1, 5, 10, 20)),
+        ("exploration, {}: KL − random, raw", TESTED[8], (1, 5, 10, 20)),
+        ("exploration by KL, {}: calibrated − raw", TESTED[9], EXPLORE),
     )
     for measure in COUNTED[finding.kind]
 )

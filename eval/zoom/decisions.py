@@ -19,7 +19,7 @@ from semfov.runs.tables import mean_or_dash, share, table
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
 
-OURS, UNVERIFIED = "ours", "ours, without closer looks"
+OURS, UNVERIFIED = "semfov", "semfov, without closer looks"
 """Names of searches with closer looks at places that seem to hold the target, and of searches without them."""
 
 
@@ -126,7 +126,7 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
             decided.append([name, counts[0], right, *counts[1:], looks, chance])
     return [
         f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
-        f"in % at the given false alarm rates. `ours` is the probability at the end of a search. {ERRORS_TEXT} "
+        f"in % at the given false alarm rates. `semfov` is the probability at the end of a search. {ERRORS_TEXT} "
         f"`{FREQUENCY}`: the share of the other pictures that hold the class.",
         "",
         *table(rows),

@@ -149,7 +149,8 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     numbers = list(first[0]["after"])
     figures = Bootstrap.of(partial(object_figures, groups, numbers), range(len(first)))
     heads = [f"AP50, {number}" for number in numbers]
-    heads += ["precision", "recall", "boxes for each object", "number off by", "sum off by", "ECE"]
+    heads += ["precision", "recall", "boxes for each object"]
+    heads += [f"mean absolute error of the {number}" for number in ("count", "expected number")] + ["ECE"]
     rows = [["", *heads]]
     for way, value, error in zip(groups, figures.value.tolist(), figures.error.tolist(), strict=True):
         rows.append([way, *(f"{each:.3f} ± {apart:.3f}" for each, apart in zip(value, error, strict=True))])
@@ -179,7 +180,7 @@ def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> lis
     rows.append(["expected in all", *(f"{each:.1f}" for each in expected.mean(0).tolist())])
     rows.append(["off by", *(f"{each:.1f}" for each in (expected - true).abs().mean(0).tolist())])
     return [
-        f"The number of objects that ours expects in all after n passes, those that no look has shown included: the "
+        f"The number of objects that semfov expects in all after n passes, those that no look has shown included: the "
         f"mean over pictures, and the mean absolute error. There are {float(true.mean()):.1f} in the mean.",
         "",
         *table(rows),

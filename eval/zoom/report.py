@@ -78,16 +78,16 @@ def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
     at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
     pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
     figures = Bootstrap.of(partial(recall_and_precision, finding, at), range(len(run.scenes)))
-    rows = [["", *map(str, at), "area under the curve", "boxes for each object", "boxes that are right"]]
+    rows = [["", *map(str, at), "area under the curve", "boxes for each object", "precision"]]
     for (way, group), value, error in zip(finding.items(), figures.value, figures.error, strict=True):
         cells, right = recall_cells(value, error)
         boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
         rows.append([way, *cells, f"{mean(curve(group, passes)):.3f}", f"{boxes:.2f}", right])
-    apart = figures.less(list(finding).index("ours"))
-    less = [["difference to ours", *map(str, at), "boxes that are right"]]
+    apart = figures.less(list(finding).index("semfov"))
+    less = [["difference to semfov", *map(str, at), "precision"]]
     for way, value, error in zip(finding, apart.value, apart.error, strict=True):
         cells, right = recall_cells(value, error, "+")
-        less += [[way, *cells, right]] if way != "ours" else []
+        less += [[way, *cells, right]] if way != "semfov" else []
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
     return [

@@ -50,7 +50,7 @@ _COMPARED = (
     "slices as in ASAHI",
     "slices, ranked by the overview",
     "quad-tree, best first",
-    "ours",
+    "semfov",
 )
 """Ways of looking whose objects are compared with the annotated ones."""
 
@@ -129,7 +129,7 @@ class ZoomRun(WindowLooking, SceneRun):
                     break
                 continue
             records.append(self._recall(name, index, looks))
-            if name in ("slices, raster", "ours"):
+            if name in ("slices, raster", "semfov"):
                 records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)]))
         watch.lap("recall")
         if self.config.mosaics and "hit" in measures:
@@ -156,8 +156,8 @@ class ZoomRun(WindowLooking, SceneRun):
         }
         for name, order in orders.items():
             yield name, look_by_look(glances, order, None)
-        yield "ours", find_everything(glances, self.evidence, target)
-        yield "ours, four at a time", find_everything(glances, self.evidence, target, batch=4)
+        yield "semfov", find_everything(glances, self.evidence, target)
+        yield "semfov, four at a time", find_everything(glances, self.evidence, target, batch=4)
         if self.observation is not None:
             observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
             yield "by the observation model", find_everything(glances, observed, target)
@@ -201,13 +201,15 @@ class ZoomRun(WindowLooking, SceneRun):
     def _objects(
         self, name: str, index: int, looks: list[Glance], ahead: list[tuple[tuple[float, float], float]]
     ) -> Iterator[ResultRecord]:
-        """Compare the objects of ours, with probabilities and with scores, and of slices with the annotated ones."""
+        """Compare the objects of semfov, with probabilities and with scores, and of slices with the annotated ones."""
         if name not in _COMPARED:
             return
         lattice = Lattice.over(self.scenes.annotation(index).size, self.eye.detector.input_size, finest=self.eye.finest)
         shared = looks, lattice, self.target, self.annotation(index), self.config.passes
         ways = (
-            {name: None} if name != "ours" else {"ours": self.evidence.certainty, "ours, scores of the detector": None}
+            {name: None}
+            if name != "semfov"
+            else {"semfov": self.evidence.certainty, "semfov, scores of the detector": None}
         )
         for way, certainty in ways.items():
             yield object_record(way, *shared, certainty, ahead) | {"scene": self.scenes.ids[index]}
@@ -243,8 +245,8 @@ class ZoomRun(WindowLooking, SceneRun):
             }
             ways: dict[str, Iterator[WindowStep[Any]]] = {
                 **{name: look_by_look(glances, order, None) for name, order in orders.items()},
-                "ours": look_for(glances, self.evidence, target, slices=cut),
-                "ours, free windows": look_for(glances, self.evidence, target, closest=True),
+                "semfov": look_for(glances, self.evidence, target, slices=cut),
+                "semfov, free windows": look_for(glances, self.evidence, target, closest=True),
             }
             for name, turns in ways.items():
                 passes, hit = 0, False

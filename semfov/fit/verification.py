@@ -326,7 +326,9 @@ def verification_report(
         chances.append([where, *(_figure_text(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
     assert fitted.model.thresholds is not None
     chosen = fitted.model.thresholds.confirm
-    decisions = [["confirm", "found, there", "found, not there", "place right", "looks, there", "looks, not there"]]
+    decisions = [
+        ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
+    ]
     decisions.append(["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])])
     for confirm in sorted({*_THRESHOLDS, chosen}):
         mark = " (chosen)" if confirm == chosen else ""

@@ -13,7 +13,7 @@ from semfov.runs.tables import mean_or_dash, share
 from tests.lab.commands.table import small_run
 
 POLICIES = ["target-evidence", "random gaze", "published belief", "published belief, a detection at the gaze"]
-SCORES = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
+SCORES = ["one unfoveated pass, highest score", "unfoveated pass and its quarters, highest score"]
 REFERENCES = [*SCORES, *PLAIN, "class frequency"]
 
 
@@ -48,7 +48,7 @@ def test_run_writes_table_and_records(finished):
     assert sorted(there.values()) == [False] * 2 + [True] * 4
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
-    places, lands = [*POLICIES, "one sharp look", *PLAIN], POLICIES
+    places, lands = [*POLICIES, "one unfoveated pass", *PLAIN], POLICIES
     compared = ["difference to target-evidence", *POLICIES[1:], *REFERENCES]
     assert [row[0] for row in rows] == [*POLICIES, *REFERENCES, *places, *compared, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
@@ -174,7 +174,7 @@ def test_table_matches_hand_calculations():
     place = "33.3 (33.3 to 33.3)"
     assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", place, "80.0", "0.50"]
     assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
-    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", place, "-", "0.30"]
+    assert look == ["one unfoveated pass", "50.0", "50.0", "-", "1.0", "1.0", place, "-", "0.30"]
     assert [row[0] for row in differences] == ["difference to a", "b", *SCORES, "class frequency"]
     assert differences[1][1:] == ["-0.125 ± 0.000", *["-25 (-25 to -25)"] * 3, "-"]
     assert differences[2][1:] == ["+0.000 ± 0.000", *["+0 (+0 to +0)"] * 3, "+0.0 (+0.0 to +0.0)"]

@@ -82,7 +82,7 @@ def test_searches_of_people_models_random_draws_and_policies_are_compared(pictur
     titles = list(dict.fromkeys(row["table"] for row in table))
     assert titles == ["all 4 pictures", "the 4 available pictures"]
     names = {row["row"] for row in table if row["table"] == titles[1]}
-    assert names == {"people", "model", "random draws", "centre draws", "random", "non-predictive-raw"}
+    assert names == {"people", "model", "uniform scanpaths", "centre-bias scanpaths", "random", "non-predictive-raw"}
     paths = read_table(out / "scanpaths" / "non-predictive-raw.csv")
     assert len(paths) == 4
     # All start in the cell of the screen's first fixation, and end at the target or after nine gaze shifts.

@@ -360,7 +360,7 @@ def test_differences_are_shown_at_every_threshold(at_thresholds, tmp_path):
     rows = [cells_of(row) for row in _page_table("thresholds", at_thresholds).make(at_thresholds)]
     assert rows[0] == ["detector", "difference", "shifts", "0.02", "0.1", "0.25", "0.5"]
     assert rows[2][:5] == ["YOLOX-nano", CONTRASTS[0].text, "5", "+100.0 ± 0.0", "-100.0 ± 0.0"]
-    kl = next(row for row in rows if row[1] == "exploration, with background: KL less random, calibrated")
+    kl = next(row for row in rows if row[1] == "exploration, with background: KL − random, calibrated")
     assert kl[2:5] == ["1", "+12.5 ± 0.0", "-12.5 ± 0.0"]
     assert sum(row[0] == "YOLOv3-tiny" for row in rows) == sum(len(contrast.shifts) for contrast in CONTRASTS)
     assert [path.stem for path in draw_figures(tmp_path, at_thresholds)] == ["thresholds"]

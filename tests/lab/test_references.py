@@ -1,4 +1,4 @@
-"""Maps from one sharp look: painted and fused maps, and counts of right cells, against loops."""
+"""Maps from one unfoveated pass: painted and fused maps, and counts of right cells, against loops."""
 
 import numpy as np
 import pytest

@@ -56,7 +56,7 @@ def test_tables_match_records(config, capsys):
     zoom_report.zoom(config)
     text = (config.out / "zoom.md").read_text()
     assert text in capsys.readouterr().out
-    for way in ("slices, raster", "quad-tree, best first", "ours", "oracle"):
+    for way in ("slices, raster", "quad-tree, best first", "semfov", "oracle"):
         assert f"| {way} " in text
     records = [json.loads(line) for line in (config.out / "records.jsonl").read_text().splitlines()]
     for record in records:
@@ -106,7 +106,7 @@ def test_figures_of_objects_match_hand_calculations():
         {"objects": 2, "after": {"1": {"scores": [], "right": []}, "4": {"scores": scores, "right": right}}}
         for scores, right in found
     ]
-    none, precision, *figures = object_figures({"ours": records}, ["1", "4"], torch.arange(2))[0].tolist()
+    none, precision, *figures = object_figures({"semfov": records}, ["1", "4"], torch.arange(2))[0].tolist()
     assert none == 0
     # Precision 1 up to a recall of 2 / 4, 3 / 4 up to 3 / 4, and 0 beyond it.
     assert precision == pytest.approx((51 + 25 * 0.75) / 101)
@@ -144,7 +144,7 @@ def test_average_precision_equals_that_of_coco():
 
 def test_tables_of_decisions_match_hand_calculations():
     """Two searches for a target that is present and two for one that is absent."""
-    common = {"measure": "decision", "way": "ours", "count": 17, "overview": 0.1, "slices": 0.2}
+    common = {"measure": "decision", "way": "semfov", "count": 17, "overview": 0.1, "slices": 0.2}
     common |= {"scene": 3, "frequency": 0.3}
     records = [
         common | {"present": there, "outcome": outcome, "probability": p, "passes": passes, "overlap": overlap}
@@ -163,22 +163,22 @@ def test_tables_of_decisions_match_hand_calculations():
     }
     assert cells["it is there"] == ["100.0", "50.0 (50.0 to 50.0)", "0.0", "0.0", "4.0", "0.90"]
     assert cells["it is not"][:5] == ["0.0", "", "50.0", "50.0", "17.0"]
-    assert cells["ours"][:2] == ["10.5", "1.000 ± 0.000"]
+    assert cells["semfov"][:2] == ["10.5", "1.000 ± 0.000"]
     assert cells["all slices, highest score"][:2] == ["17.0", "0.500 ± 0.000"]
     assert cells["class frequency"][:2] == ["-", "0.500 ± 0.000"]
     # With closer looks, one of the finds is absent.
-    changed = [record | {"way": "ours, without closer looks"} for record in records]
+    changed = [record | {"way": "semfov, without closer looks"} for record in records]
     records[0] = records[0] | {"outcome": "absent", "overlap": None, "probability": 0.3}
     text = "\n".join(decision_tables([each for pair in zip(records, changed, strict=True) for each in pair]))
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.count("|") > 3]
     rows = {line[0]: line[1:] for line in reversed(lines)}
     assert rows["it is there"] == ["50.0", "0.0 (0.0 to 0.0)", "50.0", "0.0", "4.0", "0.57"]
     assert rows["it is there, without closer looks"] == cells["it is there"]
-    assert rows["ours, without closer looks"] == cells["ours"]
-    assert rows["ours"][1] == "0.750 ± 0.000"
-    start = next(number for number, line in enumerate(lines) if line[0] == "difference to ours")
+    assert rows["semfov, without closer looks"] == cells["semfov"]
+    assert rows["semfov"][1] == "0.750 ± 0.000"
+    start = next(number for number, line in enumerate(lines) if line[0] == "difference to semfov")
     name, area, *hits, right = lines[start + 2]
-    assert (name, area) == ("ours, without closer looks", "+0.250 ± 0.000")
+    assert (name, area) == ("semfov, without closer looks", "+0.250 ± 0.000")
     assert hits == ["+50 (+50 to +50)"] * 3
     assert right == "+50.0 (+50.0 to +50.0)"
 
@@ -190,7 +190,7 @@ def test_recall_and_precision_are_shares_of_all_objects_and_boxes():
         return {"objects": objects, "found": found, "boxes": boxes, "right": right}
 
     finding = {
-        "ours": [record(4, [1, 2, 3], 5, 3), record(2, [0, 1], 1, 1)],
+        "semfov": [record(4, [1, 2, 3], 5, 3), record(2, [0, 1], 1, 1)],
         "nothing": [record(4, [0], 0, 0), record(2, [0], 0, 0)],
     }
     for drawn, expected in (([0, 1], [1 / 6, 4 / 6, 4 / 6]), ([1, 0, 1], [1 / 8, 5 / 8, 5 / 7])):

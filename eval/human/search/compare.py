@@ -29,7 +29,7 @@ from semfov.viz.style import save_figure
 
 _Array = NDArray[np.float64]
 
-RANDOM, CENTRE = "random draws", "centre draws"
+RANDOM, CENTRE = "uniform scanpaths", "centre-bias scanpaths"
 
 
 def compare(config: PeopleSearchConfig) -> None:
