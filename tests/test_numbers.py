@@ -62,6 +62,7 @@ COMPANIONS = {
         "docs/measurements/zoom.md",
         "docs/detectors.md",
         "docs/guides/gaze-prediction.md",
+        "docs/measurements/human.md",
     ],
     "docs/results.md": ["docs/tables.md"],
     "docs/tables.md": ["docs/results.md"],
