@@ -110,6 +110,7 @@ KNOWN = {
         "Python 3.11": "pyproject.toml; test_project.py compares the workflows with it",
         "39 people": "what python -m eval.readme_picture draws",
         "37 after 20 passes": "the same",
+        "500 pictures of OSIE": "size of the data set",
         "6.8 GB": "size of an installation",
         f"COCO's {len(COCO_CLASSES)} classes": "code",
     },
