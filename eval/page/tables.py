@@ -100,7 +100,7 @@ def markdown_table(name: str, number: int, folder: Path, columns: Sequence[str] 
 def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     """A Markdown table reduced to its first column and some others.
 
-    >>> with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
+    >>> _with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
     ['| a | c |', '|---|---|', '| 1 | 3 |']
     """
     heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)

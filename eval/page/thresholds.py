@@ -29,7 +29,7 @@ def _answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> di
 def _verdict_text(answers: dict[float, Answer]) -> str:
     """Verdicts, each with the thresholds at which it is reached.
 
-    >>> verdict_text({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
+    >>> _verdict_text({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
     'holds at 0.02, 0.1; level at 0.25'
     """
     verdicts = dict.fromkeys(answer.verdict for answer in answers.values())

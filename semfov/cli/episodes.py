@@ -81,6 +81,7 @@ class PictureJob(ABC):
             "eye": agent.eye.settings(),
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
+            "parts": [(place, type(part).__qualname__, _numbers(part)) for place, part in agent.named_modules()],
             "folder": None if folder is None else sha256(folder / MANIFEST),
             "annotations": None if self.truth is None else self.truth.digest,
         }
@@ -117,6 +118,11 @@ class PictureJob(ABC):
             bar = tqdm(desc=Path(source.name).name, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
             arguments["on_look"] = lambda record: bar.update(record.passes - bar.n)
         return arguments
+
+
+def _numbers(part: object) -> dict[str, Any]:
+    """The settings of a part of an agent, by which agents that Python makes are told apart."""
+    return {name: value for name, value in vars(part).items() if type(value) in (bool, int, float, str)}
 
 
 _process: dict[str, PictureJob] = {}

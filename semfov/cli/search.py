@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import fields
@@ -114,6 +115,10 @@ _JOBS: dict[type[PictureOptions], Callable[..., PictureJob]] = {
 _TASKS: dict[str, type[PictureOptions]] = {"search": SearchOptions, "find": FindOptions, "explore": ExploreOptions}
 
 
+_turn = threading.Lock()
+"""Calls of several threads take turns: a process has one job, and one standard output."""
+
+
 def look_at(options: PictureOptions, stream: TextIO) -> int:
     """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
     return int(any("error" in row for row in look_at_pictures(_JOBS[type(options)](options), stream)))
@@ -182,9 +187,10 @@ def run(
     if isinstance(options.get("draw"), str):
         options["draw"] = (options["draw"],)
     settings = kind(pictures=tuple(fspath(each) for each in listed), quiet=quiet, **options)
-    stream = sys.stdout
-    with open(os.devnull, "w") as nothing, redirect_stdout(nothing) if quiet else nullcontext():
-        return look_at_pictures(_JOBS[kind](settings, made), stream)
+    with _turn, open(os.devnull, "w") as nothing:
+        stream = sys.stdout
+        with redirect_stdout(nothing) if quiet else nullcontext():
+            return look_at_pictures(_JOBS[kind](settings, made), stream)
 
 
 def _check(options: PictureOptions) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from glob import glob
 from pathlib import Path
@@ -60,7 +61,9 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: list[PictureSource] = []
     pictures, shown = options.pictures, shown_by(options)
-    matched = (sorted(glob(name, recursive=True)) if set(name) & set("*?[") else [] for name in pictures)
+    # A file may have brackets in its name, as copies do: photo[1].jpg.
+    patterns = (name if set(name) & set("*?[") and not os.path.lexists(name) else None for name in pictures)
+    matched = ([] if pattern is None else sorted(glob(pattern, recursive=True)) for pattern in patterns)
     for name in (each for one, some in zip(pictures, matched, strict=True) for each in some or [one]):
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))

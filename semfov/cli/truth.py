@@ -6,7 +6,7 @@ import contextlib
 import io
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from functools import cache
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -72,7 +72,14 @@ class Truth:
         return float(judge.stats[0]), float(judge.stats[1])
 
 
-@cache
 def read_truth(path: Path) -> Truth:
-    """The annotations of a file, read once in each process."""
+    """The annotations of a file, read once in each process while the file does not change."""
+    with contextlib.suppress(OSError):
+        status = path.stat()
+        return _read_once(path.resolve(), path, status.st_mtime_ns, status.st_size)
+    return Truth(path)
+
+
+@lru_cache(maxsize=1)
+def _read_once(_: Path, path: Path, *version: int) -> Truth:
     return Truth(path)

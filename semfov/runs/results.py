@@ -117,7 +117,8 @@ class SceneResults:
         if not self.path.exists():
             yield None
             return
-        with closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", timeout=_WAIT, uri=True)) as database:
+        # Not read-only: what a process that was killed has half written must be undone first.
+        with closing(sqlite3.connect(self.path, timeout=_WAIT)) as database:
             yield database
 
     def _whole(self, index: int, sha256: str, seconds: str, records: str) -> bool:

@@ -14,6 +14,8 @@ from pycocotools.coco import COCO
 
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
+from semfov.cli.options import FindOptions
+from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth, read_truth
 from semfov.data import read_image
 from semfov.data.sources import picture_files
@@ -174,10 +176,8 @@ def test_results_have_the_ids_of_annotations_and_are_judged_by_pycocotools(run, 
     code, printed = run("find", photo, "--out", tmp_path / "boxes.json", "--annotations", file)
     assert (code, "annotations: expected --out FILE.coco.json beside it" in printed.err) == (1, True)
     file.write_text(json.dumps({**truth, "images": [{**truth["images"][0], "width": 120, "height": 160}]}))
-    read_truth.cache_clear()
     code, printed = run("find", photo, *out)
     assert (code, "to have 120 × 160 px, got 160 × 120" in printed.err) == (1, True)
-    read_truth.cache_clear()
 
 
 def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth):
@@ -187,6 +187,24 @@ def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth
     for name in ("c/x.jpg", "x.jpg", "z.jpg"):
         with pytest.raises(DataError, match="expected one image with the file_name of"):
             truth.image_id(name)
+
+
+def test_annotations_that_have_changed_are_read_again(make_truth, tmp_path):
+    make_truth("x.jpg", "y.jpg")
+    path = tmp_path / "truth.json"
+    first = read_truth(path)
+    assert first.image_id("y.jpg") == 2
+    assert read_truth(path) is first
+    make_truth("x.jpg", "long.jpg", "y.jpg")
+    assert read_truth(path).image_id("y.jpg") == 3
+
+
+def test_a_name_with_brackets_is_that_of_its_file(tmp_path):
+    for name in ("a1.png", "a[1].png"):
+        (tmp_path / name).touch()
+    for name, expected in (("a[1].png", ["a[1].png"]), ("a[0-9].png", ["a1.png"]), ("a*.png", ["a1.png", "a[1].png"])):
+        found = picture_sources(FindOptions(pictures=(str(tmp_path / name),)))
+        assert [source.file.name for source in found] == expected
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import csv
 import os
 import signal
+import threading
 
 import pytest
 import torch
@@ -10,8 +11,12 @@ from PIL import Image
 
 import semfov
 from semfov import DataError, InputError
+from semfov.cli.options import FindOptions
+from semfov.cli.search import _FindJob
 from semfov.data import read_image
+from semfov.gaze.policies import Random
 from semfov.runs.command import run_command
+from semfov.runs.scene_run import digest_of
 from semfov.runs.settings import Settings
 
 
@@ -56,6 +61,42 @@ def test_a_call_that_was_stopped_continues(agent, flight, tmp_path, monkeypatch)
     assert len(semfov.run(flight, "red", **wanted)) == 2
     assert len(seen) == 3
     assert list(tmp_path.glob("*.unfinished")) == []
+
+
+def test_only_outcomes_of_the_same_agent_are_continued(agent, flight):
+    def key(one):
+        return digest_of(_FindJob(FindOptions(pictures=(str(flight),), recursive=True), one).depends_on())
+
+    before = key(agent)
+    agent.find_all(flight / "low" / "b.png", "red", passes=1)
+    assert key(agent) == before
+    eye, strategies = agent.eye, [(each.observer, each.policy) for each in (agent.searching, agent.exploring)]
+    other_cells = semfov.ActivePerception(eye, *strategies, grid=(agent.columns + 1, agent.rows))
+    other_policy = semfov.ActivePerception(eye, (strategies[0][0], Random()), strategies[1])
+    assert len({before, key(other_cells), key(other_policy)}) == 3
+
+
+def test_calls_of_several_threads_look_at_their_own_pictures(agent, flight, monkeypatch):
+    find_all, rows, calls = agent.find_all, [], []
+
+    def call():
+        rows.extend(semfov.run(flight / "low", "red", agent=agent, recursive=True, passes=1))
+
+    def looks(picture, *arguments, **options):
+        if not calls:
+            calls.append(threading.Thread(target=call))
+            calls[0].start()
+            calls[0].join(0.5)
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", looks)
+    others = [flight / "other 0.png", flight / "other 1.png"]
+    for path in others:
+        Image.new("RGB", (96, 64), (100, 100, 100)).save(path)
+    own = semfov.run(others, "red", agent=agent, passes=1)
+    calls[0].join()
+    assert [row["width"] for row in own] == [96, 96]
+    assert [row["width"] for row in rows] == [160, 160]
 
 
 def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_path):

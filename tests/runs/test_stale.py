@@ -130,6 +130,24 @@ def test_a_file_that_is_no_database_counts_as_missing_and_is_replaced(tmp_path):
         results.load(1)
 
 
+def test_what_a_killed_process_has_half_written_is_undone(tmp_path):
+    """Its journal lies beside the database, which is read nevertheless: the scenes before are still there."""
+    whole, left = (SceneResults(tmp_path / name, "1-2", lambda index: "a") for name in ("whole", "left"))
+    for index in range(9):
+        whole.save(index, [{"policy": "random"}], {"look": 0.5})
+    assert whole.finished(9) == {*range(9)}
+    with closing(sqlite3.connect(whole.path)) as database:
+        database.execute("PRAGMA cache_size = 1")
+        database.execute("BEGIN")
+        database.execute("UPDATE scenes SET sha256 = '0'")
+        for index in range(9, 20):
+            database.execute("INSERT INTO scenes VALUES (?, '0', '{}', ?)", (index, "x" * 50_000))
+        shutil.copytree(whole.path.parent, left.path.parent)
+    assert [path.name for path in left.path.parent.glob("*-journal")]
+    assert left.finished(20) == {*range(9)}
+    assert len([*left.read(9)]) == 9
+
+
 def test_records_are_read_one_scene_at_a_time(tmp_path):
     """They come in the order of the scenes, whatever the order in which they were finished, and again when asked."""
     results = SceneResults(tmp_path, "1-2", lambda index: "a")
