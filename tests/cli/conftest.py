@@ -38,7 +38,8 @@ def photo(tmp_path):
 
 @pytest.fixture
 def large(tmp_path):
-    picture = Image.new("RGB", (1280, 960), (100, 100, 100))
+    ground = Image.linear_gradient("L").point(lambda value: 90 + value // 8)  # not blank, so that it is searched
+    picture = ground.resize((1280, 960)).convert("RGB")
     picture.paste((230, 20, 20), (1000, 700, 1040, 740))
     path = tmp_path / "large" / "field.png"
     path.parent.mkdir()
