@@ -137,7 +137,7 @@ def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_p
         ({"pictures": "no/such.png"}, DataError, "no such file or folder"),
         ({"crops": __file__}, DataError, "is not a folder"),
     ],
-    ids=lambda value: str(value) if isinstance(value, dict) else "",
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_a_call_is_refused_before_the_first_look(agent, flight, options, error, said):
     wanted = {"pictures": flight / "low", "target": "red", **options}
