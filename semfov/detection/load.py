@@ -22,12 +22,12 @@ from semfov.detection.yolo import YoloV3
 from semfov.errors import DataError, InputError, check, check_options, lookup
 from semfov.io.files import check_regular
 
-_WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; use load_detector('x.cfg', weights='{}')"
+_WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; give 'x.cfg' with weights='{}'"
 _PICKLE = (
     "detector: expected a file that can be read without running code from it, got {0}; export the model to ONNX, for "
     "Ultralytics with: yolo export model={0} format=onnx; for other modules with: torch.onnx.export(model, image, "
-    "'{1}.onnx'). A state dict of a torchvision model is read by load_detector('torchvision:MODEL', weights='{0}', "
-    "classes=[...])"
+    "'{1}.onnx'). A state dict of a torchvision model is read as 'torchvision:MODEL' with weights='{0}' "
+    "and classes="
 )
 
 DetectorLike = str | PathLike[str] | nn.Module

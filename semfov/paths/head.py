@@ -202,7 +202,8 @@ class HeadPath(GazeRecord):
         turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
         what = self.objects_in_words()
         if self.decision is not None:
-            what = f"{self.target_name}: {self.decision.outcome} ({self.decision.probability:.2f})"
+            there = f"there with probability {self.decision.probability:.2f}"
+            what = f"{self.target_name}: {self.decision.outcome} ({there})"
         return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
     def _eye(self, look: int) -> Tensor:

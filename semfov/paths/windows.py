@@ -171,7 +171,7 @@ class ZoomPath(GazeRecord):
         """Summarise the result."""
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
-            outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
+            outcome = f"{self.decision.outcome} (there with probability {self.decision.probability:.2f})"
             return f"{self.target_name}: {outcome} in {passes}"
         return f"{self.objects_in_words()} in {passes}"
 

@@ -48,7 +48,8 @@ REFUSED = {
     "search --target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
     "search --target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
     "search --target cup --weights a.onnx": "an ONNX file is a detector of its own, --detector FILE, got a.onnx",
-    "search --target cup --detector my.weights": "detector: expected a cfg and its weights",
+    "search --target cup --detector my.weights": "weights only; give 'x.cfg' with --weights my.weights",
+    "search --target cup --detector my.pt": "read as 'torchvision:MODEL' with --weights my.pt and --classes",
     "detectors yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
     "fit": "model: expected the name or the file of a detector, got none",
 }
