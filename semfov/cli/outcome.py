@@ -70,7 +70,7 @@ def picture_outcome(
     if options.labels is not None:
         files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
     if options.crops is not None:
-        crops = record.crops(source.file if source.scene is None else source.scene.image)
+        crops = record.crops(source.opened("auto"))
         for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
             folder = options.crops / plain_name(record.classes[label]) / source.place.parent
             files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)

@@ -60,7 +60,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     keep their precision. The first frame of an animation is read. Colour profiles are not applied.
 
     Args:
-        path: a file in one of `_FORMATS`, whatever its name.
+        path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, HEIF, TIFF, GIF, BMP or PPM, whatever its name.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
         white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
             `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.

@@ -92,7 +92,9 @@ def finish(run: SceneRun, title: str) -> None:
     finished = results.finished(len(run.scenes))
     todo = [index for index in range(len(run.scenes)) if index not in finished]
     others = results.path.parent.glob(f"{results.key.partition('-')[0]}-*.sqlite")
-    older = max((len(SceneResults(path.parent, path.stem, run.digest)) for path in others), default=0)
+    older = max(
+        (len(SceneResults(each.parent, each.stem, run.digest)) for each in others if each != results.path), default=0
+    )
     if todo and older:
         _log.warning(
             "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "

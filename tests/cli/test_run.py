@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -121,6 +122,18 @@ def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_p
     again = [flight / "low" / "b.png", flight / "low" / "b.png"]
     with pytest.raises(InputError, match=r"labels: expected pictures of different names .* got b"):
         semfov.run(again, "red", agent=agent, labels=tmp_path / "labels")
+
+
+def test_crops_show_the_bands_and_the_white_of_the_look(agent, tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    pixels = np.full((4, 120, 160), 1000, np.float32)
+    pixels[1:, 8:28, 8:28] = np.array([2300, 200, 200])[:, None, None]
+    tifffile.imwrite(tmp_path / "f.tif", pixels, photometric="minisblack", planarconfig="separate")
+    shown = {"white": "2550", "bands": "2,3,4", "how": "fovea", "passes": 1}
+    semfov.run(tmp_path / "f.tif", "red", agent=agent, crops=tmp_path / "crops", **shown)
+    crop = read_image(tmp_path / "crops/red/f-000.jpg")
+    middle = crop[:, crop.shape[1] // 2, crop.shape[2] // 2]
+    torch.testing.assert_close(middle, torch.tensor([230.0, 20.0, 20.0]) / 255, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -53,6 +54,26 @@ def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, mon
     (record,) = caplog.records
     assert "1 scenes were finished with these settings by another version of the code" in record.getMessage()
     assert second.results.load(0) is not None
+
+
+def test_only_other_code_is_reported_for_scenes_that_are_left(tmp_path, monkeypatch, caplog):
+    def tasks(function, todo, **options):
+        yield from ((index, ([{"scene": index}], {}, None)) for index in todo)
+
+    def run_of(key):
+        config = SimpleNamespace(out=tmp_path, where=1)
+        results = SceneResults(tmp_path, key, str)
+        return SimpleNamespace(scenes=range(3), config=config, results=results, digest=str)
+
+    monkeypatch.setattr(scene_run, "run_tasks", tasks)
+    interrupted = run_of("settings-code")
+    interrupted.results.save(1, [{"scene": 1}], {})
+    finish(interrupted, "searching")
+    assert not caplog.records
+    assert [each["records"][0]["scene"] for each in interrupted.results.read(3)] == [0, 1, 2]
+    with caplog.at_level(logging.WARNING):
+        finish(run_of("settings-other"), "searching")
+    assert "3 scenes were finished with these settings by another version" in caplog.text
 
 
 def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, monkeypatch):
