@@ -58,7 +58,7 @@ def make_agent(options: AgentOptions) -> ActivePerception:
 def check_device(name: str | None) -> str | None:
     """The name of a device, which PyTorch must have."""
     try:
-        torch.empty(0, device=name)
+        torch.empty(0, device=name).cpu()  # from `meta` nothing comes back
     except (RuntimeError, AssertionError):
         have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
         raise InputError(f"device: expected one that PyTorch has here ({', '.join(have)}), got {name!r}") from None

@@ -208,7 +208,7 @@ class _PictureFiles:
         written = self.written
         if self.results is not None:
             self.results.write()
-            if complete and self.job.truth is not None:
+            if complete and self.job.truth is not None and any("error" not in row for row in self.rows.values()):
                 print(self.results.precision())
             written = [*([] if self.results.path == STDOUT else [self.results.path]), *written]
         if self.episodes:
@@ -271,7 +271,7 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     skipped = len(sources) - endings.total()
     if several:
         counts = ", ".join(f"{count} {name}" for name, count in endings.items())
-        print(f"{len(sources)} pictures: {counts}{f'; {skipped} skipped' if skipped else ''}")
+        print(f"{len(sources)} pictures: {'; '.join(filter(None, [counts, f'{skipped} skipped' if skipped else '']))}")
     longest = max((max(row["width"], row["height"]) for row in outputs.rows.values() if "width" in row), default=0)
     detector = job.agent.eye.detector
     if detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):

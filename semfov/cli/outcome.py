@@ -63,14 +63,15 @@ def picture_outcome(
     if options.report is not None:
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.
-        picture = opened if record.how == "windows" else None
-        episode = record.page_data(picture, name=name, settings=settings, boxes=source.boxes)
+        shown = opened if record.how == "windows" else None
+        episode = record.page_data(shown, name=name, settings=settings, boxes=source.boxes)
     figures = _draw_episode(record, source.boxes, drawings)
     files = {}
     if options.labels is not None:
         files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
     if options.crops is not None:
-        crops = record.crops(source.opened("auto"))
+        picture: Any = source.opened("auto")
+        crops = record.crops(picture)
         for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
             folder = options.crops / plain_name(record.classes[label]) / source.place.parent
             files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)

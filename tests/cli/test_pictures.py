@@ -189,6 +189,16 @@ def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth
             truth.image_id(name)
 
 
+def test_annotations_judge_nothing_where_no_picture_was_looked_at(run, make_truth, tmp_path):
+    names = "x.png", "y.png"
+    make_truth(*names)
+    for name in names:
+        (tmp_path / name).write_bytes(b"no picture")
+    files = *(tmp_path / name for name in names), "--annotations", tmp_path / "truth.json"
+    code, printed = run("find", *files, "--out", tmp_path / "boxes.coco.json")
+    assert (code, "2 pictures: 2 skipped" in printed.out, "AP" in printed.out) == (1, True, False)
+
+
 def test_annotations_that_have_changed_are_read_again(make_truth, tmp_path):
     make_truth("x.jpg", "y.jpg")
     path = tmp_path / "truth.json"

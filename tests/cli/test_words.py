@@ -28,6 +28,7 @@ REFUSED = {
     "find nosuch --target cup": "picture: expected a file or folder (a class is given by --target nosuch)",
     "find --classes cup": "classes: expected none for yolov3-tiny, which has its own; --target names",
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
+    "find --device meta": "device: expected one that PyTorch has here (cpu",
     "live": "source: expected a video, an address or --camera 0, got none",
     "live nosuch.mp4": "nosuch.mp4; check the path",
     "live a.mp4 --camera 0": "camera: expected a video or a camera, not both, got 0",
