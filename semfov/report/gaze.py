@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import re
 from collections.abc import Sequence
 from html import escape
 from os import PathLike
@@ -18,7 +17,7 @@ from semfov.data.fixations import Fixations
 from semfov.io.files import write_text
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
-from semfov.report.page import colour_steps, json_script, page_path
+from semfov.report.page import colour_steps, filled, json_script, page_path
 from semfov.viz.gaze import MASSES
 from semfov.viz.style import COLOURS, overlay_colours
 
@@ -51,13 +50,11 @@ def gaze_page_html(title: str, drawn: Sequence[DrawnGaze]) -> str:
     }
     contents = {
         "title": escape(title),
-        "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
         "program": (_FOLDER / "gaze.js").read_text(encoding="utf-8"),
         "data": json_script(data),
         "facts": "".join(_facts(each.prediction, number) for number, each in enumerate(drawn)),
     }
-    template = (_FOLDER / "gaze.html").read_text(encoding="utf-8")
-    return re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template)
+    return filled("gaze.html", contents)
 
 
 def _picture(drawn: DrawnGaze) -> Data:

@@ -89,7 +89,6 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     }
     contents = {
         "title": escape(title),
-        "style": (_FOLDER / "page.css").read_text(encoding="utf-8"),
         "program": (_FOLDER / "page.js").read_text(encoding="utf-8"),
         "data": json_script(data),
         "sections": sections,
@@ -101,9 +100,15 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         ),
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
-    template = (_FOLDER / "page.html").read_text(encoding="utf-8")
+    return filled("page.html", contents)
+
+
+def filled(name: str, contents: dict[str, str]) -> str:
+    """The page of a template: the head of all pages, the template, and the contents of their placeholders."""
+    template = "".join((_FOLDER / each).read_text(encoding="utf-8") for each in ("head.html", name))
+    parts = {"style": (_FOLDER / "page.css").read_text(encoding="utf-8"), **contents}
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
-    return re.sub(r"\{\{(\w+)\}\}", lambda place: contents[place[1]], template)
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
 
 
 def _about_html(episodes: Sequence[Data]) -> str:
