@@ -10,6 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -59,7 +60,7 @@ def _run(name: str, options: Any) -> int | None:
     """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
     stream = sys.stdout
     if getattr(options, "quiet", False):
-        with open(os.devnull, "w") as nothing, redirect_stdout(nothing):
+        with open(os.devnull, "w", encoding="utf-8") as nothing, redirect_stdout(nothing):
             return _subcommand(name, options, stream)
     beside = str(getattr(options, "out", None)) == "-"
     with redirect_stdout(sys.stderr if beside else stream):
@@ -104,6 +105,9 @@ def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     command_line = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, TextIOWrapper):
+        # Files of Windows may have another encoding, without the signs of a text or the letters of a picture's name.
+        sys.stdout.reconfigure(errors="backslashreplace")
     if command_line[:1] == ["help"]:
         command_line = [*command_line[1:2], "--help"]
     name, *rest = command_line or ["--help"]

@@ -141,7 +141,7 @@ class ResultsFile:
 
     def _line(self, values: dict[str, Any]) -> None:
         """Write a line now."""
-        line = json.dumps(values, ensure_ascii=False) + "\n"
+        line = json.dumps(values, ensure_ascii=self._stream is not None) + "\n"  # the stream may have another encoding
         if self._stream is not None:
             self._stream.write(line)
             self._stream.flush()

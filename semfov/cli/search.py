@@ -187,7 +187,7 @@ def run(
     if isinstance(options.get("draw"), str):
         options["draw"] = (options["draw"],)
     settings = kind(pictures=tuple(fspath(each) for each in listed), quiet=quiet, **options)
-    with _turn, open(os.devnull, "w") as nothing:
+    with _turn, open(os.devnull, "w", encoding="utf-8") as nothing:
         stream = sys.stdout
         with redirect_stdout(nothing) if quiet else nullcontext():
             return look_at_pictures(_JOBS[kind](settings, made), stream)

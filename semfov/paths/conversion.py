@@ -248,7 +248,8 @@ class Conversion(ABC):
         """Cut what the box of each object shows out of the picture.
 
         Args:
-            picture: the picture in full size; None takes the file that the record comes from.
+            picture: the picture in full size, opened by `semfov.data.large.open_large` where it was looked at with
+                `white=` or `bands=`; None takes the file that the record comes from as it is.
 
         Returns:
             `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.

@@ -1,9 +1,11 @@
 """Search, find and explore as a user runs them, with a detector of red squares: texts, results, figures and pages."""
 
 import csv
+import io
 import json
 import os
 import re
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -351,6 +353,17 @@ def test_lines_of_json_are_written_as_pictures_are_done(run, folder, tmp_path):
     assert [row["objects"] for row in streamed] == [row["objects"] for row in rows]
     assert "3 pictures: 3 looked at" in printed.err
     assert {path.name for path in tmp_path.iterdir()} == {"my photo.png", "photos", "found.jsonl"}
+
+
+def test_output_of_another_encoding_has_escapes(run, photo, tmp_path, monkeypatch):
+    path = photo.rename(tmp_path / "Küche.png")
+    for options, expected in (((), "K\\xfcche.png, 160 \\xd7 120 px"), (("--out", "-"), "K\\u00fcche.png")):
+        stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", stream)
+            assert run("find", path, "--target", "red", *options)[0] == 0
+        stream.seek(0)
+        assert expected in stream.read()
 
 
 def test_quiet_prints_nothing_but_results_and_errors(run, photo, tmp_path):
