@@ -427,7 +427,7 @@ class ActivePerception(nn.Module):
         arguments = without_none(worth=worth, **limits)
         if kind == "head":
             arguments |= without_none(duration=duration)
-            return _counting(self.head.find_all(opened.world, targets, **arguments), least)
+            return _counting(self.head.find_all(opened.world, targets or None, **arguments), least)
         aim = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
 
@@ -482,7 +482,7 @@ class ActivePerception(nn.Module):
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
         opened = open_picture(picture, color, white, bands)
         kind = self._kind(opened, how, shifts, duration, foveal=start is not None or policy is not None)
-        check(policy is None or (policy == "people" and kind == "fovea"), "policy", "'people' for a fovea", policy)
+        only_for(kind, "fovea", "none", policy=policy)
         if kind == "fovea":
             given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
             seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)

@@ -469,7 +469,7 @@ def test_an_exploration_as_people_look_follows_the_density(agent, image, monkeyp
     assert 30 / 52 - 1 / cell[0] < x / SIZE[0] < 36 / 52 + 1 / cell[0]
     assert 20 / 39 - 1 / cell[1] < y / SIZE[1] < 25 / 39 + 1 / cell[1]
     assert len(agent.explore(image, policy="people", shifts=5, start=0)) == 6
-    with pytest.raises(InputError, match="policy"):
+    with pytest.raises(InputError, match="policy: expected 'people', or None, got cats"):
         agent.explore(image, policy="cats")
-    with pytest.raises(InputError, match="policy"):
+    with pytest.raises(InputError, match=r"policy: expected none for .* by windows, got people"):
         agent.explore(image, how="windows", policy="people")

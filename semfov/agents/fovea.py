@@ -112,6 +112,7 @@ class FoveaAgent:
             raise InputError(
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
             )
+        check(policy in (None, "people"), "policy", "'people', or None", policy)
         viewed = None if policy is None else GazePrediction.of(self.eye.detector, image[0])
         episode = FoveaEpisode(
             self, limits=limits, start=start, shifts=_shifts(shifts, 20, limits), seed=seed, viewed=viewed

@@ -5,11 +5,14 @@ import math
 import pytest
 import torch
 
+from semfov.agent import ActivePerception
 from semfov.agents import HeadAgent
 from semfov.agents.head import _decide_look
+from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Detections
 from semfov.errors import InputError
+from semfov.gaze.policies import NonPredictive, Random
 from semfov.head import Flat, Panorama
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
@@ -179,6 +182,14 @@ def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
     path = agent.search(Panorama(panorama), "green", prior=0.3, give_up=0.99, confirm=1.0, passes=8)
     assert [*sure, True].index(True) == len(path) - 1 if any(sure) else len(path) == 8
     assert path.decision.outcome == ("absent" if any(sure) else "undecided")
+
+
+def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama):
+    strategies = (Target(agent.target_evidence), NonPredictive()), (LearnedMap(agent.map_evidence), Random())
+    whole = ActivePerception(agent.eye, *strategies)
+    path = whole.find_all(Panorama(panorama), passes=2)
+    assert path.actions == agent.find_all(Panorama(panorama), passes=2).actions
+    assert (path.target, path.targets) == (None, ())
 
 
 @pytest.mark.slow
