@@ -11,6 +11,8 @@ from semfov.metrics.scanpath.sequence import cell_labels
 
 _Array = NDArray[np.float64]
 
+_MOST_LETTERS = 10_000  # of a scanpath: the table of an alignment has their product
+
 
 def scanmatch(
     ours: ArrayLike,
@@ -56,12 +58,16 @@ def scanmatch(
     check_number(threshold, "threshold", 1e-6, 1e6)
     check_number(gap, "gap", -1e6, 0)
     check_number(bin_ms, "bin_ms", 1e-6, 1e6)
+    for count in cells:
+        check_whole(count, "cells", 1, 1000)
     words = []
     for number, path in enumerate((_path(ours, "ours"), _path(theirs, "theirs"))):
         word = cell_labels(path, *cells, size)
         if durations is not None:
             lasting = np.asarray(durations[number], dtype=np.float64)
             check(lasting.shape == word.shape, "durations", f"{len(word)} numbers", lasting.shape)
+            fits = bool((lasting >= 0).all()) and lasting.sum() <= _MOST_LETTERS * bin_ms
+            check(fits, "durations", f"numbers from 0, of at most {_MOST_LETTERS:,} letters in all", lasting.tolist())
             word = word.repeat(np.maximum(1, np.round(lasting / bin_ms)).astype(np.int64))
         words.append(np.stack([word % cells[0], word // cells[0]], 1))
     a, b = words

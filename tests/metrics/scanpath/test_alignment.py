@@ -45,6 +45,12 @@ def test_durations_repeat_letters():
         scanmatch(ours, theirs, SIZE, durations=([1.0], [1.0]))
 
 
+@pytest.mark.parametrize("wrong", [{"durations": ([np.nan], [1.0])}, {"durations": ([1e12], [1.0])}, {"cells": (0, 1)}])
+def test_durations_and_cells_are_checked(wrong):
+    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected"):
+        scanmatch([[1.0, 1.0]], [[1.0, 1.0]], SIZE, **wrong)
+
+
 def test_the_substitution_matrix_of_the_toolbox_has_the_published_range():
     """ScanMatch's default of 12 × 8 cells and 3.5: equal letters add 3.5, opposite corners 3.5 - √(11² + 7²)."""
     corners = [[0.0, 0.0]], [[79.0, 59.0]]
