@@ -164,9 +164,9 @@ def _option_names(name: str) -> list[str]:
 
 def _of_others(own: str, rest: Sequence[str]) -> str | None:
     """What to say about an option that other subcommands or other programs have; None if there is none."""
-    if own not in _LOOKING:
+    if own not in (*_LOOKING, "gaze"):
         return None
-    names = {each: set(_option_names(each)) for each in _LOOKING}
+    names = {each: set(_option_names(each)) for each in (*_LOOKING, own)}
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
         meant = next((each for each in texts.SYNONYMS.get(option, ()) if each in names[own]), None)

@@ -1,6 +1,7 @@
 """Pictures that a head looks around in: panoramas around the viewer, and large pictures in front of it."""
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +21,9 @@ from semfov.sensor.perspective import even_rows, go_around, sample
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
 
+_PROPORTION = 0.1
+"""Width by height of a panorama may differ by this from 2."""
+
 _DEGREE = 640 / 60
 """Default number of pixels of a flat picture per degree."""
 
@@ -32,7 +36,8 @@ class Panorama(Sphere):
 
     Args:
         image: equirectangular picture of any common kind (`semfov.as_image`), with an even number of columns; or its
-            `(width, height)` alone, for the geometry of a scene that is not viewed.
+            `(width, height)` alone, for the geometry of a scene that is not viewed. One that is not about twice as wide
+            as high brings a warning.
         size: `(w, h)` of a view in pixels.
         fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
         speeds: of eye and head.
@@ -63,7 +68,13 @@ class Panorama(Sphere):
         pixels: Tensor | None = None
         if not isinstance(image, tuple):
             pixels = as_image(image, color=color)
-            image = pixels.shape[-1], pixels.shape[-2]
+            width, height = image = pixels.shape[-1], pixels.shape[-2]
+            if abs(width / height - 2) > _PROPORTION:
+                warnings.warn(
+                    f"image: expected a panorama of 360 by 180 degrees, which is twice as wide as high, got {width} × "
+                    f"{height} px; its views are distorted, and how='head' turns a head in front of a flat picture",
+                    stacklevel=2,
+                )
         super().__init__(image, size, tilt=(-reach, reach), fields=fields, speeds=speeds, cell=cell)
         self.reach = reach
         self._source = None if pixels is None else go_around(even_rows(pixels)[None])[0]

@@ -64,6 +64,7 @@ WRONG_USE = {
     "explore --frames=3": "unknown option --frames; it is one of `semfov live`",
     "find . --conf 0.5": "unknown option --conf; did you mean --least?",
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
+    "gaze a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",

@@ -68,6 +68,12 @@ def test_a_view_of_a_panorama_is_perspective():
     torch.testing.assert_close(world.look_at((33.0, 20.0), 60.0), expected.clamp(0, 1))
 
 
+def test_a_photograph_given_as_a_panorama_brings_a_warning():
+    with pytest.warns(UserWarning, match="twice as wide as high, got 64 × 48 px"):
+        Panorama(torch.rand(3, 48, 64), (32, 24))
+    Panorama(torch.rand(3, 48, 98), (32, 24))
+
+
 def test_a_view_of_a_flat_scene_is_a_glimpse():
     """Without the border pixels, where a glimpse also uses pixels from outside the window."""
     torch.manual_seed(0)
