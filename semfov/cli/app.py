@@ -263,4 +263,4 @@ def _believed(looked: OwnLooks) -> Any:
     """The probability of the target in each cell after the last look."""
     file = BytesIO()
     plot_belief(looked.record, -1).savefig(file, format="png", dpi=110)
-    return np.asarray(Image.open(file).convert("RGB"))
+    return np.asarray(Image.open(file, formats=["PNG"]).convert("RGB"))

@@ -265,6 +265,10 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
             if number not in before:
                 tqdm.write(outcome.text, file=sys.stdout)
         complete = True
+        longest = max((max(row["width"], row["height"]) for row in outputs.rows.values() if "width" in row), default=0)
+        detector = job.agent.eye.detector
+        if detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):
+            print("in large pictures yolox-nano finds more small objects, in less time: --detector yolox-nano")
     finally:
         if outputs.rows:
             outputs.finish(complete=complete)
@@ -272,10 +276,6 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     if several:
         counts = ", ".join(f"{count} {name}" for name, count in endings.items())
         print(f"{len(sources)} pictures: {'; '.join(filter(None, [counts, f'{skipped} skipped' if skipped else '']))}")
-    longest = max((max(row["width"], row["height"]) for row in outputs.rows.values() if "width" in row), default=0)
-    detector = job.agent.eye.detector
-    if detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):
-        print("in large pictures yolox-nano finds more small objects, in less time: --detector yolox-nano")
     return [outputs.rows[number] for number in range(len(sources))]
 
 

@@ -22,6 +22,15 @@ class AreaUnderRoc(Metric):
     It keeps the scores, as the area needs all of them.
 
     Shapes of an update: score `(M,)`, present `(M,)`, booleans or 0 and 1.
+
+    Args:
+        options: of `torchmetrics.Metric`, such as `sync_on_compute`.
+
+    >>> area = AreaUnderRoc()
+    >>> area.update(torch.tensor([0.9, 0.4]), torch.tensor([True, True]))
+    >>> area.update(torch.tensor([0.4, 0.1]), torch.tensor([False, False]))
+    >>> area.compute()
+    tensor(0.8750)
     """
 
     is_differentiable = False
@@ -51,6 +60,14 @@ class Reliability(Metric):
     It keeps sums, so that its size does not grow.
 
     Shapes of an update: probability `(M,)`, outcome `(M,)`, booleans or 0 and 1.
+
+    Args:
+        options: of `torchmetrics.Metric`, such as `sync_on_compute`.
+
+    >>> reliability = Reliability()
+    >>> reliability.update(torch.tensor([0.9, 0.2]), torch.tensor([True, False]))
+    >>> {name: round(float(value), 3) for name, value in reliability.compute().items()}
+    {'count': 2.0, 'nll': 0.164, 'brier': 0.025, 'ece': 0.15}
     """
 
     is_differentiable = False

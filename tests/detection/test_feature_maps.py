@@ -106,8 +106,10 @@ def network(tmp_path_factory):
         nodes.append(helper.make_node("Conv", given, [f"conv{number}"], **shape))
         nodes.append(helper.make_node("Relu" if number < 3 else "Sigmoid", [f"conv{number}"], [f"map{number}"]))
         source = f"map{number}"
-    nodes.append(helper.make_node("Reshape", [source, "shape"], ["output"]))
+    nodes.append(helper.make_node("Reshape", [source, "shape"], ["shares"]))
     weights.append(numpy_helper.from_array(torch.tensor([1, 6, 4]).numpy(), "shape"))
+    nodes.append(helper.make_node("Mul", ["shares", "sides"], ["output"]))  # boxes in pixels
+    weights.append(numpy_helper.from_array(torch.tensor([64.0, 64, 64, 64, 1, 1])[:, None].numpy(), "sides"))
     made = helper.make_tensor_value_info
     graph = helper.make_graph(
         nodes, "net", [made("images", TensorProto.FLOAT, [1, 3, 64, 64])],

@@ -205,8 +205,8 @@ def test_a_search_looks_closely_before_it_finds(detector, picture):
 
 def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     """Green squares look red until a look enlarges them beyond the magnification of the last level."""
-    image = torch.zeros_like(picture)
-    image[1, 320:344, 640:664] = 1
+    image = 0.03 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(0))  # ground that is not blank
+    image[:, 320:344, 640:664] = torch.tensor([0.0, 1, 0])[:, None, None]
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     assert agent.search(image, "red", closer=0).decision.outcome == "found"
     path = agent.search(image, "red", closer=2)
