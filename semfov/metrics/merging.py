@@ -21,8 +21,6 @@ class AreaUnderRoc(Metric):
 
     It keeps the scores, as the area needs all of them.
 
-    Shapes of an update: score `(M,)`, present `(M,)`, booleans or 0 and 1.
-
     Args:
         options: of `torchmetrics.Metric`, such as `sync_on_compute`.
 
@@ -45,7 +43,12 @@ class AreaUnderRoc(Metric):
         self.add_state("present", default=[], dist_reduce_fx="cat")
 
     def update(self, score: Tensor, present: Tensor) -> None:
-        """Add cases."""
+        """Add cases.
+
+        Args:
+            score: `(M,)`, higher where the target is more likely.
+            present: `(M,)`, whether it is there: booleans, or 0 and 1.
+        """
         self.score.append(as_numbers(score, "score").detach())
         self.present.append(as_outcomes(present, "present"))
 
@@ -58,8 +61,6 @@ class Reliability(Metric):
     """Negative log likelihood, Brier score and calibration error of all predictions so far (`BinarySums`).
 
     It keeps sums, so that its size does not grow.
-
-    Shapes of an update: probability `(M,)`, outcome `(M,)`, booleans or 0 and 1.
 
     Args:
         options: of `torchmetrics.Metric`, such as `sync_on_compute`.
@@ -82,7 +83,12 @@ class Reliability(Metric):
         self.add_state("sums", default=torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, probability: Tensor, outcome: Tensor) -> None:
-        """Add predictions."""
+        """Add predictions.
+
+        Args:
+            probability: `(M,)`.
+            outcome: `(M,)`, whether it came true: booleans, or 0 and 1.
+        """
         added = BinarySums.of(probability, outcome)
         self.bins += added.bins.to(self.bins.device)
         self.sums += torch.tensor([added.surprisal, added.square], dtype=torch.float64, device=self.sums.device)
