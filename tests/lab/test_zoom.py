@@ -79,7 +79,7 @@ def test_measures_can_be_left_out(config, capsys):
     zoom_report.zoom(replace(config, measures=("decision", "objects")))
     text = capsys.readouterr().out
     assert "Is the target present?" in text
-    assert "| ours, scores of the detector " in text
+    assert "| semfov, scores of the detector " in text
     assert "Recall" not in text
     assert {json.loads(line)["measure"] for line in (config.out / "records.jsonl").read_text().splitlines()} == {
         "decision",

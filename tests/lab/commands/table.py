@@ -47,7 +47,7 @@ class Command:
     settings: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
-    parts: str = "out/parts/*/*.json"
+    parts: str = "out/parts/*.sqlite"
     same: dict[str, tuple[str, ...]] = field(default_factory=dict)
     refused: tuple[tuple[tuple[str, ...], str], ...] = ()
     workers: bool = True
@@ -165,13 +165,13 @@ COMMANDS = {
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "4", "--holdout", "2", "--shard", "1", "--method", "newton"),
         files=(MODEL, "report.md"),
         others=("manifest.json", "reliability.png"),
-        parts="cache/samples/*/*.safetensors",
+        parts="cache/samples/*/*/*.safetensors",
         same={"other shards": ("--shard", "3")},
     ),
     "train.fit_search": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--max_target_area", "0.5"),
         files=(MODEL, "judged.json", "report.md"),
-        parts="cache/looks/*/*.safetensors",
+        parts="cache/looks/*/*/*.safetensors",
         refused=(
             (("--holdout", "1"), "holdout: expected a whole number from 2 to"),
             (("--looks", "1"), "looks: expected a whole number from 2 to"),
@@ -180,7 +180,7 @@ COMMANDS = {
     "train.fit_map": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--gain_steps", "2"),
         files=(MODEL, "judged.json", "report.md"),
-        parts="cache/looks/*/*.safetensors",
+        parts="cache/looks/*/*/*.safetensors",
         refused=(
             (("--holdout", "1"), "holdout: expected a whole number from 2 to 1,000,000,000, got 1"),
             (("--looks", "1"), "looks: expected a whole number from 2 to 10,000, got 1"),
@@ -192,7 +192,7 @@ COMMANDS = {
         settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
                   "--target_model", "HERE/target.safetensors"),
         files=(MODEL, "judged.json", "report.md"),
-        parts="cache/searches/*/*.safetensors",
+        parts="cache/searches/*/*/*.safetensors",
         workers=False,
         refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
     ),
@@ -200,7 +200,7 @@ COMMANDS = {
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "2", "--holdout", "2", "--min_objects", "1", "--shard", "1",
                   "--exponents", "[0.25, 1.0]"),
         files=("hits.json", "report.md"),
-        parts="cache/samples/*/*.safetensors",
+        parts="cache/samples/*/*/*.safetensors",
     ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
@@ -210,7 +210,7 @@ COMMANDS = {
                   "--sensor.sigma", "60", "--sensor.growth", "1"),
         files=("evidence.safetensors", "map.safetensors"),
         others=("manifest.json", "report.md", "search.png", "explore.png"),
-        parts="cache/looks/*/*.safetensors",
+        parts="cache/looks/*/*/*.safetensors",
         refused=(
             ((), "model: expected the name or the file of a detector, got none"),
             (("a.onnx", "--detector.name", "yolov3"), "detector.name: expected nothing, as model already names"),

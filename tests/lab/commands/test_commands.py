@@ -4,8 +4,10 @@ import importlib
 import json
 import os
 import re
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -101,22 +103,46 @@ def test_the_same_bits_with_settings_that_change_only_how_it_is_computed(finishe
     assert contents(name, tmp_path) == contents(name, folder)
 
 
+def parts_of(name, folder):
+    """When each finished part was made, by its file or by its row in a database, and how much it holds."""
+    found = {}
+    for path in folder.glob(COMMANDS[name].parts) if COMMANDS[name].parts else ():
+        if path.suffix == ".sqlite":
+            with closing(sqlite3.connect(path)) as database:
+                rows = database.execute("SELECT number, seconds, length(records) FROM scenes").fetchall()
+            found |= {(path, number): made for number, *made in rows}
+        else:
+            found[path, 0] = [path.stat().st_mtime_ns, path.stat().st_size]
+    return found
+
+
+def damage(part):
+    path, number = part
+    if path.suffix == ".sqlite":
+        with closing(sqlite3.connect(path)) as database, database:
+            database.execute("UPDATE scenes SET records = '[]' WHERE number = ?", (number,))
+    else:
+        path.write_bytes(path.read_bytes()[:-40])
+
+
 def test_finished_parts_are_kept_and_a_damaged_one_is_computed_again(finished):
     name, settings, folder = finished
     torch.manual_seed(1)  # random numbers drawn elsewhere change nothing
     expected = contents(name, folder)
-    parts = sorted(folder.glob(COMMANDS[name].parts)) if COMMANDS[name].parts else []
-    assert len(parts) > 1 or not COMMANDS[name].parts
-    kept = {part: part.stat().st_mtime_ns for part in parts[1:]}
-    if parts:
-        damaged = parts[0].read_bytes()[:-40]
-        parts[0].write_bytes(damaged)
+    kept = parts_of(name, folder)
+    assert len(kept) > 1 or not COMMANDS[name].parts
+    damaged = min(kept, default=None)
+    if damaged is not None:
+        damage(damaged)
+    broken = parts_of(name, folder)
     for file in COMMANDS[name].files:
         (folder / "out" / file).unlink()
     assert run(name, *words(name, folder, *settings)) == 0
     assert contents(name, folder) == expected
-    assert {part: part.stat().st_mtime_ns for part in kept} == kept
-    assert not parts or parts[0].read_bytes() != damaged
+    found = parts_of(name, folder)
+    assert found.keys() == kept.keys()
+    assert {part for part in kept if found[part] != kept[part]} <= {damaged}
+    assert damaged is None or found[damaged][-1] > broken[damaged][-1]
 
 
 ALONE = pytest.mark.parametrize("finished", [long("eval.search"), long("train.fit_fom")], indirect=True)
