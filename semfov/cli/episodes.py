@@ -176,8 +176,8 @@ class _PictureFiles:
         """Outcomes of an interrupted command with the same options and models, by the numbers of the pictures."""
         if self.finished is None:
             return {}
-        stored = ((number, self.finished.load(number)) for number in self.finished.finished(len(self.job.sources)))
-        return {number: PictureOutcome(**each["records"][0]) for number, each in sorted(stored) if each is not None}
+        stored = self.finished.items(len(self.job.sources))
+        return {number: PictureOutcome(**each["records"][0]) for number, each in stored}
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""

@@ -13,7 +13,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
-from semfov.fit.searches import TargetSearch
+from semfov.fit.searches import SearchLimits, TargetSearch
 from semfov.fit.verification import (
     VerificationResult,
     choose_confirm,
@@ -45,7 +45,7 @@ _AREA = 0.2
 """Classes that cover a larger share of a photograph are not searched for."""
 
 
-class _Limits(Protocol):
+class _Limits(SearchLimits, Protocol):
     """Settings of the fit (see `FitZoomConfig`)."""
 
     @property
@@ -56,16 +56,6 @@ class _Limits(Protocol):
     @property
     def worth(self) -> float:
         """Least worth of a closer look."""
-        ...
-
-    @property
-    def surest(self) -> float:
-        """Upper limit of the probability from which on a target counts as found."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of the choice of classes."""
         ...
 
 

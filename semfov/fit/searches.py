@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import ClassVar, Generic
+from typing import ClassVar, Generic, Protocol
 
 import torch
 from torch import Tensor
@@ -28,6 +28,20 @@ from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
+
+
+class SearchLimits(Protocol):
+    """Settings of a fit of a verification (see `FitZoomConfig`)."""
+
+    @property
+    def surest(self) -> float:
+        """Upper limit of the probability from which on a target counts as found."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the choice of classes."""
+        ...
 
 
 class TargetSearch(ABC, Generic[LookType]):

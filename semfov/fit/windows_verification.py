@@ -13,7 +13,7 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Scenes
 from semfov.decision import SAME, settle
 from semfov.detection.detections import Detections
-from semfov.fit.searches import TargetSearch
+from semfov.fit.searches import SearchLimits, TargetSearch
 from semfov.fit.verification import (
     VerificationResult,
     choose_confirm,
@@ -30,7 +30,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
 
 
-class _Limits(Protocol):
+class _Limits(SearchLimits, Protocol):
     """Settings of the fit (see `FitZoomConfig`)."""
 
     @property
@@ -51,16 +51,6 @@ class _Limits(Protocol):
     @property
     def false_alarms(self) -> float:
         """Maximum share of absent targets that may be reported as found."""
-        ...
-
-    @property
-    def surest(self) -> float:
-        """Upper limit of the probability from which on a target counts as found."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of the choice of classes."""
         ...
 
 

@@ -60,25 +60,23 @@ class SceneResults:
             numbers.update(row[0] for row in rows if row[0] < scenes and self._whole(*row))
         return numbers
 
-    def load(self, index: int) -> dict[str, Any] | None:
-        """The outcomes of a scene; None if they are missing or damaged."""
-        with suppress(sqlite3.DatabaseError), self._opened() as database:
-            query = "SELECT * FROM scenes WHERE number = ?"
-            row = None if database is None else database.execute(query, (index,)).fetchone()
-            return None if row is None else self._read(*row)
-        return None
-
-    def read(self, scenes: int) -> Iterator[dict[str, Any]]:
-        """The outcomes of all scenes in their order, one at a time."""
-        expected = 0
+    def items(self, scenes: int) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The numbers and outcomes of finished scenes in their order, one at a time."""
         with suppress(sqlite3.DatabaseError), self._opened() as database:
             query = "SELECT * FROM scenes WHERE number < ? ORDER BY number"
             for row in () if database is None else database.execute(query, (scenes,)):
                 result = self._read(*row)
-                if result is None or row[0] != expected:
-                    break
-                yield result
-                expected += 1
+                if result is not None:
+                    yield row[0], result
+
+    def read(self, scenes: int) -> Iterator[dict[str, Any]]:
+        """The outcomes of all scenes in their order, one at a time."""
+        expected = 0
+        for number, result in self.items(scenes):
+            if number != expected:
+                break
+            yield result
+            expected += 1
         if expected < scenes:
             raise DataError(f"{self.path}: scene {expected} is missing or damaged; run the same command again")
 
