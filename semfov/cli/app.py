@@ -9,11 +9,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from html import escape
-from io import BytesIO
 from itertools import cycle
 from typing import Any
 
-import numpy as np
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
@@ -25,8 +23,10 @@ from semfov.cli.own_looks import OwnLooks, grid_of, look_at_cells
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError, SemfovError
+from semfov.report.episode import pillow
 from semfov.report.gaze import DrawnGaze, gaze_page_html
 from semfov.report.page import page_html
+from semfov.viz.animation import render
 from semfov.viz.belief import plot_belief
 from semfov.viz.style import FOUND, GAZE, TARGET
 
@@ -100,7 +100,7 @@ class _Calls:
         """The next embedded scene, and a class that it holds."""
         assert self.scenes is not None
         index = next(self._numbers)
-        return _pixels(self.scenes[index].image), self.scenes.classes[self.scenes.targets(index)[0] - 1]
+        return pillow(self.scenes[index].image), self.scenes.classes[self.scenes.targets(index)[0] - 1]
 
     def look(self, picture: Any, target: str, task: str, passes: float) -> tuple[str, str]:
         """Words about a record of the picture, and its page in a frame."""
@@ -213,14 +213,9 @@ def _framed(page: str) -> str:
     return f'<iframe title="The looks" sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"></iframe>'
 
 
-def _pixels(image: Tensor) -> Image.Image:
-    """A picture `(3, H, W)` in [0, 1] for Pillow."""
-    return Image.fromarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy())
-
-
 def _reduced(image: Tensor) -> Image.Image:
     """The picture that is clicked on."""
-    picture = _pixels(image)
+    picture = pillow(image)
     picture.thumbnail((_LONGEST, _LONGEST))
     return picture
 
@@ -246,7 +241,7 @@ def _seen(looked: OwnLooks) -> Image.Image:
     """The foveated picture of the last look, with its detections of at least 0.1."""
     record = looked.record
     view = record.views()[-1]
-    picture = _pixels(view)
+    picture = pillow(view)
     draw, scale = ImageDraw.Draw(picture), view.shape[-1] / record.size[0]
     detections = record.looks[-1].detections
     columns = detections.boxes[0].tolist(), detections.labels[0].tolist(), detections.confidence[0].tolist()
@@ -261,6 +256,4 @@ def _seen(looked: OwnLooks) -> Image.Image:
 
 def _believed(looked: OwnLooks) -> Any:
     """The probability of the target in each cell after the last look."""
-    file = BytesIO()
-    plot_belief(looked.record, -1).savefig(file, format="png", dpi=110)
-    return np.asarray(Image.open(file, formats=["PNG"]).convert("RGB"))
+    return render([plot_belief(looked.record, -1)], dpi=110)[0]

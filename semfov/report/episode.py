@@ -22,13 +22,18 @@ from semfov.viz.semantic import cell_entropy
 Data = dict[str, Any]
 
 
-def jpeg(image: Tensor, quality: int) -> bytes:
-    """A picture `(3, H, W)`, of bytes or in [0, 1], as JPEG."""
+def pillow(image: Tensor) -> Any:
+    """A picture `(3, H, W)`, of bytes or in [0, 1], for Pillow."""
     from PIL import Image
 
     pixels = image if image.dtype == torch.uint8 else (image.detach().clamp(0, 1) * 255).round().byte()
+    return Image.fromarray(pixels.cpu().permute(1, 2, 0).numpy())
+
+
+def jpeg(image: Tensor, quality: int) -> bytes:
+    """A picture `(3, H, W)`, of bytes or in [0, 1], as JPEG."""
     file = io.BytesIO()
-    Image.fromarray(pixels.cpu().permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality, optimize=True)
+    pillow(image).save(file, "JPEG", quality=quality, optimize=True)
     return file.getvalue()
 
 
