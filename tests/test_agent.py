@@ -141,15 +141,6 @@ def test_half_precision_is_for_the_detector_alone(image, dtype):
     assert agent.float().eye.detector.white.dtype == torch.float32
 
 
-def test_boxes_decide_what_is_found(agent, image):
-    nowhere = torch.tensor([[60.0, 60, 61, 61]])
-    scanpath = agent.search(image, "green", start=0, boxes=nowhere, shifts=5)
-    hit = Grid(8, 6, SIZE).footprint(nowhere)[0].nonzero()[0, 0]
-    assert scanpath.found == (int(hit) in scanpath.cells.tolist())
-    assert scanpath.shifts <= 5
-    assert agent.search(image, "red", start=0, boxes=torch.tensor([[0.0, 0, 30, 30]])).shifts == 0
-
-
 @pytest.mark.parametrize("mapper", [{}, {"prior": 0.25, "fusion": "sum"}], ids=["same", "other"])
 def test_search_keeps_the_beliefs_of_both_observers(image, mapper):
     """The map of all classes is that of the exploring observer, the posterior that of the searching observer."""
@@ -283,13 +274,6 @@ def test_exploration_ends_when_every_cell_was_visited(image):
 def test_an_agent_that_calibrates_accepts_looks_without_detections(explorer, image):
     scanpath = explorer.explore(torch.full_like(image, 0.4), start=3, shifts=2)
     torch.testing.assert_close(scanpath.probabilities, torch.full_like(scanpath.probabilities, 1 / 3))
-
-
-def test_exploration_needs_a_policy_without_target(image):
-    observer = Semantic(3)
-    agent = ActivePerception(squares_eye(), (observer, NonPredictive()), (observer, NonPredictive()), grid=(8, 6))
-    with pytest.raises(InputError, match="policy 'non-predictive': expected a target to search for"):
-        agent.explore(image)
 
 
 def test_every_look_of_an_agent_is_timed(agent, image):

@@ -9,7 +9,6 @@ import torch
 
 from semfov import FovealObservationModel, Foveation, Grid, InputError
 from semfov.belief import TargetEvidence
-from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Semantic, Target
 from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
@@ -110,47 +109,6 @@ class SemanticLoop:
     chance = present
 
 
-class TargetLoop:
-    """Evidence for the target in each cell: of the closest look, of the strongest one, and the mean of all looks."""
-
-    def __init__(self, seen, target, model):
-        self.seen, self.target, self.model = seen, target, model
-        self.nearest, self.best = [0.0] * CELLS, [-math.inf] * CELLS
-        self.total, self.weight, self.closest = [0.0] * CELLS, [0.0] * CELLS, [math.inf] * CELLS
-        self.score, self.looks, self.visited = 0.0, 0, [False] * CELLS
-
-    def look(self, at):
-        fixation = GRID.centres[at : at + 1].double()
-        look_odds = self.model(self.seen[at : at + 1], fixation, GRID, self.target)[0].tolist()
-        for cell in range(CELLS):
-            distance = away(cell, at)
-            if distance < self.closest[cell]:
-                self.closest[cell], self.nearest[cell] = distance, look_odds[cell]
-            self.best[cell] = max(self.best[cell], look_odds[cell])
-            self.total[cell] += math.exp(-6 * distance) * look_odds[cell]
-            self.weight[cell] += math.exp(-6 * distance)
-        for detection in range(int(self.seen.count[at])):
-            self.score = max(self.score, float(self.seen.scores[at, detection, self.target]))
-        self.looks += 1
-        self.visited[at] = True
-
-    def gathered(self):
-        mean = [total / weight for total, weight in zip(self.total, self.weight, strict=True)]
-        rows = [
-            torch.tensor([row], dtype=torch.float64)
-            for row in (self.nearest, self.best, mean, self.closest, self.score, float(self.looks))
-        ]
-        return Gathered(*rows, torch.tensor([self.visited]), torch.tensor([self.target]))
-
-    def present(self):
-        odds = self.model.log_odds(self.gathered(), GRID.columns)
-        return [1 / (1 + math.exp(-value)) for value in odds[0].tolist()]
-
-    def chance(self):
-        odds = self.model.chance(self.gathered(), GRID.columns)
-        return [1 / (1 + math.exp(-value)) for value in odds[0].tolist()]
-
-
 def away(cell, other):
     """Distance between the centres of two cells, relative to the longer side of the image."""
     return math.hypot(cell % 3 - other % 3, cell // 3 - other // 3) / 3
@@ -208,12 +166,6 @@ MOST = [1, 3, CELLS, 50]
 def test_searches_with_a_semantic_map_equal_the_scalar_loop(most, tempering):
     observer = Semantic(4, tempering=tempering)
     check_against_loop(observer, partial(SemanticLoop, tempering=tempering), by_target, most)
-
-
-@pytest.mark.parametrize("most", MOST)
-def test_searches_for_several_targets_equal_the_scalar_loop(most):
-    model = evidence().double()
-    check_against_loop(Target(model), partial(TargetLoop, model=model), by_target, most)
 
 
 @pytest.mark.parametrize("most", MOST)

@@ -117,14 +117,6 @@ def test_price_zero_never_ends_an_exploration(model, image, gain):
     assert len(agent.explore(image, start=0, shifts=30)) == 1
 
 
-@pytest.mark.parametrize("worth", [0, 1e-6])
-def test_exploration_with_a_low_price_ends_after_all_cells(model, image, worth):
-    """The gain of every look exceeds the price, so the exploration ends after the last cell."""
-    scanpath = agent_of(model, grid=(3, 2)).explore(image, shifts=30, worth=worth)
-    assert sorted(scanpath.cells.tolist()) == list(range(6))
-    assert scanpath.ending == "cells"
-
-
 def test_exploration_without_gaze_shifts(model, image):
     assert agent_of(model).explore(image, start=0, shifts=0, worth=0.1).ending == "shifts"
     assert agent_of(model).explore(image, start=0, shifts=0, worth=1e3).ending == "worth"

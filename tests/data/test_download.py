@@ -185,13 +185,6 @@ def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkey
     assert tree(tmp_path) == WHOLE
 
 
-def test_the_partial_download_of_another_split_is_kept(server, tmp_path):
-    (tmp_path / ".download").mkdir()
-    (tmp_path / ".download/train2017.zip.part").touch()
-    get(tmp_path, server.address)
-    assert tree(tmp_path) == sorted([".download/train2017.zip.part", *WHOLE])
-
-
 def test_archives_copied_by_the_user_are_used_and_kept(tmp_path, unreachable_address):
     for path, data in FILES.items():
         (tmp_path / ARCHIVES[path].name).write_bytes(data)
@@ -217,13 +210,6 @@ def test_unpacking_keeps_complete_files_and_replaces_damaged_ones(tmp_path):
     _unpack_members(tmp_path / "val2017.zip", tmp_path, "val2017/")
     assert all((tmp_path / name).read_bytes() == content for name, content in PICTURES.items())
     assert (tmp_path / first).stat().st_mtime_ns == before
-
-
-def test_a_missing_image_is_fetched_again(server, tmp_path):
-    get(tmp_path, server.address)
-    (tmp_path / "val2017" / NAMES[1]).unlink()
-    get(tmp_path, server.address)
-    assert tree(tmp_path) == WHOLE
 
 
 def linked():
@@ -257,18 +243,6 @@ def test_too_little_free_space_is_an_error_before_the_download(server, tmp_path,
     monkeypatch.setattr(download.shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(DataError, match="free space"):
         get(tmp_path, server.address)
-
-
-def test_a_disk_that_fills_up_is_an_error_and_a_later_run_completes(server, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(download.shutil, "copyfileobj", full)
-    with pytest.raises(DataError, match=r"cannot be written \(No space left on device\)"):
-        get(tmp_path, server.address)
-    monkeypatch.undo()
-    get(tmp_path, server.address)
-    assert tree(tmp_path) == WHOLE
 
 
 def test_the_program_downloads_and_reports_errors(server, tmp_path, monkeypatch, capsys):

@@ -112,12 +112,6 @@ def test_given_boxes_end_a_search_without_closer_looks(image):
     assert agent(Scripted(*script)).search(image, "red", start=11, boxes=boxes).closer == ()
 
 
-def test_a_search_whose_shifts_are_spent_can_still_find_its_target(image):
-    scanpath = agent(Scripted((cells(c11=0.6), 0.6))).search(image, "red", start=0, shifts=0)
-    assert scanpath.ending == "shifts"
-    assert (scanpath.found, scanpath.decision.cell) == (True, 11)
-
-
 def test_closer_looks_survive_a_file(image, tmp_path):
     scanpath = agent(Scripted((cells(c11=0.9), 0.9))).search(image, "red", start=11)
     scanpath.save(tmp_path / "path.safetensors")

@@ -2,7 +2,6 @@
 
 import math
 from itertools import pairwise
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from semfov.detection import Candidates, Detector
 from semfov.episode import Forgetting
-from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
 from tests.decision.test_rule import Scripted
 from tests.decision.test_verifier import AT, GRID, Closer, FromScore, Told, box_of, look, step
@@ -283,23 +281,6 @@ def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgo
         assert sum(closely) >= 6 * most
 
 
-def test_no_other_place_is_examined_while_one_is_surely_known():
-    judge, _ = verifier({5: SURE, 7: 0.8}, 0.1)
-    both = step(0, {5: 0.6, 7: 0.6}, [5, 7], 0.9, look(5, 7))
-    judge.see(both)
-    judge.wait()
-    judge.look()
-    assert judge.candidate is None
-    less, _ = verifier({5: 0.8, 7: 0.75}, 0.1)
-    less.see(both)
-    less.wait()
-    less.look()
-    assert less.candidate is not None
-    less.wait()
-    less.look()
-    assert less.decision().cell == 5
-
-
 def test_recent_detections_count_more_as_evidence():
     """Two places, equally probable: the one that was seen later is examined, unless nothing is forgotten."""
     for rate, cell in ((0.2, 7), (0.0, 5)):
@@ -312,35 +293,6 @@ def test_recent_detections_count_more_as_evidence():
         assert judge.candidate.box.tolist() == box_of(cell)
 
 
-def test_without_closer_looks_the_belief_decides_as_before(one_thread):
-    """`closer=0`, no model, a model without thresholds and an exploration: no closer look, and the same to the bit."""
-    pictures = [torch.roll(spots(5, 10), 5 * shift, -1) for shift in range(10)]
-
-    def watch(made, **options):
-        live = made.live("red", rate=0.1, start=3, **options)
-        return [live.step(picture) for picture in pictures]
-
-    plain = watch(agent(Counted(3), verification=False))
-    for others in (watch(agent(Counted(3)), closer=0), watch(agent(Counted(3), thresholds=None))):
-        for one, other in zip(plain, others, strict=True):
-            assert other.closer is None
-            assert (one.cell, one.next_cell, one.number) == (other.cell, other.next_cell, other.number)
-            assert torch.equal(one.belief.beta, other.belief.beta)
-            assert torch.equal(one.detections.scores, other.detections.scores)
-            assert (one.decision.outcome, one.decision.probability, one.decision.cell, one.decision.place) == (
-                other.decision.outcome,
-                other.decision.probability,
-                other.decision.cell,
-                None,
-            )
-    assert any(each.closer is not None for each in watch(agent(Counted(3))))
-    exploring = agent(Counted(3)).live()
-    assert [exploring.step(picture).closer for picture in pictures] == [None] * 10
-    for wrong in (-1, 101, 0.5):
-        with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
-            agent(Counted(3)).live("red", closer=wrong)
-
-
 def test_thresholds_are_those_of_the_verification_unless_given():
     """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
 
@@ -351,18 +303,6 @@ def test_thresholds_are_those_of_the_verification_unless_given():
     assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
     assert thresholds(confirm=0.99, give_up=0.5) == Thresholds(0.99, 0.5, AT.place)
     assert thresholds(closer=0) == Counted.thresholds
-
-
-def test_examined_places_are_worth_a_frame_also_when_no_cell_is_worth_a_look():
-    judge, _ = verifier({9: 0.95}, 0.1)
-    now = step(0, {9: 0.4}, [0], 0.6, look(9))
-    now = SimpleNamespace(**{**vars(now), "visited": torch.ones(1, 12, dtype=torch.bool)})
-    judge.see(now)
-    assert judge.candidate.cell == 9
-    assert judge.decision().outcome == "undecided"
-    judge.wait()
-    judge.look()
-    assert judge.decision().cell == 9
 
 
 def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():

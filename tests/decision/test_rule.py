@@ -133,7 +133,7 @@ def random_looks(count, most, seed):
     return Detections(boxes, scores, torch.rand(count, most, generator=generator) < 0.6)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_strongest_detection_equals_a_loop(seed):
     grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
     parts = [looks[row : row + 1] for row in range(3)]
@@ -247,7 +247,7 @@ def test_the_target_may_be_found_in_another_cell_than_the_last_fixation(image):
     assert scanpath.decision.box is not None
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
     parts = [looks[row : row + 1] for row in range(3)]
@@ -359,14 +359,6 @@ def test_without_thresholds_a_detection_confirms_the_target(image):
         assert len(never) == 12
         assert (never.found, never.decision.outcome) == (False, "undecided")
     assert searcher.search(image, "green", start=0, shifts=3).decision.outcome == "undecided"
-
-
-@pytest.mark.parametrize("observer", [Scripted((cells(), 0.5)), Semantic(3)], ids=["thresholds", "none"])
-@pytest.mark.parametrize("given", [{"confirm": 50}, {"give_up": -1}, {"confirm": float("nan")}], ids=str)
-def test_thresholds_that_are_not_probabilities_are_refused_by_name(image, observer, given):
-    (name,) = given
-    with pytest.raises(InputError, match=f"^{name}: expected a probability"):
-        agent(observer).search(image, "red", **given)
 
 
 def test_goal_cells_are_the_cells_that_boxes_overlap():

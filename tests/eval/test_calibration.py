@@ -1,11 +1,9 @@
 """The files of a small run of `python -m eval.calibration`."""
 
 import csv
-import json
 
 import pytest
 
-from semfov.metrics.calibration import BinarySums
 from tests.lab.commands.table import small_run
 
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
@@ -36,17 +34,3 @@ def test_run_writes_tables_sums_and_figures(finished):
         figures = [f"{float(row[name]):.4f}" for name in ("nll", "brier", "ece", "mean_probability", "rate")]
         shown = next(line for line in by_looks if line[:2] == [row["looks"], row["belief"]])
         assert [float(value) for value in shown[3:]] == pytest.approx([float(f) for f in figures], abs=1.01e-4)
-
-
-def test_sums_in_the_file_add_up_to_the_figures(finished):
-    written = json.loads((finished / "beliefs.json").read_text())
-    assert written["edges"] == BinarySums.EDGES.tolist()
-    rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
-    assert len(rows) == len(written["sums"])
-    for row, each in zip(rows, written["sums"], strict=True):
-        assert (row["belief"], int(row["looks"]), row["cells"]) == (each["belief"], each["looks"], each["cells"])
-        sums = BinarySums.from_record(each)
-        assert (float(row["nll"]), float(row["ece"])) == pytest.approx((sums.nll, sums.ece), abs=1e-6)
-        parts = [s for s in written["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
-        if each["cells"] == "all":
-            assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2

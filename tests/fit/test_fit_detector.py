@@ -315,20 +315,6 @@ def test_without_verification_or_evidence_the_agent_decides_without_closer_looks
         assert agent.search(photograph_with(2, (7, 0)), "blue", start=3, shifts=15).closer == ()
 
 
-def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
-    folder = copy_models(home, tmp_path)
-    rewrite_manifest(folder, used=True)
-    known = Manifest.read(folder)
-    earlier = {name: part for name, part in known.parts.items() if name != "verification"}
-    replace(known, parts=earlier).write(folder)
-    (folder / "verification.safetensors").unlink()
-    agent = ActivePerception.from_pretrained(folder)
-    assert agent.verification is None
-    assert isinstance(agent.searching.observer, Target)
-    assert with_models(DecideConfig(models=folder)).verification is None
-    assert command(["search", str(home / "photographs/0.png"), "--target", "red", "--models", str(folder)]) == 0
-
-
 def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_path):
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, used=True)

@@ -11,6 +11,7 @@ from semfov.fit.observation import FitObservationConfig, fit_fom
 from semfov.observation import match
 from semfov.runs.config import DataConfig
 from semfov.runs.samples import Sampler
+from semfov.runs.seeds import generator_for
 from train.fit_fom import main
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
@@ -102,7 +103,10 @@ def test_samples_match_looks_at_random_fixations(tmp_path):
     samples = sampler.sample(0)
     scene = sampler.scenes[1]
     mine = samples[samples.scene == 1]
-    first = torch.rand(2, 2, generator=_generator(0, scene.id))[0] * torch.tensor([scene.size]).float() - 0.5
+    first = (
+        torch.rand(2, 2, generator=generator_for("fixations", 0, scene.id))[0] * torch.tensor([scene.size]).float()
+        - 0.5
+    )
     seen = sampler.eye(scene.image[None], first)
     count = int(seen.count)
     torch.testing.assert_close(mine.scores[:count], seen.scores[0])
@@ -110,9 +114,3 @@ def test_samples_match_looks_at_random_fixations(tmp_path):
     assert torch.equal(mine.labels[:count], expected)
     centre = (seen.boxes[0, :, :2] + seen.boxes[0, :, 2:]) / 2 - 0.5
     torch.testing.assert_close(mine.distance[:count], (centre - first).norm(dim=1) / max(scene.size))
-
-
-def _generator(seed, scene):
-    from semfov.runs.seeds import generator_for
-
-    return generator_for("fixations", seed, scene)

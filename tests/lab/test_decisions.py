@@ -163,30 +163,6 @@ def test_records_match_searches_run_step_by_step(run):
     assert {"found", "absent"} <= outcomes
 
 
-@pytest.mark.slow
-@pytest.mark.weights
-def test_the_key_changes_only_with_settings_that_affect_decisions(config, run, folder):
-    def key(**change):
-        return DecisionRun(replace(config, **change)).key
-
-    def with_model(path):
-        return key(belief=replace(config.belief, target_model=str(path)))
-
-    same = [key(), key(workers=2, out=folder / "other"), key(cache=folder / "other")]
-    assert set(same) == {run.key}
-    others = [
-        key(protocol=ProtocolConfig(shifts=7)),
-        key(confirm=0.52),
-        key(give_up=0.2),
-        key(place=0.3),
-        key(data=DataConfig(limit=2, max_target_area=0.5)),
-        with_model(write_evidence(folder / "seed.safetensors", AT, seed=1)),
-        with_model(write_evidence(folder / "confirm.safetensors", Thresholds(0.51, 0.375))),
-        with_model(write_evidence(folder / "none.safetensors", None)),
-    ]
-    assert len({run.key, *others}) == 9
-
-
 @pytest.mark.weights
 def test_a_model_without_thresholds_still_decides(config, folder):
     path = write_evidence(folder / "none.safetensors", None)

@@ -139,20 +139,6 @@ def test_a_run_goes_on_after_a_write_without_space(whole, tmp_path, monkeypatch,
     assert result_files(out) == result_files(whole / "out")
 
 
-@pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
-def test_a_killed_run_does_not_disturb_another_run_on_the_same_cache(whole, tmp_path):
-    killed, other = (start(tmp_path / name, tmp_path / "cache", "--workers", "2") for name in ("killed", "other"))
-    wait_for(lambda: list((tmp_path / "cache").rglob("*.safetensors")) or killed.poll() is not None)
-    workers = workers_of(killed) if killed.poll() is None else []
-    killed.kill()
-    killed.communicate(timeout=300)
-    wait_for_end(other, 0)
-    wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
-    wait_for_end(start(tmp_path / "killed", tmp_path / "cache", "--workers", "2"), 0)
-    assert result_files(tmp_path / "killed") == result_files(tmp_path / "other") == result_files(whole / "out")
-
-
 def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
     """Stored looks and outcomes of scenes are swapped, cut, or changed by one bit; the results stay the same."""
     looks = sorted((whole / "cache" / "looks").rglob("*.safetensors"))
@@ -196,25 +182,3 @@ def run_in(out: Path, cache: Path) -> int:
     from eval.search import main
 
     return main([*SEARCH[3:], "--out", str(out), "--cache", str(cache), "--workers", "1"])
-
-
-@pytest.mark.parametrize("damage", ["cut", "flipped", "of another kind"])
-def test_damaged_models_are_refused(whole, tmp_path, capsys, damage):
-    from eval.search import main
-    from semfov import FovealObservationModel
-
-    model = tmp_path / "model.safetensors"
-    FovealObservationModel.from_pretrained("yolov3-tiny").save(model)
-    content = bytearray(model.read_bytes())
-    if damage == "cut":
-        content = content[: len(content) // 2]
-    elif damage == "flipped":
-        content[-1000] ^= 1
-    else:
-        content = bytearray(next((whole / "cache" / "looks").rglob("*.safetensors")).read_bytes())
-    model.write_bytes(content)
-    arguments = ["--policies", '["predictive-calibrated"]', "--belief.model", str(model), "--out", str(tmp_path)]
-    assert main([*arguments, "--data.limit", "1", "--workers", "1"]) == 1
-    error = capsys.readouterr().err
-    assert str(model) in error
-    assert error.count("\n") == 1

@@ -3,7 +3,6 @@
 import json
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -61,15 +60,6 @@ def config(request, tmp_path, monkeypatch):
         cache=tmp_path / "cache",
         workers=1,
     )
-
-
-@pytest.mark.slow
-def test_results_do_not_depend_on_the_store(config):
-    fresh = HeadRun(replace(config, store=False)).outcomes(0)[0]
-    written = HeadRun(config).outcomes(0)[0]
-    run = HeadRun(config)
-    run.eye.detector.propose = None  # any new look would fail
-    assert run.outcomes(0)[0] == written == fresh
 
 
 @pytest.mark.slow

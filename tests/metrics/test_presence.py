@@ -3,7 +3,6 @@
 import math
 from fractions import Fraction
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
 from semfov.errors import InputError
-from semfov.metrics.presence import _threshold_for, area_under_roc, hits_at, roc
+from semfov.metrics.presence import _threshold_for, area_under_roc, hits_at
 
 # Few values, so that many are tied.
 scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)
@@ -80,24 +79,6 @@ def test_a_single_precision_score_equal_to_a_false_alarm_is_no_hit():
 def test_a_threshold_needs_at_least_one_case():
     with pytest.raises(InputError, match="absent: expected at least one case"):
         _threshold_for(torch.zeros(0), 0.1)
-
-
-@given(st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]), st.booleans()), min_size=2, max_size=30))
-def test_roc_counts_at_every_threshold(cases):
-    """Against counting, and its area against the rank statistic."""
-    score, present = torch.tensor([s for s, _ in cases]), torch.tensor([p for _, p in cases])
-    if present.all() or not present.any():
-        with pytest.raises(InputError, match="present"):
-            roc(score, present)
-        return
-    alarms, hits = roc(score, present)
-    levels = sorted({s for s, _ in cases}, reverse=True)
-    for level, alarm, hit in zip(levels, alarms[1:], hits[1:], strict=True):
-        reached = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
-        assert hit == pytest.approx(sum(reached) / int(present.sum()))
-        assert alarm == pytest.approx((len(reached) - sum(reached)) / int((~present).sum()))
-    assert (alarms[0], hits[0], alarms[-1], hits[-1]) == (0, 0, 1, 1)
-    assert np.trapezoid(hits, alarms) == pytest.approx(area_under_roc(score, present))
 
 
 def test_the_next_number_above_a_false_alarm_is_a_hit():

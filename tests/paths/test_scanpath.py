@@ -2,13 +2,11 @@
 
 import json
 import math
-import shutil
 import sys
 from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from semfov import ActivePerception, Detections, Eye, Foveation, Grid, InputError, Scanpath, observers, policies
 from semfov.decision import CloseUp, Decision
@@ -17,7 +15,6 @@ from semfov.errors import DataError
 from semfov.io.storage import read, write_file
 from semfov.paths import Stimulus
 from semfov.paths.stimulus import LONGEST
-from semfov.sensor.foveation import foveate
 from tests.paths.test_records import same
 
 
@@ -265,25 +262,3 @@ def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp
         with pytest.raises(DataError, match="expected a complete scanpath") as caught:
             Scanpath.load(path)
         assert named in str(caught.value), (named, caught.value)
-
-
-def test_files_can_be_read_by_safetensors(scanpath, tmp_path):
-    """Another reader of safetensors reads the same tensors."""
-    scanpath.save(tmp_path / "a.safetensors")
-    shutil.copy(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
-    tensors = load_file(tmp_path / "b.safetensors")
-    assert torch.equal(tensors["cells"], scanpath.cells)
-    assert len(tensors["mask"]) == sum(look.mask.shape[-1] for look in scanpath.detections)
-
-
-def test_views_equal_foveation_of_the_kept_canvas(scanpath):
-    """Foveation of the kept canvas by a direct call."""
-    kept = scanpath.stimulus
-    gaze = kept.placement.points_to_canvas(scanpath.fixations[:1])
-    # With growth 2 the width of the fovea in pixels does not depend on the size of the canvas.
-    sigma = kept.settings["sensor"]["sigma"]
-    whole = foveate(kept.canvas[None].float() / 255, gaze[0], sigma=sigma, levels=5, growth=2.0)[0]
-    left, top = kept.placement.offset
-    first = scanpath.views()[0]
-    height, width = first.shape[1:]
-    torch.testing.assert_close(first, whole[:, top : top + height, left : left + width])

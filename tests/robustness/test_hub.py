@@ -40,14 +40,6 @@ def test_sensor_and_observation_model_load_without_detector_weights():
     assert load("yolov3_tiny_observation").classes[0] == "person"
 
 
-@pytest.mark.weights
-def test_eye_returns_scores_of_all_classes():
-    scene = semfov.EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=1)[0]
-    with torch.inference_mode():
-        seen = load("yolov3_tiny_eye")(scene.image[None], torch.tensor([[320.0, 240.0]]))
-    assert seen.scores.shape[-1] == 81
-
-
 AGENTS = {
     "recommended": ({"grid": (6, 5)}, observers.Target, policies.NonPredictive, policies.Closer),
     "published": ({"search": "predictive"}, observers.Semantic, policies.Predictive, policies.KL),

@@ -13,7 +13,6 @@ from semfov.belief import MapEvidence
 from semfov.errors import InputError
 from semfov.gaze.acquisition import (
     ExpectedAccuracy,
-    NeighbourhoodPosterior,
     PredictedTargetPosterior,
     SaliencyPrior,
     Static,
@@ -101,11 +100,6 @@ def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model)
                 strategy(preset, task, **others)
 
 
-def test_saliency_does_not_change_which_models_a_policy_needs():
-    for policy in ("random", "non-predictive", "predictive", "target-evidence"):
-        assert needs_model(None, PolicyConfig(policy, saliency="vocus2")) == needs_model(None, PolicyConfig(policy))
-
-
 @pytest.fixture
 def loaded(monkeypatch):
     """The models that a run loads, as pairs of kind and name."""
@@ -169,13 +163,6 @@ def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
     changed = strategy(own, belief=run, observation=model).observer
     settings = changed.prior, changed.fusion, changed.footprint, changed.tempering, changed.memory, changed.misses
     assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
-
-
-def test_the_neighbourhood_policy_needs_an_observation_model(model):
-    made = strategy("neighbourhood-raw", observation=model)
-    assert isinstance(made.policy(1, GRID), NeighbourhoodPosterior)
-    with pytest.raises(InputError, match="observation model"):
-        strategy("neighbourhood-raw")
 
 
 def test_kl_divergence_is_measured_from_the_prior_of_the_run(model):

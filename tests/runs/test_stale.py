@@ -4,8 +4,6 @@ import logging
 import os
 import shutil
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +12,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from eval.search import main
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import TargetPosterior
@@ -204,31 +201,6 @@ def test_a_policy_given_twice_is_refused(config):
     for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
         with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
             SearchRun(replace(config, policies=policies))
-
-
-@pytest.mark.slow
-@pytest.mark.lab
-def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
-    """The same command and folder, after the choice of the next cell has been inverted."""
-    tree = tmp_path / "tree"
-    for name in ("semfov", "eval"):
-        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    small = ["--data.limit", "1", "--belief.columns", "4", "--belief.rows", "3", "--protocol.starts", "3"]
-    small += ["--protocol.shifts", "5", "--policies", '["target-evidence"]', "--scanpaths", "0", "--workers", "1"]
-    small += ["--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]
-
-    # The first run is in this process, with the same code as the copied tree.
-    assert main(small) == 0
-    first = (tmp_path / "out" / "episodes.jsonl").read_text()
-    choice = tree / "semfov" / "gaze" / "choice.py"
-    text = choice.read_text()
-    assert "values.masked_fill(visited, -torch.inf)" in text
-    choice.write_text(text.replace("values.masked_fill(", "values.neg().masked_fill("))
-    call = [sys.executable, "-m", "eval.search", *small]
-    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(call, cwd=tree, env=environment, capture_output=True, text=True, check=True)
-    assert "by another version of the code" in done.stderr
-    assert (tmp_path / "out" / "episodes.jsonl").read_text() != first
 
 
 def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):

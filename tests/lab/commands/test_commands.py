@@ -3,22 +3,16 @@
 import importlib
 import json
 import os
-import re
 import sqlite3
 import subprocess
 import sys
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 from safetensors import safe_open
-
-from semfov.gaze.policies import POLICIES
-from semfov.runs.config import PolicyConfig
-from semfov.runs.presets import label, presets
 
 from .table import COMMANDS, MODEL, RUN, write_material
 
@@ -212,38 +206,3 @@ def test_help_describes_the_command_and_printed_settings_can_be_given_back(name,
         (tmp_path / "settings.yaml").write_text(texts[-1])
     assert texts[0] == texts[1]
     assert yaml.safe_load(texts[0])["out"] == "elsewhere"
-
-
-@pytest.mark.parametrize(
-    ("name", "task", "example"),
-    [
-        ("eval.search", "search", "non-predictive-calibrated, tempering 0.25"),
-        ("eval.explore", "exploration", "kl-calibrated, memory closest"),
-    ],
-)
-def test_the_help_of_studies_of_policies_names_every_preset_and_a_valid_example(name, task, example, capsys):
-    def shown(*arguments):
-        with pytest.raises(SystemExit) as stopped:
-            run(name, *arguments)
-        assert stopped.value.code == 0
-        return capsys.readouterr().out
-
-    text = " ".join(shown("--help").replace("-\n", "-").split())
-    explained = re.search(r".*(--policies \[ITEM.*?\(type:)", text)[1].replace(" ", "")
-    for preset, policy in presets(task).items():
-        if getattr(POLICIES.get(policy.policy), "__module__", "semfov.").startswith("semfov."):  # not by another test
-            alone = re.sub("-(raw|calibrated|learned)$", "", preset)
-            assert f"`{preset}`" in explained or f"`{alone}`" in explained, preset
-    for ending in ("-raw", "-calibrated"):
-        assert f"`{ending}`" in explained
-    learned = [preset for preset in presets("search") if preset.endswith("-learned")]
-    assert task != "search" or (len(learned) == 5 and "Thelastfouralsotake`-learned`" in explained)
-    mapping = re.search(r"mapping of settings such as `(\{.*?\})`", text)[1]
-    printed = yaml.safe_load(shown("--policies", f"[{mapping}]", "--sensor.sigma", "50", "--print_config"))
-    assert printed["sensor"]["sigma"] == 50
-    assert label(PolicyConfig(**printed["policies"][0]), task) == example
-    settings = shown("--policies.help")
-    assert all(field in settings for field in asdict(PolicyConfig("random")))
-    assert "(type: int from 1 to 10,000, default: 10)" in text
-    assert "(type: float from 0 to 1, default: 0.02)" in text
-    assert "Annotated" not in text

@@ -74,16 +74,6 @@ def test_attention_over_several_looks_equals_the_loop(dtype, device):
             assert float(got[episode, x]) == pytest.approx(total / weights, rel=1e-4, abs=1e-5)
 
 
-def test_an_episode_does_not_depend_on_the_others():
-    visited = torch.rand(5, 12, generator=torch.Generator().manual_seed(0)) < 0.4
-    target = torch.tensor([1, 2, 3, 2, 1])
-    together = TemplateAttention(target, make_attention(), GRID)(uniform_beliefs(5), visited)
-    for episode in range(5):
-        alone = TemplateAttention(target[episode : episode + 1], make_attention(), GRID)
-        part = slice(episode, episode + 1)
-        assert torch.equal(alone(uniform_beliefs(1), visited[part]), together[part])
-
-
 def test_templates_of_other_classes_are_refused():
     model = make_templates()
     model.metadata |= {"detector": {"name": "yolov3-tiny", "digest": "1"}}
@@ -128,12 +118,3 @@ def test_shipped_templates():
     # The average object of a class matches the template of its own class best.
     average = (model.templates + model.mean)[:, :, None, None]
     assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
-
-
-def test_looks_are_weighted_in_the_precision_of_the_attention():
-    """The mean of hundreds of equal values is that value, within rounding of double precision."""
-    grid = Grid(30, 20, (300, 200))
-    attention = torch.linspace(1, 2, 600, dtype=torch.float64).expand(600, 1, 600)
-    values = TemplateAttention(1, attention, grid, 0.2)
-    got = values(DirichletBelief(torch.ones(1, 600, 2, dtype=torch.float64)), torch.ones(1, 600, dtype=torch.bool))
-    torch.testing.assert_close(got[0], attention[0, 0], rtol=1e-13, atol=0)

@@ -1,10 +1,6 @@
-"""Metrics of conditional and of fixation maps, against pysaliency where it is installed, and against closed forms."""
+"""Metrics of conditional and of fixation maps, against their definitions and closed forms."""
 
-import importlib.util
-import sys
-import warnings
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,83 +25,8 @@ from semfov.metrics.scanpath import (
 SHAPE = (12, 17)
 
 
-@pytest.fixture
-def pysaliency(monkeypatch):
-    if importlib.util.find_spec("pysaliency") is None:
-        pytest.skip("pip install pysaliency")
-    # It imports a module that setuptools has removed, which is not called here; its ROC uses a removed name of NumPy.
-    if importlib.util.find_spec("pkg_resources") is None:
-        monkeypatch.setitem(sys.modules, "pkg_resources", SimpleNamespace(resource_string=None, resource_listdir=None))
-    monkeypatch.setattr(np, "trapz", np.trapezoid, raising=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module("pysaliency")
-
-
-def pysaliency_data(pysaliency, maps):
-    """Model, stimuli and random fixations of pysaliency for the given maps."""
-    generator = np.random.default_rng(1)
-    stimuli = pysaliency.Stimuli([np.full((*SHAPE, 3), number, dtype=np.uint8) for number in range(len(maps))])
-
-    class Model(pysaliency.SaliencyMapModel):
-        def _saliency_map(self, stimulus):
-            return maps[int(stimulus[0, 0, 0])]
-
-    count = 8
-    # In distinct pixels; otherwise one pixel would count as fixated twice.
-    pixels = [generator.choice(SHAPE[0] * SHAPE[1], count, replace=False) for _ in maps]
-    xs = [(each % SHAPE[1]).astype(float) for each in pixels]
-    ys = [(each // SHAPE[1]).astype(float) for each in pixels]
-    trains = pysaliency.FixationTrains.from_fixation_trains(
-        xs, ys, [np.arange(count)] * len(maps), list(range(len(maps))), [0] * len(maps)
-    )
-    return Model(caching=False), stimuli, trains, np.array(xs), np.array(ys)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("levels", [None, 4], ids=["distinct", "many ties"])
-def test_metrics_match_pysaliency(pysaliency, levels):
-    generator = np.random.default_rng(0)
-    maps = generator.uniform(0, 1, (3, *SHAPE))
-    if levels is not None:
-        maps = np.round(maps * levels) / levels
-    model, stimuli, trains, xs, ys = pysaliency_data(pysaliency, maps)
-    np.testing.assert_allclose(nss(maps, xs, ys).ravel(), model.NSSs(stimuli, trains), atol=1e-12)
-    np.testing.assert_allclose(
-        auc(maps, xs, ys).ravel(), model.AUCs(stimuli, trains, nonfixations="uniform"), atol=1e-12
-    )
-    judd = [auc_judd(each, x, y) for each, x, y in zip(maps, xs, ys, strict=True)]
-    assert np.mean(judd) == pytest.approx(model.AUC_Judd(stimuli, trains, jitter=False), abs=1e-12)
-    shuffled = [
-        auc_shuffled(maps[i], xs[i], ys[i], np.delete(xs, i, 0).ravel(), np.delete(ys, i, 0).ravel()) for i in range(3)
-    ]
-    assert np.mean(shuffled) == pytest.approx(
-        np.mean(model.AUC_per_image(stimuli, trains, nonfixations="shuffled")), abs=1e-12
-    )
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_information_gain_matches_pysaliency(pysaliency):
-    generator = np.random.default_rng(2)
-    densities, base = (log_density(generator.uniform(0.1, 1, (2, *SHAPE))) for _ in range(2))
-    _, stimuli, trains, xs, ys = pysaliency_data(pysaliency, densities)
-
-    class Density(pysaliency.Model):
-        def __init__(self, tables):
-            super().__init__(caching=False)
-            self.tables = tables
-
-        def _log_density(self, stimulus):
-            return self.tables[int(stimulus[0, 0, 0])]
-
-    gain = information_gain(densities, base, xs, ys)
-    expected = Density(densities).information_gain(stimuli, trains, baseline_model=Density(base))
-    assert gain.mean() == pytest.approx(expected, abs=1e-12)
-
-
 def test_metrics_match_their_definitions():
-    """Every metric by its definition, pixel by pixel, without pysaliency."""
+    """Pixel by pixel."""
     generator = np.random.default_rng(3)
     values = np.round(generator.uniform(0, 1, SHAPE), 1)
     x, y = np.array([0, 16, 5]), np.array([0, 11, 7])
