@@ -71,8 +71,8 @@ test-quick: $(STAMP)
 
 gpu: $(STAMP)
 	$(BIN)/python -c "import sys, torch; sys.exit(None if torch.cuda.is_available() else 'no GPU that torch can use')"
-	$(BIN)/python -m pytest -m "not long" -k cuda
-	$(BIN)/python -m benchmarks.pyramid --device cuda | tee benchmarks/results/gpu.md
+	$(BIN)/python -m pytest -m "not long" -k "cuda or test_devices"
+	$(BIN)/python -m benchmarks.gpu
 
 # Of the processes that tests start, too.
 coverage: $(STAMP)

@@ -20,7 +20,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from semfov.data.scenes import EmbeddedScenes
-from tests.pretended import PretendedGpu
+from tests.pretended import a_gpu
 
 pytest.register_assert_rewrite("tests.base_tester")
 settings.register_profile("semfov", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -79,8 +79,7 @@ def dtype(request: pytest.FixtureRequest) -> torch.dtype:
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """The CPU and a GPU, which is pretended on a machine without one (`tests.pretended`)."""
-    pretended = request.param == "cuda" and not torch.cuda.is_available()
-    with PretendedGpu() if pretended else nullcontext():
+    with a_gpu() if request.param == "cuda" else nullcontext():
         yield torch.device(request.param)
 
 

@@ -4,7 +4,9 @@ Operations on tensors of two devices, and `numpy()` of a tensor that was not cop
 Values are those of the CPU, so a module must give the same output there, and errors of values are raised, too.
 """
 
-from contextlib import AbstractContextManager, nullcontext
+import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -101,6 +103,30 @@ class PretendedGpu(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(func, args, kwargs or {})
+
+
+def a_gpu() -> AbstractContextManager[object]:
+    """The GPU of this machine, or the pretended one."""
+    return nullcontext() if torch.cuda.is_available() else PretendedGpu()
+
+
+@contextmanager
+def waits() -> Iterator[list[str]]:
+    """The operations that wait for the GPU while it is open."""
+    found: list[str] = []
+    if not torch.cuda.is_available():
+        waited.clear()
+        yield found
+        found += waited
+        return
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield found
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    found += [f"{each.filename}:{each.lineno}" for each in caught if "synchroniz" in str(each.message)]
 
 
 def _no_gradients(mode: bool) -> AbstractContextManager[None]:

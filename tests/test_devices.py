@@ -27,7 +27,7 @@ from semfov.episode import Step, StoredLooks, rollout
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
 from tests import small
-from tests.pretended import PretendedGpu, waited
+from tests.pretended import a_gpu, waits
 from tests.test_modules import find_testers
 from tests.viz.test_places import calls
 
@@ -173,7 +173,7 @@ def run(name: str, folder: Path) -> OnGpu:
     on_gpu, given = OnGpu(function), more(folder).get(name)
     if given is not None:
         arguments, options = given
-        with PretendedGpu():
+        with a_gpu():
             on_gpu(*arguments, **options)
         return on_gpu
     (example,) = doctest.DocTestFinder(recurse=False).find(
@@ -185,7 +185,7 @@ def run(name: str, folder: Path) -> OnGpu:
             for key in [key for key, value in vars(module).items() if value is function]:
                 patch.setattr(module, key, on_gpu)
         example.globs[function.__name__] = on_gpu
-        with PretendedGpu():
+        with a_gpu():
             doctest.DocTestRunner(verbose=False).run(example, out=failures.append)
     assert not failures, "".join(failures)
     return on_gpu
@@ -233,9 +233,9 @@ def explored(count: int) -> object:
 def test_more_episodes_do_not_wait_for_the_gpu_more_often(work):
     """Nor do more fixations: they are computed together, and few values are read."""
     often = []
-    with torch.no_grad(), PretendedGpu():
+    with torch.no_grad(), a_gpu():
         for count in (2, 9):
-            waited.clear()
-            work(count)
-            often.append([*waited])
+            with waits() as found:
+                work(count)
+            often.append(found)
     assert often[0] == often[1]
