@@ -93,8 +93,8 @@ class LivePerception:
 
         Args:
             frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
-            passed: number of frames since the last look, this one included, by which a fovea's evidence fades; above 1
-                where frames were lost, such as the seconds between two time stamps times the frames per second.
+            passed: number of frames since the last look, this one included, by which evidence fades; above 1 where
+                frames were lost, such as the seconds between two time stamps times the frames per second.
 
         Returns:
             What is known at this frame: a `FoveaMoment` or a `WindowMoment`.

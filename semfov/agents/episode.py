@@ -139,7 +139,7 @@ class Episode(ABC, Generic[_Record]):
 
         Args:
             frame: the frame.
-            passed: number of frames since the last look, this one included, by which a fovea's evidence fades.
+            passed: number of frames since the last look, this one included, by which evidence fades.
 
         Returns:
             What is known.

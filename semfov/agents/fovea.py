@@ -209,7 +209,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._first = first_cell(cell_at(start, agent.cells), seed, columns * rows)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None
-        self._outcome, self._faded = 0, 0.0
+        self._outcome, self._faded, self._frame = 0, 0.0, 0.0
         self._concluded: Decision | None = None
 
     def open(self, image: Tensor) -> Grid:
@@ -241,8 +241,7 @@ class FoveaEpisode(Episode[Scanpath]):
             places = CandidateCells(grid, self.target, self.forgetting)
             self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
         # A stream has no end, so it keeps the detections of the looks of which at least half the evidence is left.
-        span = min(self.forgetting.span, _MOST_RECENT) if self.forgetting is not None else None
-        self._recent: deque[Detections] = deque(maxlen=None if span is None else max(1, int(span)))
+        self._recent: deque[tuple[float, Detections]] = deque(maxlen=_MOST_RECENT if self.forgetting else None)
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
         if self.forgetting is None:
             mapper = self.agent.exploring.observer
@@ -263,8 +262,9 @@ class FoveaEpisode(Episode[Scanpath]):
         image = as_image(frame, like=self.eye.sensor.like, argument="frame", color=self.color)[None]
         self._check_size((image.shape[-1], image.shape[-2]))
         self._faded += self.passed
+        self._frame += self.passed
         if self._verifier is not None:
-            self._verifier.wait()
+            self._verifier.wait(self.passed)
         if self._candidate is not None:
             self._image = image
             return self._look_closely(self._candidate)
@@ -284,7 +284,9 @@ class FoveaEpisode(Episode[Scanpath]):
         if step is None:
             return None
         self._last = step, self.passes
-        self._recent.append(step.detections)
+        self._recent.append((self._frame, step.detections))
+        while self.forgetting is not None and self._frame - self._recent[0][0] >= self.forgetting.span:
+            self._recent.popleft()
         self.passes += 1
         if self.forgetting is None:
             self._trace.add(step)
@@ -353,13 +355,13 @@ class FoveaEpisode(Episode[Scanpath]):
             if self.thresholds is None:
                 return None
             outcome = int(decide(step, self.target, self.thresholds))
-            return conclude(outcome, step.belief, tuple(self._recent), grid, self.target)
+            return conclude(outcome, step.belief, self._detections, grid, self.target)
         if self.ends is None:
             return None
         # Without thresholds the target was found in the fixated cell.
         cell = None if self.thresholds is not None else int(step.cell)
         meant = class_meant(step.belief, self.target)
-        return conclude(self._outcome, step.belief, tuple(self._recent), grid, meant, cell)
+        return conclude(self._outcome, step.belief, self._detections, grid, meant, cell)
 
     def record(self) -> Scanpath:
         """The scanpath so far."""
@@ -409,6 +411,11 @@ class FoveaEpisode(Episode[Scanpath]):
             closer=None if closer is None else replace(closer, fixation=0),
             photograph=in_bytes(small[0]),
         )
+
+    @property
+    def _detections(self) -> tuple[Detections, ...]:
+        """The detections of the looks that count."""
+        return tuple(detections for _, detections in self._recent)
 
     @property
     def _candidate(self) -> int | None:

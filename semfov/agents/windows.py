@@ -244,9 +244,10 @@ class ZoomAgent(nn.Module):
 
 
 class _Look(NamedTuple):
-    """A look at a window: the number of its pass, the value that it was chosen for, and the time at its end."""
+    """A look at a window: the numbers of its pass and frame, the value that it was chosen for, and the time at its end."""
 
     number: int
+    frame: float
     glance: Glance
     value: float
     seconds: float
@@ -325,6 +326,7 @@ class WindowEpisode(Episode[ZoomPath]):
         self._glances: Glances | None = None
         self._last: WindowStep[Any] | None = None
         self._looks: list[_Look] = []
+        self._frame = 0.0
         self._concluded: Decision | None = None
         self._began = perf_counter()
 
@@ -369,9 +371,10 @@ class WindowEpisode(Episode[ZoomPath]):
                 if self._glances is None:
                     self.open(LiveGlances(self.eye, view))
                 assert isinstance(self._glances, LiveGlances)
-                self._glances.show(view, self.passes)
+                self._frame += self.passed
+                self._glances.show(view, self._frame)
                 if self._decisions is not None:
-                    self._decisions.wait()
+                    self._decisions.wait(self.passed)
             assert self._glances is not None
             if window is not None:
                 self._window = window
@@ -402,11 +405,11 @@ class WindowEpisode(Episode[ZoomPath]):
         if turn is None:
             return False
         self._last = turn
-        self._looks.append(_Look(self.passes, turn.glance, turn.worth, perf_counter() - self._began))
+        self._looks.append(_Look(self.passes, self._frame, turn.glance, turn.worth, perf_counter() - self._began))
         if self.forgetting is not None:
-            counting, oldest = {id(look) for look in turn.looks}, self.passes - self.forgetting.span
+            counting, oldest = {id(look) for look in turn.looks}, self._frame - self.forgetting.span
             self._looks = [
-                look for look in self._looks if (look.number >= oldest if look.closely else id(look.glance) in counting)
+                look for look in self._looks if (look.frame >= oldest if look.closely else id(look.glance) in counting)
             ]
         self.passes += 1
         if self._decisions is not None:
@@ -418,7 +421,7 @@ class WindowEpisode(Episode[ZoomPath]):
         """Spend a pass on a closer look at a box."""
         assert self._glances is not None
         glance = look_closely(self._glances, box)
-        self._looks.append(_Look(self.passes, glance, 0.0, perf_counter() - self._began, closely=True))
+        self._looks.append(_Look(self.passes, self._frame, glance, 0.0, perf_counter() - self._began, closely=True))
         self.passes += 1
         return candidates(glance)
 

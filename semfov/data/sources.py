@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections import Counter
@@ -170,17 +171,26 @@ def _recorder(cv2: Any, source: str | Path | int) -> Any:
 def _record(
     cv2: Any, recorder: Any, source: str | Path | int, name: str, most: int | None, gaps: Counter[str]
 ) -> Iterator[Picture]:
-    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again."""
+    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again.
+
+    The number of frames that passed follows from the time stamps of videos and streams. A camera skips the frames that
+    nobody waits for, and these are not counted.
+    """
     total, rate = (float(recorder.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
     whole_file = 0 < total < _MOST_FRAMES
-    read, missed, passed = 0, 0, 1.0
+    rate = rate if 0 < rate < _FASTEST else _USUAL_RATE
+    read, missed, passed, stamp = 0, 0, 1.0, math.inf
     try:
         while read != most:
             there, pixels = recorder.read()
             if there:
                 gaps["lost"] += missed
                 picture = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
-                yield Picture(f"{name}, frame {read + gaps['lost']}", picture, passed=passed + missed)
+                before, stamp = stamp, float(recorder.get(cv2.CAP_PROP_POS_MSEC))
+                if not isinstance(source, int) and before < stamp < math.inf:
+                    passed = max(passed, round((stamp - before) / 1000 * rate) - missed)
+                passed = min(passed + missed, _MOST_FRAMES)
+                yield Picture(f"{name}, frame {read + gaps['lost']}", picture, passed=passed)
                 read, missed, passed = read + 1, 0, 1.0
                 continue
             if whole_file and read + gaps["lost"] + missed < total:
@@ -194,7 +204,7 @@ def _record(
                 gaps["lost"] += missed if missed > 1 else 0
                 return
             gaps["reconnected"] += 1
-            passed = 1 + (time.monotonic() - began) * (rate if 0 < rate < _FASTEST else _USUAL_RATE)
+            passed, stamp = 1 + (time.monotonic() - began) * rate, math.inf
     finally:
         recorder.release()
 

@@ -102,8 +102,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self.dismiss(candidate, box)
         return features, box
 
-    def wait(self) -> None:
-        """Let a frame pass."""
+    def wait(self, frames: float = 1) -> None:
+        """Let frames pass."""
 
     def move(self, look: CloseUp, box: Tensor) -> CloseUp:
         """The record of a closer look whose target has moved to another box."""
@@ -118,7 +118,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
 class _Seen:
     """A look of a search, whose footprints are computed once."""
 
-    frame: int
+    frame: float
     detections: Detections
     grid: Grid
 
@@ -140,9 +140,9 @@ class CandidateCells(CandidatePlaces[Step]):
     def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
         self.grid, self._target = grid, target
-        self._frame = 0
+        self._frame = 0.0
         self._looks: list[_Seen] = []
-        self._dismissed: list[tuple[int, Tensor, Tensor]] = []  # frame, boxes (2, 4) and cells (X·Y,) of each place
+        self._dismissed: list[tuple[float, Tensor, Tensor]] = []  # frame, boxes (2, 4) and cells (X·Y,) of each place
 
     _step: Step
 
@@ -200,9 +200,9 @@ class CandidateCells(CandidatePlaces[Step]):
         """Make the record of the last closer look, after the last fixation."""
         return CloseUp(self._step.shift, self.target, cell_of(box, self.grid), box, place, presence)
 
-    def wait(self) -> None:
-        """Let a frame pass: drop looks, and list places again, of which less than half the evidence is left."""
-        self._frame += 1
+    def wait(self, frames: float = 1) -> None:
+        """Let frames pass: drop looks, and list places again, of which less than half the evidence is left."""
+        self._frame += frames
         oldest = self._frame - self.forgetting.span
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look.frame >= oldest]
         self._dismissed = [place for place in self._dismissed if place[0] >= oldest]

@@ -27,7 +27,7 @@ class _Verdict(NamedTuple):
     """A closer look at a place, and the number of frames since then."""
 
     look: CloseUp
-    age: int = 0
+    age: float = 0
 
 
 class Verifier(Generic[LookType]):
@@ -78,10 +78,10 @@ class Verifier(Generic[LookType]):
         """The closer looks, in order."""
         return [verdict.look for verdict in self.verdicts]
 
-    def wait(self) -> None:
-        """Let the time of a frame pass. In a stream, call it before every frame."""
-        self.places.wait()
-        aged = (verdict._replace(age=verdict.age + 1) for verdict in self.verdicts)
+    def wait(self, frames: float = 1) -> None:
+        """Let the time of frames pass. In a stream, call it before every frame."""
+        self.places.wait(frames)
+        aged = (verdict._replace(age=verdict.age + frames) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def see(self, look: LookType, *, last: bool = False) -> None:
@@ -213,7 +213,7 @@ class Verifier(Generic[LookType]):
         """Whether at least half of the evidence of a closer look is left."""
         return verdict.age <= self.places.forgetting.span
 
-    def _faded(self, before: float, now: float, age: int) -> float:
+    def _faded(self, before: float, now: float, age: float) -> float:
         """A probability that fades towards that of the belief."""
         weight = self.places.forgetting.keep**age
         if weight == 1:

@@ -73,7 +73,7 @@ class WindowLook(NamedTuple):
 class _Dated(NamedTuple):
     """Boxes `(M, 4)` of a frame, and scores `(M,)` of the target in them."""
 
-    frame: int
+    frame: float
     boxes: Tensor
     scores: Tensor
 
@@ -100,8 +100,8 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         super().__init__(forgetting)
         self._target, self.likely = target, likely
         self._detections: list[_Dated] = []
-        self._examined: list[tuple[int, Tensor]] = []  # with their frames
-        self._frame = self._number = 0
+        self._examined: list[tuple[float, Tensor]] = []  # with their frames
+        self._frame, self._number = 0.0, 0
 
     _look: WindowLook
 
@@ -157,9 +157,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Make the record of the last closer look, which is the last look of the path."""
         return CloseUp(None, self._target, None, box, place, presence, number=self._number - 1)
 
-    def wait(self) -> None:
-        """Let a frame pass: forget boxes of which less than half the evidence is left."""
-        self._frame += 1
+    def wait(self, frames: float = 1) -> None:
+        """Let frames pass: forget boxes of which less than half the evidence is left."""
+        self._frame += frames
         oldest = self._frame - self.forgetting.span
         self._detections = [each for each in self._detections if each.frame >= oldest]
         self._examined = [(frame, box) for frame, box in self._examined if frame >= oldest]
@@ -201,7 +201,7 @@ class PhotographPlaces(CandidateBoxes):
     def __init__(self, target: int, lattice: Lattice, forgetting: Forgetting | None = None) -> None:
         super().__init__(target, 0.0, forgetting)
         self._lattice, self._at = lattice, 0
-        self._known: list[tuple[int, float]] = []  # with their frames
+        self._known: list[tuple[float, float]] = []  # with their frames
 
     @property
     def left(self) -> float:
@@ -239,7 +239,7 @@ class PhotographPlaces(CandidateBoxes):
         self._known.append((self._frame, place))
         return replace(super().record(box, place, presence), number=self._at)
 
-    def wait(self) -> None:
-        """Let a frame pass."""
-        super().wait()
+    def wait(self, frames: float = 1) -> None:
+        """Let frames pass."""
+        super().wait(frames)
         self._known = [each for each in self._known if each[0] >= self._frame - self.forgetting.span]

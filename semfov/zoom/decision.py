@@ -172,10 +172,10 @@ class WindowDecisions:
             self.thresholds = self.thresholds.changed(confirm)
         return SearchFacts(belief)
 
-    def wait(self) -> None:
-        """Let the time of a frame pass. In a stream, call it before every frame."""
+    def wait(self, frames: float = 1) -> None:
+        """Let the time of frames pass. In a stream, call it before every frame."""
         if self.verifier is not None:
-            self.verifier.wait()
+            self.verifier.wait(frames)
 
     def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
         """Take in a look, and choose the place that is to be looked at closely."""

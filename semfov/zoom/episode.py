@@ -50,9 +50,9 @@ class _Recent(Generic[_Belief]):
         self.looks: list[Glance] = []
         self.windows: set[Window] = set()
         self.renewed = False
-        self._frames: list[int] = []
+        self._frames: list[float] = []
 
-    def add(self, glance: Glance, frame: int) -> None:
+    def add(self, glance: Glance, frame: float) -> None:
         """Add a look at a frame, and forget those that it replaces and those that are too old."""
         self.looks.append(glance)
         self._frames.append(frame)
@@ -72,12 +72,12 @@ class _Recent(Generic[_Belief]):
         """The window that was looked at longest ago."""
         return min(zip(self._frames, self.looks, strict=True), key=lambda dated: dated[0])[1].window
 
-    def _forgets(self, glance: Glance, frame: int) -> bool:
+    def _forgets(self, glance: Glance, frame: float) -> bool:
         """Forget the looks that no longer count; returns whether any were forgotten."""
         assert self.forgetting is not None
         first, span = self.looks[0].window, self.forgetting.span
         again = glance.window in self.windows
-        dated: list[tuple[int, Glance]] = list(zip(self._frames, self.looks, strict=True))
+        dated: list[tuple[float, Glance]] = list(zip(self._frames, self.looks, strict=True))
         if again and glance.window == first:
             dated = [dated[-1], *dated[1:-1]]
         # An old overview is kept until there is a new one, as all other looks are predicted from it.

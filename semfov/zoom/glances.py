@@ -91,7 +91,7 @@ class Glances(ABC):
     """Base of sources of looks at one picture: live ones, and stored ones."""
 
     lattice: Lattice
-    frame: int = 0
+    frame: float = 0
     blank: Tensor | None = None
     """Cells where there is nothing to see, `(rows, columns)`; None for none."""
 
@@ -106,8 +106,8 @@ class LiveGlances(Glances):
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
 
-    def show(self, view: WindowView, frame: int) -> None:
-        """Take the next frame of a stream, which has the size of the first."""
+    def show(self, view: WindowView, frame: float) -> None:
+        """Take the next frame of a stream, which has the size of the first, and the number of frames until it."""
         self.view, self.frame = view, frame
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:

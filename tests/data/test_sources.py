@@ -4,6 +4,7 @@ import re
 import sys
 from collections import Counter
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from threading import Thread
 
 import numpy as np
@@ -136,6 +137,16 @@ def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
     assert stream.gaps["lost"] == 5
 
 
+def test_frames_pass_by_their_time_stamps(monkeypatch):
+    """Frames at 0, 40, 80 and 1080 ms, 25 a second; of a camera the same frames are those that are waited for."""
+    cv2 = pytest.importorskip("cv2")
+    for source, expected in ((Path("a.mp4"), [1, 1, 1, 25]), (0, [1, 1, 1, 1])):
+        recorder = Recorder([[0, 40, 80, 1080], []])
+        monkeypatch.setattr(recorder, "get", lambda key, of=recorder: of.now if key == cv2.CAP_PROP_POS_MSEC else 25.0)
+        taken = sources._record(cv2, recorder, source, "a", 4, Counter())
+        assert [picture.passed for picture in taken] == expected
+
+
 class Recorder:
     """OpenCV's reader of a stream that breaks off, and is there again when it is opened for the second time."""
 
@@ -159,7 +170,10 @@ class Recorder:
         return bool(self.left)
 
     def read(self):
-        return (True, np.full((6, 8, 3), self.left.pop(0), np.uint8)) if self.left else (False, None)
+        if not self.left:
+            return False, None
+        self.now = float(self.left.pop(0))
+        return True, np.full((6, 8, 3), self.now % 256, np.uint8)
 
 
 def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):

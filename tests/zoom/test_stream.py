@@ -96,6 +96,21 @@ def test_windows_are_looked_at_again_after_the_half_life_of_evidence(agent, pict
     assert len(last) < 30 - len(overviews) + 1
 
 
+def test_looks_are_forgotten_by_the_frames_that_passed(agent, picture):
+    """A twin keeps the date of each look; the overview is kept until there is a new one."""
+    live, dates, now = agent.episode(rate=math.log(2) / 4.5), {}, 0.0
+    for passed in (1, 1, 1, 1, 3, 0.5, 6, 1, 1, 1):
+        moment = live.step(picture, passed)
+        now += passed
+        dates[moment.window] = now
+        expected = {window for window, date in dates.items() if window.level == 0 or now - date <= 4.5}
+        assert {look.window for look in moment.glances} == expected
+        due = now + 1 - next(date for window, date in dates.items() if window.level == 0) > 4.5
+        assert due == (moment.next_window.level == 0)
+    assert passed == 1
+    assert len(dates) > len(expected)
+
+
 @pytest.mark.slow
 def test_objects_that_move_or_leave_are_forgotten(agent):
     """A square jumps to another place: soon it is shown there, and nowhere else."""
