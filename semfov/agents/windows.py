@@ -244,7 +244,7 @@ class ZoomAgent(nn.Module):
 
 
 class _Look(NamedTuple):
-    """A look at a window: the numbers of its pass and frame, the value that it was chosen for, and the time at its end."""
+    """A look at a window: its numbers of pass and frame, the value that it was chosen for, and the time at its end."""
 
     number: int
     frame: float

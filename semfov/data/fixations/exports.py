@@ -7,11 +7,11 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import Line, Origin, Size, Units, of_source, records_of
-from semfov.errors import DataError, lookup
+from semfov.errors import DataError, check, lookup
 
 
 class _Export(NamedTuple):
@@ -82,6 +82,8 @@ _EXPORTS = (
 
 _OURS = ("picture", "subject", "target", "trial")
 _GONE = ("", ".", "nan", "none", "null", "na")  # lost, or not a number
+_EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
+"""Sides of eyes by the first word of a field, which may be a number of ioHub (`EyeTrackerConstants`)."""
 
 
 def read_export(
@@ -93,6 +95,7 @@ def read_export(
     columns: Mapping[str, str] | None = None,
     units: Units | None = None,
     origin: Origin | None = None,
+    eye: Literal["left", "right"] | None = None,
 ) -> list[Fixations]:
     r"""Read the fixations in a table that the program of an eye tracker exports.
 
@@ -113,6 +116,7 @@ def read_export(
             `{"picture": "condition_image"}`.
         units: as for `read_table`, where it is not that of the program.
         origin: likewise.
+        eye: `left` or `right`, where a column `eye` tells them; None takes the right one in viewings that have both.
 
     Returns:
         One record for each viewing, in the order in which they begin; convert those of a screen by
@@ -134,6 +138,7 @@ def read_export(
     named = dict(columns or {})
     for name in named:
         lookup(name, _OURS, "column")
+    check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     where, header, rows = of_source(source)
     by_key = {_key(name): name for name in reversed(header)}
     _split_location(by_key, rows)
@@ -159,9 +164,11 @@ def read_export(
         line["trial"] = f"{line['trial']} {viewing}"
         key = line.pop("number") or None
         kept[number if key is None else (viewing, key)] = place, line
-    lines = list(kept.values())
-    if not lines:
+    if not kept:
         raise DataError(f"{where}: expected fixations of {export.program}, got none that has a place on the picture")
+    lines = _of_one_eye(list(kept.values()), eye)
+    if not lines:
+        raise DataError(f"{where}: expected fixations of the {eye} eye, got those of the other one")
     if not all(line["picture"] for _, line in lines):
         raise DataError(
             f"{where}: expected the name of the picture, which {export.program} does not give; give picture="
@@ -169,6 +176,17 @@ def read_export(
     if size is None and not all(line["width"] and line["height"] for _, line in lines):
         raise DataError(f"{where}: expected the size of the frame, which {export.program} does not give; give size=")
     return records_of(where, lines, size, units or export.units, origin or export.origin)
+
+
+def _of_one_eye(lines: Sequence[tuple[str, dict[str, str]]], eye: str | None) -> list[Line]:
+    """The lines of an eye, of the right one in viewings of both; lines that name no eye, or both, are kept."""
+    sides = [_EYES.get(re.split(r"[\W_]", line.pop("eye").lower())[0], "") for _, line in lines]
+    both = {line["trial"] for (_, line), side in zip(lines, sides, strict=True) if side == "right"}
+    dropped = [
+        side != eye if eye else side == "left" and line["trial"] in both
+        for (_, line), side in zip(lines, sides, strict=True)
+    ]
+    return [line for line, side, drop in zip(lines, sides, dropped, strict=True) if not (side and drop)]
 
 
 def is_export(header: Sequence[str]) -> bool:
@@ -206,7 +224,12 @@ def _reader(
         return next((by_key[name] for name in names if name in by_key), None)
 
     fields = {name: column(getattr(export, name)) for name in ("picture", "subject", "trial", "number")}
-    fields |= {"x": by_key[export.point[0]], "y": by_key[export.point[1]], "duration": column(export.duration[0])}
+    fields |= {
+        "eye": column(("eye", "eyeused")),
+        "x": by_key[export.point[0]],
+        "y": by_key[export.point[1]],
+        "duration": column(export.duration[0]),
+    }
     for name, side in zip(("width", "height"), export.size or (), strict=False):
         fields[name] = column((side, f"{side}px"))
     missing = [given for given in named.values() if given not in by_key.values()]

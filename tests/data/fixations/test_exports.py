@@ -127,6 +127,22 @@ def test_viewings_are_told_apart(tmp_path):
     assert [len(each) for each in records] == [1, 2, 1, 1, 1]
 
 
+@pytest.mark.parametrize("names", [("21", "22"), ("LEFT_EYE", "RIGHT_EYE"), ("L", "R")])
+def test_fixations_of_both_eyes_are_those_of_one(tmp_path, names):
+    """The right one where a viewing has both; b.png was seen by the left one alone."""
+    left, right = names
+    rows = [(left, 1, "a"), (right, 2, "a"), (left, 3, "a"), (right, 4, "a"), (left, 5, "b")]
+    head = "session_id,eye,duration,average_gaze_x,average_gaze_y,cond"
+    (tmp_path / "a.csv").write_text("\n".join([head, *(f"2,{eye},0.2,{x},0,{name}.png" for eye, x, name in rows)]))
+    known = {"size": (101, 101), "columns": {"picture": "cond"}}
+    for eye, expected in ((None, [[2, 4], [5]]), ("right", [[2, 4]]), ("left", [[1, 3], [5]])):
+        records = read_export(tmp_path / "a.csv", eye=eye, **known)
+        assert [(each.points[:, 0] - 50).tolist() for each in records] == expected
+    (tmp_path / "a.csv").write_text("\n".join([head, f"2,{left},0.2,1,0,a.png"]))
+    with pytest.raises(DataError, match="expected fixations of the right eye, got those of the other one"):
+        read_export(tmp_path / "a.csv", eye="right", **known)
+
+
 def test_what_is_missing_is_named(tmp_path):
     text, _, _ = FILES["Pupil Cloud"]
     (tmp_path / "a.csv").write_text(text)
