@@ -10,7 +10,7 @@ from time import perf_counter
 
 from semfov.agents.fovea import cell_at
 from semfov.cli.agent import detector_classes, make_agent, one_class, several_classes
-from semfov.cli.options import LiveOptions, start_of
+from semfov.cli.options import LiveOptions, start_of, white_of
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.live import LivePerception
@@ -37,7 +37,7 @@ def look_live(options: LiveOptions) -> int:
     _sought(options, detector_classes(options))
     source = options.source if options.camera is None else options.camera
     assert source is not None
-    stream = open_stream(source, options.frames)
+    stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))

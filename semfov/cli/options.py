@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from semfov.agents.episode import MOST_PASSES
 from semfov.agents.picture import How
+from semfov.data.tone import White
 from semfov.errors import InputError
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
 from semfov.runs.workers import Where
@@ -187,6 +188,7 @@ class LiveOptions(AgentOptions):
         give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
         closer: largest number of closer looks in the time until half of the belief has faded (none: 2 for a fovea, as
             many as there are frames for windows); 0: none.
+        white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
         out: video to write, with gaze and belief, or windows and objects, drawn into each frame.
     """
 
@@ -200,6 +202,7 @@ class LiveOptions(AgentOptions):
     confirm: Share | None = None
     give_up: Share | None = None
     closer: _MostCloserLooks | None = None
+    white: str | None = None
     out: Path | None = None
 
 
@@ -303,19 +306,30 @@ def start_of(text: str | None) -> int | tuple[int, int] | None:
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
+def white_of(text: str | None) -> White | None:
+    """The values that are black and white.
+
+    >>> white_of("300,3000"), white_of("4095"), white_of("auto")
+    ((300.0, 3000.0), 4095.0, 'auto')
+    """
+    if text is None:
+        return None
+    try:
+        values: Any = "auto" if text == "auto" else tuple(float(each) for each in text.split(","))
+    except ValueError:
+        raise InputError(f"white: expected 4095, 300,3000 or auto, got {text!r}") from None
+    white: White = values[0] if len(values) == 1 else values
+    return white
+
+
 def shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
     """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given.
 
     >>> shown_by(PictureOptions(white="300,3000", bands="4,3,2"))
     {'white': (300.0, 3000.0), 'bands': (4, 3, 2)}
     """
-    shown: dict[str, Any] = {}
-    if options.white is not None:
-        try:
-            values = "auto" if options.white == "auto" else tuple(float(each) for each in options.white.split(","))
-        except ValueError:
-            raise InputError(f"white: expected 4095, 300,3000 or auto, got {options.white!r}") from None
-        shown["white"] = values[0] if len(values) == 1 else values
+    white = white_of(options.white)
+    shown: dict[str, Any] = {} if white is None else {"white": white}
     if options.bands is not None:
         try:
             numbers = tuple(int(each) for each in options.bands.split(","))

@@ -13,11 +13,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
+from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
@@ -34,6 +36,9 @@ _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)
 _MOST_FRAMES = 1e9  # of a file; streams state numbers that mean nothing
 _FASTEST = 1000  # frames per second
 _USUAL_RATE = 25.0  # of a stream that does not give its own
+
+_WIDE = {int.from_bytes(code, "little") for code in (b"Y1\0\x10", b"Y16 ")}
+"""Codes of frames of 16 bits, grey, of FFmpeg and of a camera."""
 
 _PLAYLIST = b"#EXTM3U"
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
@@ -107,8 +112,9 @@ class Stream(NamedTuple):
     gaps: Mapping[str, int] = MappingProxyType({})
 
 
-def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
-    """Open a video by its file, a camera by its number, or a stream by its address."""
+def open_stream(source: str | Path | int, most: int | None = None, white: White | None = None) -> Stream:
+    """Open a video by its file, a camera by its number, or a stream by its address; `white` as for `read_image`."""
+    check_white(white)
     address = isinstance(source, str) and "://" in source
     if not address and not isinstance(source, int):
         source = Path(source)
@@ -135,7 +141,7 @@ def open_stream(source: str | Path | int, most: int | None = None) -> Stream:
         raise DataError(f"{name}: cannot be opened; check that {what}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
     gaps: Counter[str] = Counter()
-    frames = _record(cv2, recorder, source, name, most, gaps)
+    frames = _record(cv2, recorder, source, name, most, gaps, white)
     first = next(frames)
     return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
 
@@ -151,25 +157,36 @@ def _name(address: str) -> str:
 
 
 def _recorder(cv2: Any, source: str | Path | int) -> Any:
-    """OpenCV's reader of a source. Of a camera or a stream it keeps the newest frame alone, where it can."""
+    """OpenCV's reader of a source."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised by the caller
     try:
         if isinstance(source, Path):
             return cv2.VideoCapture(str(source))
         if isinstance(source, int):
-            recorder = cv2.VideoCapture(source)
-        else:
-            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
-            recorder = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
-        recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        return recorder
+            return cv2.VideoCapture(source)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
+        return cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
     finally:
         cv2.utils.logging.setLogLevel(level)
 
 
+def _prepare(cv2: Any, recorder: Any, white: White | None) -> None:
+    """Let a camera or a stream keep the newest frame alone, where it can, and with `white` give 16 bits as they are."""
+    recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    codes = {int(recorder.get(key)) for key in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC)}
+    if white is not None and codes & _WIDE:
+        recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+
+
 def _record(
-    cv2: Any, recorder: Any, source: str | Path | int, name: str, most: int | None, gaps: Counter[str]
+    cv2: Any,
+    recorder: Any,
+    source: str | Path | int,
+    name: str,
+    most: int | None,
+    gaps: Counter[str],
+    white: White | None = None,
 ) -> Iterator[Picture]:
     """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again.
 
@@ -180,11 +197,15 @@ def _record(
     whole_file = 0 < total < _MOST_FRAMES
     rate = rate if 0 < rate < _FASTEST else _USUAL_RATE
     read, missed, passed, stamp = 0, 0, 1.0, math.inf
+    _prepare(cv2, recorder, white)
     try:
         while read != most:
             there, pixels = recorder.read()
             if there:
                 gaps["lost"] += missed
+                if white is not None:
+                    pixels = bytes_between(pixels, black_and_white(white, pixels))
+                    pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
                 picture = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
                 before, stamp = stamp, float(recorder.get(cv2.CAP_PROP_POS_MSEC))
                 if not isinstance(source, int) and before < stamp < math.inf:
@@ -203,6 +224,7 @@ def _record(
                 # The number of frames that a file states may be off by one.
                 gaps["lost"] += missed if missed > 1 else 0
                 return
+            _prepare(cv2, recorder, white)
             gaps["reconnected"] += 1
             passed, stamp = 1 + (time.monotonic() - began) * rate, math.inf
     finally:
@@ -217,8 +239,6 @@ def _reopened(cv2: Any, recorder: Any, source: str | int) -> bool:
         again = _recorder(cv2, source)
         if again.isOpened():
             again.release()
-            opened = recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG)
-            if opened:
-                recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+            if recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG):
                 return True
     return False

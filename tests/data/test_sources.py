@@ -147,6 +147,21 @@ def test_frames_pass_by_their_time_stamps(monkeypatch):
         assert [picture.passed for picture in taken] == expected
 
 
+def test_frames_of_sixteen_bits_are_shown_between_black_and_white(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    path, kind = tmp_path / "warm.mkv", [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    film = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 25, (64, 48), kind)
+    for value in (300, 1300, 4000):
+        film.write(np.full((48, 64), value, np.uint16))
+    film.release()
+    taken = [each.image for each in open_stream(path, white=(300, 2300)).frames]
+    assert [each.shape for each in taken] == [(3, 48, 64)] * 3
+    assert [int(each[0, 0, 0]) for each in taken] == [0, 128, 255]
+    assert all((each == each[0, 0, 0]).all() for each in taken)
+    plain = [int(each.image[0, 0, 0]) for each in open_stream(path).frames]
+    assert np.allclose(plain, np.array([300, 1300, 4000]) / 256, atol=1)
+
+
 class Recorder:
     """OpenCV's reader of a stream that breaks off, and is there again when it is opened for the second time."""
 

@@ -151,7 +151,7 @@ def read_export(
         )
     read = _reader(export, by_key, named, where)
     default = {"picture": picture, "subject": subject}
-    kept: dict[object, Line] = {}
+    kept: dict[object, tuple[str, dict[str, str]]] = {}
     viewing, before = 0, None
     for number, (place, row) in enumerate(rows):
         line = read(row)
