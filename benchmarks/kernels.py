@@ -11,8 +11,8 @@ from torch import Tensor
 from benchmarks.beliefs import CLASSES, LEVELS, make_belief, make_model, unvisited
 from benchmarks.machine import GAZE, SIGMA, photograph
 from benchmarks.timing import Comparison
+from eval.presence import roc
 from semfov import Grid, acquisition, foveate
-from semfov.metrics.presence import roc
 from semfov.sensor import gaussian_pyramid, laplacian_pyramid
 
 Array = NDArray[np.float32]

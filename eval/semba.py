@@ -15,13 +15,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
 from semfov.belief.observers import Semantic
 from semfov.episode import Step, rollout
 from semfov.errors import DataError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.files import write_text
-from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.command import command
 from semfov.runs.config import BeliefConfig, DetectorConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import CellLooks, Looking

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
 from eval.comparison.summary import Curve, collect_records
 from eval.explore.report import success
 from eval.explore.run import ExploreConfig, ExploreRun
@@ -30,10 +31,8 @@ from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
 from semfov.eye import Eye
-from semfov.fit.observation import FitObservationConfig, fit_fom
-from semfov.fit.outputs import model_path
+from semfov.fit.observation import FitObservationConfig
 from semfov.io.files import clean, write_text
-from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.presence import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -45,6 +44,8 @@ from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table
+from train.fit_fom import fit_fom
+from train.outputs import model_path
 
 
 class _SensorChoice(NamedTuple):

@@ -13,10 +13,185 @@ continue. Several machines share the work with
 Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 """
 
+import json
+import platform
 import sys
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
 
-from semfov.fit.observation import FitObservationConfig, fit_fom
+import torch
+from torch import Tensor
+
+from semfov.fit.observation import FitObservationConfig, count_misses, fit_model, fit_published, statistics_of
+from semfov.fit.outputs import split
+from semfov.io.files import write_text
+from semfov.io.tables import csv_text
+from semfov.metrics.calibration import Calibration, calibration
+from semfov.observation import MissCounts
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.mle import Method
 from semfov.runs.command import command
+from semfov.runs.samples import Sampler, Samples
+from semfov.runs.tables import table
+from semfov.version import __version__
+from semfov.viz import plot_reliability
+from semfov.viz.style import save_figure
+from train.mosaic_samples import MosaicSampler
+from train.outputs import commit, model_path
+from train.samples import collect_samples
+
+_Models = dict[str, FovealObservationModel]
+
+
+def _report_markdown(
+    config: FitObservationConfig,
+    model: FovealObservationModel,
+    figures: dict[str, Calibration],
+    likelihood: dict[str, float],
+    by_level: list[list[str]],
+    fitted: int,
+) -> str:
+    """Write the report as Markdown: the measures of each model, then counts and measures by level."""
+    judged = next(iter(figures.values())).count
+    head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
+    rows = [
+        [name, f"{likelihood[name]:.2f}", *(f"{value:.3f}" for value in (f.nll, f.brier, f.ece)),
+         f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
+        for name, f in figures.items()
+    ]  # fmt: skip
+    summary = table([head, *rows])
+    counts = torch.tensor(model.metadata["counts"])
+    fallback = model.metadata["fallback"]
+    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
+    levels = [
+        [
+            f"{low} - {high}",
+            str(int(counts[0, n])),
+            str(int(counts[1:, n].sum())),
+            str(fallback.get(str(n), "")),
+            *by_level[n],
+        ]
+        for n, (low, high) in enumerate(pairwise(edges))
+    ]
+    axis = "reduction in octaves" if config.mosaics else "distance"
+    where = (
+        "the number of octaves by which the picture is reduced"
+        if config.mosaics
+        else "distance to the fixation in units of the image's longer side"
+    )
+    head = [axis, "background", "objects", "uses level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
+    return "\n".join(
+        [
+            f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
+            f"{config.holdout}). The log likelihood is that of the scores given the true class. The other measures are "
+            "of the posterior of the class, background included.",
+            "",
+            *summary,
+            "",
+            f"Number of detections in the fit, by {where}. Levels with too few objects use the parameters of another "
+            "level. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
+            "",
+            *table([head, *levels]),
+            "",
+        ]
+    )
+
+
+def _figures_by_level(
+    model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples
+) -> list[list[str]]:
+    """Compute NLL and ECE of raw scores and of the fitted model at each level; predictions `(M, K+1)`."""
+    first, *_, last = predictions.values()
+    level = model.level(judged.distance)
+    rows = []
+    for n in range(len(model.edges) + 1):
+        here = level == n
+        if not here.any():
+            rows.append([""] * 4)
+            continue
+        raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
+        rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
+    return rows
+
+
+def _write_report(
+    config: FitObservationConfig,
+    model: FovealObservationModel,
+    models: _Models,
+    judged: Samples,
+) -> list[Path]:
+    """Evaluate the models (the fitted one last) on held-out samples, print the tables, and write all files."""
+    with torch.inference_mode():
+        predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
+        likelihood = {
+            name: float(m.log_likelihood(judged.scores, judged.distance).gather(1, judged.labels[:, None]).mean())
+            for name, m in models.items()
+        }
+    figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
+    by_level = _figures_by_level(model, predictions, judged)
+    text = _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
+    print(text)
+    write_text(config.out / "report.md", text)
+    write_text(config.out / "config.yaml", config.yaml())
+    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
+    write_text(
+        config.out / "manifest.json",
+        json.dumps(
+            {
+                "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
+                "commit": commit(),
+                "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
+                "model": metadata,
+                "held_out": {name: asdict(figure) for name, figure in figures.items()},
+            },
+            indent=2,
+        )
+        + "\n",
+    )
+    last = list(models)[-1]
+    classes = ("background", *model.classes)
+    counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
+    head = ["class", *(f"level {n}" for n in range(len(model.edges) + 1))]
+    write_text(config.out / "counts.csv", csv_text([head, *counts]))
+    figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
+    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
+    return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
+
+
+def fit_fom(config: FitObservationConfig) -> None:
+    """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
+    folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
+    sampler = collect_samples(config, folder, "looking", kind)
+    samples = sampler.drawn(config.most)
+    held_out = split(samples.scene, config.holdout)
+    training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
+    statistics = statistics_of(config, sampler, training)
+    model = fit_model(config, sampler, statistics, samples[~held_out])
+    fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
+    counts = (
+        count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
+    )
+    misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
+    model.miss_rate = misses.rates().to(model.edges)
+    if config.mosaics:
+        model.metadata["cells"] = misses.total.sum(1).tolist()
+    path = model_path(config, sampler.eye.detector.name)
+    model.save(path)
+    edges, classes = config.edges, sampler.eye.detector.classes
+    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
+    methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
+    for method in methods:
+        models[f"Dirichlet, {method}"] = fit_published(config, sampler, statistics, method)
+    models["Dirichlet with class prior"] = fit_published(config, sampler, statistics, "newton", prior=True)
+    models["the same, tempered 0.1"] = fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
+    if config.method == "discriminative":
+        models["discriminative"] = model
+    written = _write_report(config, model, models, samples[held_out])
+    print("written:")
+    for file in [path, *written]:
+        print(f"  {file}")
+
 
 main = command(fit_fom, FitObservationConfig, __doc__)
 

@@ -19,15 +19,15 @@ from pathlib import Path
 
 from semfov.detection.load import load_detector
 from semfov.errors import check
-from semfov.fit.gaze import GazeFit, describe_viewing, fitted_density, summary_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
-from semfov.fit.outputs import model_path, write_outputs
-from semfov.fit.viewing import ViewingData, features_of, look
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import SingleName, Whole
 from semfov.runs.setup import detector_options, prepare_worker
 from semfov.runs.tables import table
+from train.gaze import GazeFit, describe_viewing, fitted_density, summary_of
+from train.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
+from train.outputs import model_path, write_outputs
+from train.viewing import ViewingData, features_of, look
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,17 @@ Use it with `python -m eval.explore --policies [learned-map] --belief.map_model 
 
 import sys
 
-from semfov.fit.map import FitMapConfig, fit_map
+from semfov.errors import check
+from semfov.fit.map import FitMapConfig, fit_map_evidence
 from semfov.runs.command import command
+from train.outputs import fit_and_write
+
+
+def fit_map(config: FitMapConfig) -> None:
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
+    check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
+    fit_and_write(config, fit_map_evidence)
+
 
 main = command(fit_map, FitMapConfig, __doc__)
 

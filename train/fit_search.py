@@ -15,8 +15,15 @@ Use the model with `--policies [target-evidence] --belief.target_model runs/fit_
 
 import sys
 
-from semfov.fit.evidence import FitSearchConfig, fit_search
+from semfov.fit.evidence import FitSearchConfig, fit_evidence
 from semfov.runs.command import command
+from train.outputs import fit_and_write
+
+
+def fit_search(config: FitSearchConfig) -> None:
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
+    fit_and_write(config, fit_evidence)
+
 
 main = command(fit_search, FitSearchConfig, __doc__)
 

@@ -18,13 +18,14 @@ from dataclasses import replace
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.outputs import training_of
 from semfov.fit.searches import open_photographs
 from semfov.fit.verification import FitVerificationConfig, fit_in_folds, verification_report
 from semfov.runs.command import command
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
+from train.outputs import model_path, write_outputs
 
 
 def fit_verification(config: FitVerificationConfig) -> None:

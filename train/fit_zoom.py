@@ -19,7 +19,6 @@ from typing import get_args
 import torch
 
 from semfov.errors import check
-from semfov.fit.outputs import write_outputs
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.windows import (
     FitZoomConfig,
@@ -45,6 +44,7 @@ from semfov.runs.command import command
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
 from semfov.zoom.evidence import GlimpseEvidence
+from train.outputs import write_outputs
 from train.zoom_choice import choose_foresight, choose_patience
 
 _PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")

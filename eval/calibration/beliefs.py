@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.comparison.model_folder import if_shipped
 from eval.decide.run import detected_on_landing, landing
 from eval.search.run import SearchConfig
 from semfov.belief import MapEvidence, TargetEvidence
@@ -28,7 +29,7 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches
-from semfov.runs.setup import if_shipped, make_learned
+from semfov.runs.setup import make_learned
 
 COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""

@@ -17,13 +17,14 @@ from semfov.eye import Eye
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, DataConfig, EyeConfig, ProtocolConfig
-from semfov.runs.samples import Samples, collect_samples
+from semfov.runs.samples import Samples
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Count, Seed, Share, Side
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
+from train.samples import collect_samples
 
 
 @dataclass(frozen=True)

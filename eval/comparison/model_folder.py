@@ -1,10 +1,12 @@
 """Settings of an experiment from a folder of fitted models."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TypeVar
 
 from semfov.errors import InputError, check
+from semfov.eye import Eye
 from semfov.gaze.policies import POLICIES
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DetectorConfig, PolicyConfig, RunConfig, SensorConfig
@@ -94,3 +96,22 @@ def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
 
 def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
+
+
+_Made = TypeVar("_Made")
+
+
+def if_shipped(
+    make: Callable[[str | None, Eye], _Made],
+    name: str | None,
+    eye: Eye,
+    missing: Callable[[str], object] = lambda reason: None,
+) -> _Made | None:
+    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped."""
+    try:
+        return make(name, eye)
+    except InputError as error:
+        if name is not None:
+            raise
+        missing(str(error))
+        return None

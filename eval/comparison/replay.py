@@ -5,6 +5,7 @@ from functools import partial
 
 import torch
 
+from eval.comparison.model_folder import if_shipped
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
@@ -12,7 +13,7 @@ from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import if_shipped, make_learned
+from semfov.runs.setup import make_learned
 
 
 def replay(run: PolicyLooking, index: int, record: ResultRecord) -> Scanpath:

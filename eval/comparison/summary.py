@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from semfov.io.code import commit
 from semfov.io.files import inside, replacing, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
@@ -25,6 +24,7 @@ from semfov.runs.scene_run import gather
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import percent
 from semfov.version import __version__
+from train.outputs import commit
 
 _Value = TypeVar("_Value", float, FloatArray)
 """A number, or a curve."""

@@ -7,10 +7,12 @@ from collections.abc import Hashable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
+from eval.chance import errors_by_chance
+from eval.presence import hits_at
 from semfov.data.scene import Scenes
-from semfov.metrics.bootstrap import Bootstrap
-from semfov.metrics.calibration import calibration_error, errors_by_chance
-from semfov.metrics.presence import area_under_roc, hits_at
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.presence import area_under_roc
 from semfov.runs.tables import plus_minus, table
 
 _SHARES = (0.01, 0.02, 0.05)

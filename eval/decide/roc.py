@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from semfov.metrics.presence import area_under_roc, roc
+from eval.presence import roc
+from semfov.metrics.presence import area_under_roc
 from semfov.viz.style import COLOURS, LINES, make_figure, styled
 
 if TYPE_CHECKING:

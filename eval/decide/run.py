@@ -11,6 +11,7 @@ from typing import Annotated, Any, Self
 import torch
 from torch import Tensor
 
+from eval.comparison.model_folder import if_shipped
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
 from semfov.agents.episode import EpisodeLimits
@@ -36,7 +37,7 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
-from semfov.runs.setup import if_shipped, make_learned, make_observation
+from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks
 from semfov.runs.zoom_store import StoredGlances
 from semfov.strategy import Strategy

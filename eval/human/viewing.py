@@ -17,9 +17,6 @@ from tqdm import tqdm
 from eval.page.origin import END, PLACE
 from semfov.detection.load import load_detector
 from semfov.errors import check
-from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
-from semfov.fit.viewing import MapSource, Viewed, ViewingData, covering, features_of, look, saliency_of
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
@@ -28,6 +25,9 @@ from semfov.runs.config import DetectorConfig, SaliencyModel
 from semfov.runs.settings import Count, Whole
 from semfov.runs.setup import detector_options, prepare_worker
 from semfov.runs.tables import plus_minus, table
+from train.gaze import GazeFit, maps_of
+from train.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
+from train.viewing import MapSource, Viewed, ViewingData, covering, features_of, look, saliency_of
 
 _Array = NDArray[np.float64]
 

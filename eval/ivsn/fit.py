@@ -24,12 +24,13 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detector import Detector
 from semfov.errors import DataError
-from semfov.fit.outputs import model_path, training_of, write_outputs
+from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
 from semfov.runs.command import command
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes, prepare_worker
 from semfov.runs.tables import table
+from train.outputs import model_path, write_outputs
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.chance import random_search
 from eval.page import paper
 from eval.page.curves import averaged, behind, paired_difference, points, policies_of, records_of, spans
 from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
-from semfov.metrics.search import random_search
 from semfov.runs.presets import label as name_of
 from semfov.runs.tables import percent, table
 

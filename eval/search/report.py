@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.chance import random_search
 from eval.comparison.replay import replay
 from eval.comparison.report_page import write_run_report
 from eval.comparison.summary import (
@@ -25,7 +26,7 @@ from eval.search.run import SearchRun
 from semfov.errors import DataError
 from semfov.io.files import clean, inside
 from semfov.metrics.averages import FloatArray
-from semfov.metrics.search import cumulative_performance, random_search
+from semfov.metrics.search import cumulative_performance
 from semfov.paths import Stimulus
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table

@@ -8,10 +8,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
 from semfov.agents.windows import LIKELY
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
-from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table

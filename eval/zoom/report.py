@@ -8,11 +8,11 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
-from semfov.metrics.bootstrap import Bootstrap
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import table

@@ -25,7 +25,7 @@ from semfov.fit.comparison import Difference, Rule, by_detection, decisions, sea
 from semfov.fit.descent import descend
 from semfov.fit.detector_report import curves_figure, in_words, mean_percent, percent_of, section
 from semfov.fit.examples import Examples, example_episodes
-from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
@@ -135,12 +135,7 @@ def _make_examples(
     return _TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def fit_search(config: FitSearchConfig) -> None:
-    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
-    fit_and_write(config, _fit_evidence)
-
-
-def _fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
+def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds."""
     examples = _make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
@@ -369,7 +364,7 @@ class EvidenceFit(PartFit):
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
         config, run, inputs = self.settings, self.run, self.inputs
-        fit = _fit_evidence(config, run)
+        fit = fit_evidence(config, run)
         fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
         learned = strategy(Target(fit.model), NonPredictive())
         ways = {

@@ -17,12 +17,12 @@ from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Observer, Semantic
 from semfov.belief.observers.base import own
 from semfov.episode import Step
-from semfov.errors import DataError, InputError, check
+from semfov.errors import DataError, InputError
 from semfov.fit.comparison import Difference, explore_curves
 from semfov.fit.descent import descend
 from semfov.fit.detector_report import curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
-from semfov.fit.outputs import Fit, fit_and_write, split, training_of
+from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
@@ -120,13 +120,7 @@ def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _M
     return _MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def fit_map(config: FitMapConfig) -> None:
-    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
-    check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
-    fit_and_write(config, _fit_map_evidence)
-
-
-def _fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
+def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model."""
     examples = _make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
@@ -330,7 +324,7 @@ class MapFit(PartFit):
         inputs, run = self.inputs, self.run
         if inputs.components < 3:
             raise InputError("detector: a map of all classes needs at least 2 classes, got a detector with 1 class")
-        fit = _fit_map_evidence(self.settings, run)
+        fit = fit_map_evidence(self.settings, run)
         fovea = self.config.sensor.fovea
         ways = {
             "fitted": strategy(LearnedMap(fit.model), Closer(fovea)),

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import platform
-import sys
 import warnings
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -19,23 +15,17 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.fit.comparison import Difference
 from semfov.fit.detector_report import in_words, section
-from semfov.fit.outputs import model_path, split
+from semfov.fit.outputs import split
 from semfov.fit.parts.base import IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
-from semfov.io.code import commit
-from semfov.io.files import write_text
-from semfov.io.tables import csv_text
-from semfov.metrics.calibration import Calibration, calibration, surprisal
+from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
 from semfov.runs.looking import Looking
-from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells, collect_samples
+from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
-from semfov.runs.tables import table
-from semfov.runs.zoom_samples import MosaicSampler
-from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 
@@ -100,55 +90,21 @@ class FitObservationConfig(FitConfig):
         return [step * n for n in range(1, self.levels)]
 
 
-def fit_fom(config: FitObservationConfig) -> None:
-    """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
-    folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
-    sampler = collect_samples(config, folder, "looking", kind)
-    samples = sampler.drawn(config.most)
-    held_out = split(samples.scene, config.holdout)
-    training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
-    statistics = _statistics_of(config, sampler, training)
-    model = _fit_model(config, sampler, statistics, samples[~held_out])
-    fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
-    counts = (
-        _count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
-    )
-    misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
-    model.miss_rate = misses.rates().to(model.edges)
-    if config.mosaics:
-        model.metadata["cells"] = misses.total.sum(1).tolist()
-    path = model_path(config, sampler.eye.detector.name)
-    model.save(path)
-    edges, classes = config.edges, sampler.eye.detector.classes
-    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
-    methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
-    for method in methods:
-        models[f"Dirichlet, {method}"] = _fit_published(config, sampler, statistics, method)
-    models["Dirichlet with class prior"] = _fit_published(config, sampler, statistics, "newton", prior=True)
-    models["the same, tempered 0.1"] = _fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
-    if config.method == "discriminative":
-        models["discriminative"] = model
-    written = _write_report(config, model, models, samples[held_out])
-    print("written:")
-    for file in [path, *written]:
-        print(f"  {file}")
-
-
 _Looker = Sampler | Looking
 """The source of the detections: random looks, or looks from every cell."""
 
 
-def _fit_model(
+def fit_model(
     config: FitObservationConfig, sampler: _Looker, statistics: DirichletStatistics, samples: Samples
 ) -> FovealObservationModel:
     """Fit the model with the method in the settings."""
     if config.method != "discriminative":
-        return _fit_published(config, sampler, statistics, config.method)
-    start = _fit_published(config, sampler, statistics, "newton", expected="empirical")
+        return fit_published(config, sampler, statistics, config.method)
+    start = fit_published(config, sampler, statistics, "newton", expected="empirical")
     return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
-def _fit_published(
+def fit_published(
     config: FitObservationConfig,
     sampler: _Looker,
     statistics: DirichletStatistics,
@@ -179,7 +135,7 @@ def _fit_published(
         ).eval()
 
 
-def _statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Iterable[Samples]) -> DirichletStatistics:
+def statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Iterable[Samples]) -> DirichletStatistics:
     """Sum the sufficient statistics of detections by class and level, shard by shard."""
     model = FovealObservationModel.identity(sampler.eye.detector.classes, config.edges)
     components, levels = model.alpha.shape[:2]
@@ -189,7 +145,7 @@ def _statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Itera
     return statistics
 
 
-def _count_misses(
+def count_misses(
     photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: CellsOfLook
 ) -> MissCounts:
     """Count cells without any detection over all looks at some photographs; edges `(N-1,)`."""
@@ -205,124 +161,6 @@ def _count_misses(
         detected, objects = grid.footprint(boxes).any(0), grid.footprint(annotation.boxes)
         misses.update(detected[in_view], objects[:, in_view], annotation.labels, level)
     return misses
-
-
-_Models = dict[str, FovealObservationModel]
-
-
-def _write_report(
-    config: FitObservationConfig,
-    model: FovealObservationModel,
-    models: _Models,
-    judged: Samples,
-) -> list[Path]:
-    """Evaluate the models (the fitted one last) on held-out samples, print the tables, and write all files."""
-    with torch.inference_mode():
-        predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
-        likelihood = {
-            name: float(m.log_likelihood(judged.scores, judged.distance).gather(1, judged.labels[:, None]).mean())
-            for name, m in models.items()
-        }
-    figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
-    by_level = _figures_by_level(model, predictions, judged)
-    text = _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", config.yaml())
-    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
-    write_text(
-        config.out / "manifest.json",
-        json.dumps(
-            {
-                "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
-                "commit": commit(),
-                "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
-                "model": metadata,
-                "held_out": {name: asdict(figure) for name, figure in figures.items()},
-            },
-            indent=2,
-        )
-        + "\n",
-    )
-    last = list(models)[-1]
-    classes = ("background", *model.classes)
-    counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
-    head = ["class", *(f"level {n}" for n in range(len(model.edges) + 1))]
-    write_text(config.out / "counts.csv", csv_text([head, *counts]))
-    figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
-    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
-    return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
-
-
-def _report_markdown(
-    config: FitObservationConfig,
-    model: FovealObservationModel,
-    figures: dict[str, Calibration],
-    likelihood: dict[str, float],
-    by_level: list[list[str]],
-    fitted: int,
-) -> str:
-    """Write the report as Markdown: the measures of each model, then counts and measures by level."""
-    judged = next(iter(figures.values())).count
-    head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
-    rows = [
-        [name, f"{likelihood[name]:.2f}", *(f"{value:.3f}" for value in (f.nll, f.brier, f.ece)),
-         f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
-        for name, f in figures.items()
-    ]  # fmt: skip
-    summary = table([head, *rows])
-    counts = torch.tensor(model.metadata["counts"])
-    fallback = model.metadata["fallback"]
-    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
-    levels = [
-        [
-            f"{low} - {high}",
-            str(int(counts[0, n])),
-            str(int(counts[1:, n].sum())),
-            str(fallback.get(str(n), "")),
-            *by_level[n],
-        ]
-        for n, (low, high) in enumerate(pairwise(edges))
-    ]
-    axis = "reduction in octaves" if config.mosaics else "distance"
-    where = (
-        "the number of octaves by which the picture is reduced"
-        if config.mosaics
-        else "distance to the fixation in units of the image's longer side"
-    )
-    head = [axis, "background", "objects", "uses level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
-    return "\n".join(
-        [
-            f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
-            f"{config.holdout}). The log likelihood is that of the scores given the true class. The other measures are "
-            "of the posterior of the class, background included.",
-            "",
-            *summary,
-            "",
-            f"Number of detections in the fit, by {where}. Levels with too few objects use the parameters of another "
-            "level. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
-            "",
-            *table([head, *levels]),
-            "",
-        ]
-    )
-
-
-def _figures_by_level(
-    model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples
-) -> list[list[str]]:
-    """Compute NLL and ECE of raw scores and of the fitted model at each level; predictions `(M, K+1)`."""
-    first, *_, last = predictions.values()
-    level = model.level(judged.distance)
-    rows = []
-    for n in range(len(model.edges) + 1):
-        here = level == n
-        if not here.any():
-            rows.append([""] * 4)
-            continue
-        raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
-        rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
-    return rows
 
 
 class ObservationFit(PartFit):
@@ -345,10 +183,10 @@ class ObservationFit(PartFit):
         config, run, samples = self.settings, self.run, self.inputs.samples
         held_out = split(samples.scene, config.holdout)
         judged = samples[held_out]
-        model = _fit_model(config, run, _statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
+        model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = partial(all_cells, cells=self.config.cells)
-        misses = _count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
         with torch.inference_mode():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import subprocess
 import sys
 import uuid
 from collections.abc import Callable, Iterable, Iterator
@@ -178,17 +177,3 @@ def _distributed(path: tuple[str, ...]) -> dict[str, set[Path]]:
             for name in names | {getmodulename(top) or top for top in tops}:
                 found.setdefault(name, set()).add(folder.resolve())
     return found
-
-
-def commit() -> str | None:
-    """Commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
-    folder = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None

@@ -89,21 +89,6 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
     return _error_of(reliability(confidence, correct, bins))
 
 
-def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000, seed: int = 0) -> Tensor:
-    r"""Expected calibration errors of perfectly calibrated predictions, which are above 0 by chance.
-
-    The outcomes are drawn from the predicted probabilities (Bröcker and Smith, 2007, consistency resampling):
-
-    .. math:: y_i \sim \mathrm{Bernoulli}(p_i)
-
-    Shapes: confidence `(M,)` → `(samples,)`.
-    """
-    p = _probabilities(confidence, "confidence").detach().cpu()
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.rand(samples, len(p), generator=generator, dtype=torch.float64) < p
-    return torch.stack([calibration_error(p, outcome, bins) for outcome in drawn])
-
-
 def _error_of(bins: Tensor) -> Tensor:
     """Expected calibration error from the sums of `reliability`.
 

@@ -1,17 +1,13 @@
 """Measures of deciding whether a target is present."""
 
-import math
-from bisect import bisect_right
-
-import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_number, check_shape
+from semfov.errors import check, check_shape
 from semfov.metrics.labels import as_numbers, as_outcomes
 
 
-def _cases(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Scores of the cases with the target, and of those without; there is at least one of each."""
     scores = as_numbers(score, "score")
     there = as_outcomes(present, "present").to(scores.device)
@@ -29,44 +25,7 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
     Shapes: score `(M,)`, present `(M,)`.
     """
-    hit, miss = _cases(score, present)
+    hit, miss = scores_by_presence(score, present)
     miss = miss.sort().values
     below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
     return float(below.double().mean() / (2 * len(miss)))
-
-
-def _threshold_for(absent: Tensor, share: float) -> float:
-    """The lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
-
-    Shapes: absent `(M,)`.
-    """
-    check(len(absent) > 0, "absent", "at least one case without the target", "none")
-    check_number(share, "share", 0, 1)
-    count = len(absent)
-    # A product of floats can fall on the wrong side of a whole number: 0.29 · 100 is less than 29.
-    allowed = bisect_right(range(1, count + 1), share, key=lambda alarms: alarms / count)
-    if allowed >= count:
-        return -math.inf
-    order = absent.double().sort(descending=True).values
-    return float(torch.nextafter(order[allowed], torch.tensor(torch.inf, dtype=torch.float64)))
-
-
-def hits_at(score: Tensor, present: Tensor, share: float) -> float:
-    """Hit rate at a given false alarm rate: the fraction of the cases with the target that reach the threshold.
-
-    Shapes: score `(M,)`, present `(M,)`.
-    """
-    hit, miss = _cases(score, present)
-    return float((hit >= _threshold_for(miss, share)).double().mean())
-
-
-def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
-    """The receiver operating characteristic: false alarm rate and hit rate at every threshold.
-
-    Shapes: score `(M,)`, present `(M,)`.
-    """
-    # NumPy sorts faster than torch on one thread.
-    hit, miss = (np.sort(kind.detach().cpu().numpy()) for kind in _cases(score, present))
-    levels = np.unique(np.concatenate([hit, miss]))[::-1]
-    shares = [1 - np.searchsorted(kind, levels) / len(kind) for kind in (miss, hit)]
-    return [0.0, *shares[0].tolist()], [0.0, *shares[1].tolist()]

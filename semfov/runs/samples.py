@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -20,13 +19,11 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
-from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.observation.matching import match
 from semfov.runs.looks import look_from
 from semfov.runs.seeds import generator_for
-from semfov.runs.setup import check_sources, make_eye, make_scenes, prepare_worker
+from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import SceneStore, looks_digest
-from semfov.runs.workers import run_tasks
 from semfov.zoom.eye import WindowEye
 
 
@@ -217,37 +214,3 @@ class Sampler:
         points = torch.rand(config.fixations, 2, generator=generator) * grid.extent - 0.5
         detections = look_from(cast(Eye, self.eye), scene.image, points)
         return Samples.of(detections, points, self.scenes.annotation(index), index, config.iou)
-
-
-_process: dict[str, Sampler] = {}
-
-
-def _prepare(kind: type[Sampler], config: Any, folder: Path) -> None:
-    prepare_worker()
-    _process["sampler"] = kind(config, folder)
-
-
-def _run_shard(shard: int) -> bytes:
-    return pack_tensors(vars(_process["sampler"].sample(shard)))
-
-
-def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:
-    """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
-
-    The result is the same to the last bit wherever the work is done, on processors of one kind.
-    """
-    sampler = kind(config, folder)
-    todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
-    done = run_tasks(
-        _run_shard,
-        todo,
-        where=config.where,
-        setup=_prepare,
-        settings=(kind, config, folder),
-        title=title,
-        unit="shard",
-    )
-    with closing(done):
-        for shard, tensors in done:
-            sampler.save(shard, Samples(**unpack_tensors(tensors)))
-    return sampler

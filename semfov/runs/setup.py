@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -29,7 +29,6 @@ from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
 
 _Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
-_Made = TypeVar("_Made")
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -158,22 +157,6 @@ def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:
     model = kind.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
-
-
-def if_shipped(
-    make: Callable[[str | None, Eye], _Made],
-    name: str | None,
-    eye: Eye,
-    missing: Callable[[str], object] = lambda reason: None,
-) -> _Made | None:
-    """Load the model that the settings name, or else the one shipped for the eye; None where none is shipped."""
-    try:
-        return make(name, eye)
-    except InputError as error:
-        if name is not None:
-            raise
-        missing(str(error))
-        return None
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

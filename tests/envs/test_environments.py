@@ -9,10 +9,10 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from eval.chance import random_search
 from semfov import DataError, EmbeddedScenes, Grid, InputError
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
 from semfov.envs.registration import _IDS
-from semfov.metrics.search import random_search
 from tests.envs.agents import MaskedRandom, run_agent
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]

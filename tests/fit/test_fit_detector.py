@@ -161,11 +161,11 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 
 FITS = {
-    "observation": "_fit_model",
+    "observation": "fit_model",
     "tempering": "hit_rates",
-    "evidence": "_fit_evidence",
+    "evidence": "fit_evidence",
     "verification": "fit_in_folds",
-    "map": "_fit_map_evidence",
+    "map": "fit_map_evidence",
     "parts.windows": "_fit_mosaics",
 }
 

@@ -7,12 +7,12 @@ import torch
 
 from eval.calibration import main as calibrate
 from semfov import FovealObservationModel
-from semfov.fit.observation import FitObservationConfig, fit_fom
+from semfov.fit.observation import FitObservationConfig
 from semfov.observation import match
 from semfov.runs.config import DataConfig
 from semfov.runs.samples import Sampler
 from semfov.runs.seeds import generator_for
-from train.fit_fom import main
+from train.fit_fom import fit_fom, main
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 

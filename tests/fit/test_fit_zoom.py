@@ -15,7 +15,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
 from semfov.decision import MOST_CLOSER
-from semfov.fit.observation import FitObservationConfig, fit_fom
+from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import unverified, verify
 from semfov.fit.windows import FitZoomConfig
 from semfov.fit.windows_evidence import example_of
@@ -23,12 +23,13 @@ from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
-from semfov.runs.zoom_samples import MosaicSampler
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, Tiles
+from train.fit_fom import fit_fom
 from train.fit_zoom import fit_zoom
+from train.mosaic_samples import MosaicSampler
 
 
 @pytest.mark.slow
@@ -109,7 +110,7 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
 @pytest.mark.slow
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles(name="bright"))
-    monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (96, 72))
+    monkeypatch.setattr("train.mosaic_samples.TILE", (96, 72))
     config = FitObservationConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",

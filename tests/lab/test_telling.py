@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from eval.comparison.telling import Telling, _tells, calibrated, class_frequencies
+from eval.presence import hits_at
 from semfov import EmbeddedScenes
-from semfov.metrics.presence import area_under_roc, hits_at
+from semfov.metrics.presence import area_under_roc
 
 
 @pytest.fixture(scope="module")

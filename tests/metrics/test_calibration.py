@@ -9,8 +9,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eval.chance import errors_by_chance
 from semfov.errors import InputError
-from semfov.metrics.calibration import BinarySums, calibration, calibration_error, errors_by_chance, reliability
+from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
 
 
 def ece_by_loop(confidence, correct, bins):

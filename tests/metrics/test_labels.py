@@ -5,12 +5,14 @@ import pytest
 import torch
 from sklearn.metrics import roc_auc_score, roc_curve
 
+from eval.bootstrap import Bootstrap
+from eval.chance import errors_by_chance
+from eval.presence import hits_at, roc
 from semfov.errors import InputError
 from semfov.metrics.averages import standard_error
-from semfov.metrics.bootstrap import Bootstrap
-from semfov.metrics.calibration import BinarySums, calibration, calibration_error, errors_by_chance, reliability
+from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
 from semfov.metrics.exploration import count_right
-from semfov.metrics.presence import area_under_roc, hits_at, roc
+from semfov.metrics.presence import area_under_roc
 from semfov.metrics.scanpath import edit_distance, mean_performance, sequence_score, tfp_auc
 from semfov.metrics.search import cumulative_performance
 

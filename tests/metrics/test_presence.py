@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
+from eval.presence import _threshold_for, hits_at
 from semfov.errors import InputError
-from semfov.metrics.presence import _threshold_for, area_under_roc, hits_at
+from semfov.metrics.presence import area_under_roc
 
 # Few values, so that many are tied.
 scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from semfov.metrics.search import cumulative_performance, random_search
+from eval.chance import random_search
+from semfov.metrics.search import cumulative_performance
 
 
 def test_cumulative_performance_by_hand():

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from eval.chance import random_search
 from semfov import Detections, Grid, fusion, policies
 from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
-from semfov.metrics.search import cumulative_performance, random_search
+from semfov.metrics.search import cumulative_performance
 from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.search_protocol import episodes_of, looks_of, run_episodes, tie_noise

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.observation import FitObservationConfig, _count_misses
+from semfov.fit.observation import FitObservationConfig, count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.setup import split_photographs
-from semfov.runs.zoom_samples import MosaicSampler, _choose_windows
 from semfov.zoom.lattice import Lattice
+from train.mosaic_samples import MosaicSampler, _choose_windows
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
@@ -35,7 +35,7 @@ def test_windows_are_of_all_magnifications():
 def sampler(detector, monkeypatch, tmp_path):
     detector.classes = ("person", "cat", "cup")
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: detector)
-    monkeypatch.setattr("semfov.runs.zoom_samples.TILE", (160, 120))
+    monkeypatch.setattr("train.mosaic_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
     config = FitObservationConfig(data=data, fixations=2, shard=1, mosaics=2, holdout=2)
     return MosaicSampler(config, tmp_path)
@@ -70,7 +70,7 @@ def test_samples_are_detections_with_octaves(sampler):
 @pytest.mark.slow
 def test_misses_are_counted_in_the_cells_that_a_window_shows(sampler):
     samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
-    counts = _count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
+    counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
     size = sampler.scenes.annotation(1).size
     cells = torch.zeros(3, dtype=torch.long)
     for x, y, magnification in samples.fixations.tolist():

@@ -19,13 +19,13 @@ from eval.human.search.trials import drawn_searches, read_searches
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture, write_table
 from semfov.errors import DataError, check
-from semfov.io.code import commit
 from semfov.io.files import clean, sha256
 from semfov.io.tables import csv_text
 from semfov.runs.scene_run import finish, gather
 from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz.style import save_figure
+from train.outputs import commit
 
 _Array = NDArray[np.float64]
 

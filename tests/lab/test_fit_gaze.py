@@ -14,12 +14,12 @@ from eval.human import main as compare
 from semfov import Detector, saliency
 from semfov.data.fixations import Fixations, write_osie
 from semfov.detection import Candidates
-from semfov.fit.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
-from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
-from semfov.fit.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 from train.fit_gaze import main
+from train.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
+from train.gaze_folds import CENTRE, Fold, FoldStore
+from train.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
 
 SIZE = (60, 80)
 
@@ -132,8 +132,8 @@ def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monke
     fold = Fold([half], 1, 4)
     first = store.scores("halves", fold, fit, judges=[others])
     assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
-    monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
-    monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
+    monkeypatch.setattr("train.gaze_folds.fitted_density", None)
+    monkeypatch.setattr("train.gaze_folds.score", None)
     again = store.scores("halves", fold, fit, judges=[others])
     assert all(torch.equal(first[key], again[key]) for key in first)
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from semfov.errors import SemfovError
-from semfov.fit.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
-from semfov.fit.viewing import Viewed, folds, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.code import modules_digest
 from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.scene_run import digest_of
+from train.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
+from train.viewing import Viewed, folds, log_centre, others_of
 
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
@@ -94,7 +94,7 @@ class FoldStore:
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
-        self.folder, code = folder, modules_digest("semfov.fit.gaze", "semfov.gaze.saliency", __name__)
+        self.folder, code = folder, modules_digest("train.gaze", "train.viewing", "semfov.gaze.saliency", __name__)
         self.what = {**what, "code": code}
 
     def model(self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features") -> FixationDensity:

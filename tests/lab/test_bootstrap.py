@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.stats import bootstrap, norm
 
+from eval.bootstrap import Bootstrap
 from semfov.errors import InputError
-from semfov.metrics.bootstrap import Bootstrap
 from semfov.metrics.presence import area_under_roc
 
 GROUPS = ["a", "b", "a", "c", "b", "b"]
