@@ -1,5 +1,6 @@
 """Fusion rules: update a Dirichlet belief with the likelihoods of detections."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -196,9 +197,9 @@ def check_parameters(beta: Tensor) -> None:
     if not beta.numel() or not values_known(beta):
         return
     # The minimum and the maximum of a tensor with a NaN are NaN.
-    least, largest = beta.detach().aminmax()
-    if not bool((least > 0) & (largest < torch.inf)):
-        check(False, "beta", "positive, finite Dirichlet parameters", f"{float(least):g} to {float(largest):g}")
+    least, largest = torch.stack(beta.detach().aminmax()).tolist()
+    got = f"{least:g} to {largest:g}"
+    check(least > 0 and largest < math.inf, "beta", "positive, finite Dirichlet parameters", got)
 
 
 def scale_likelihood(likelihood: Tensor) -> Tensor:
@@ -271,9 +272,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
     if soft and footprint.numel() and values_known(footprint):
         # The minimum and the maximum of a tensor with a NaN are NaN.
-        least, most = footprint.detach().aminmax()
-        if not bool((least >= 0) & (most <= 1)):
-            check(False, "footprint", "weights from 0 to 1", f"{float(least):g} to {float(most):g}")
+        least, most = torch.stack(footprint.detach().aminmax()).tolist()
+        check(least >= 0 and most <= 1, "footprint", "weights from 0 to 1", f"{least:g} to {most:g}")
     return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
 
 

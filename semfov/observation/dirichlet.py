@@ -234,10 +234,10 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     check(epsilon > 0, "epsilon", "a positive number", epsilon)
     if scores.numel() and values_known(scores):
         # The minimum and the maximum of a tensor with a NaN are NaN, so one pass checks both conditions.
-        least, largest = scores.detach().aminmax()
-        if not bool(torch.isfinite(least) & torch.isfinite(largest)):
+        least, largest = torch.stack(scores.detach().aminmax()).tolist()
+        if not (math.isfinite(least) and math.isfinite(largest)):
             check_finite(scores, "scores")
-        check(bool(least >= 0), "scores", "no negative numbers", float(least))
+        check(least >= 0, "scores", "no negative numbers", least)
     raised = scores.clamp(min=epsilon)
     return raised / raised.sum(-1, keepdim=True)
 
@@ -253,6 +253,5 @@ def _check_parameters(alpha: Tensor, argument: str) -> None:
     check_shape(alpha, argument, None)
     if alpha.numel() and values_known(alpha):
         # The minimum and the maximum of a tensor with a NaN are NaN.
-        least, most = alpha.detach().aminmax()
-        got = f"{float(least):g} to {float(most):g}"
-        check(bool((least > 0) & (most < torch.inf)), argument, "positive, finite parameters", got)
+        least, most = torch.stack(alpha.detach().aminmax()).tolist()
+        check(least > 0 and most < math.inf, argument, "positive, finite parameters", f"{least:g} to {most:g}")

@@ -171,10 +171,14 @@ class FovealObservationModel(Pretrained):
             InputError: a distance is negative, NaN, or so large that it must be in pixels.
         """
         if distance.numel() and values_known(distance):
-            least, most = (float(bound) for bound in distance.detach().aminmax())
+            least, most = torch.stack(distance.detach().aminmax()).tolist()
             check(least >= 0, "distance", "numbers from 0 up", "NaN or a negative number")
             got = f"{most:g}; divide distances in pixels by it"
             check(most < _MOST_DISTANCE or most == float("inf"), "distance", "units of the image's longer side", got)
+        return self._level(distance)
+
+    def _level(self, distance: Tensor) -> Tensor:
+        """`level` without checks, which wait for a GPU."""
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
@@ -223,7 +227,7 @@ class FovealObservationModel(Pretrained):
             InputError: shapes do not fit, or a score is negative or not finite.
         """
         logits = self.log_likelihood(scores, distance) * self.tempering
-        return (logits + F.embedding(self.level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
+        return (logits + F.embedding(self._level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
         """Expected score vector of every class at every level, `E[S | C = k, d]`.

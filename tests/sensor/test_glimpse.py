@@ -22,7 +22,8 @@ def picture(height=47, width=61, channels=3, dtype=torch.float64, seed=0):
 def test_the_whole_image_equals_antialiased_resizing_by_torch_inside_the_border(device, size):
     image = picture().to(device)
     boxes = torch.tensor([[0.0, 0.0, 61.0, 47.0]], dtype=image.dtype, device=device)
-    expected = F.interpolate(image, size[::-1], mode="bilinear", antialias=True)
+    # On a GPU the peer refuses to shrink a picture to one pixel.
+    expected = F.interpolate(image.cpu(), size[::-1], mode="bilinear", antialias=True).to(device)
     got = glimpse(image, boxes, size, padding_mode="border")
     inner = [slice(n // 2, n // 2 + 1) if n < 3 else slice(1, n - 1) for n in size[::-1]]
     if min(size) >= 3:
