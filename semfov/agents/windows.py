@@ -192,8 +192,8 @@ class ZoomAgent(nn.Module):
             on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
-            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
-                takes 0.3.
+            least: probability from which on objects count, or their score in a look at the whole picture, as the bare
+                detector shows it; None takes 0.5. Without evidence it is their score, and None takes 0.3.
 
         Returns:
             The looks and the objects.
@@ -283,7 +283,8 @@ class WindowEpisode(Episode[ZoomPath]):
         closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames; None as for `search`.
         batch: number of windows that are chosen jointly and pass the detector together.
         worth: an exploration ends when no look is expected to find more new objects than this.
-        least: probability or score from which on objects count; None takes 0.5 for probabilities and 0.3 for scores.
+        least: probability, or score in a look at the whole picture, from which on objects count; None takes 0.5.
+            Without evidence it is the score in any look, and None takes 0.3.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
         eye: the eye that looks at frames; a picture is opened with its looks.
 

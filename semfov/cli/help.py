@@ -90,7 +90,7 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 {_AGENT}
 {_LOOKS}
   --worth N            a look is worth a pass if it is expected to show this many new objects (default 0.01)
-  --least P            objects count from this probability on, in small pictures from this score on
+  --least P            objects count from this probability on, or with this score in the whole picture (default 0.5)
   --batch N            windows that are looked at together
 {_OUTPUT}
 """,

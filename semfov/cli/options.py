@@ -148,7 +148,8 @@ class FindOptions(PictureOptions):
     Args:
         target: class to find, or several with commas (none: all classes).
         worth: a look is worth a pass if it is expected to show this many new objects (none: 0.01).
-        least: score from which on an object counts, in windows its probability (none: 0.5 there).
+        least: score from which on an object counts, in windows its probability or its score in the whole picture
+            (none: 0.5 there).
         batch: number of windows that are looked at together.
     """
 
@@ -165,7 +166,8 @@ class ExploreOptions(PictureOptions):
     Args:
         worth: least expected gain of a look: cells that are named right with a learned map (none: 0.1), or in a large
             picture new objects (none: 0.01); 0 makes all looks.
-        least: score from which on an object counts, in windows its probability (none: 0.5 there).
+        least: score from which on an object counts, in windows its probability or its score in the whole picture
+            (none: 0.5 there).
     """
 
     worth: Weight | None = None

@@ -47,7 +47,8 @@ class Record(Conversion):
         target: class index 1..K that was searched for; None for all classes.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count; where scores are probabilities (`measure`), the probability.
+        least: score from which on objects count; where scores are probabilities (`measure`), the probability, or the
+            score in a look at the whole picture.
         photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
         source: file of the picture; None if it does not come from a file.
 
@@ -114,8 +115,13 @@ class Record(Conversion):
 
     @property
     def measure(self) -> str:
-        """What `least` is compared with, in a word: `score`, or `probability`."""
+        """What the scores of objects are, in a word: `score`, or `probability`."""
         return "score"
+
+    @property
+    def threshold_in_words(self) -> str:
+        """From what on objects count, such as `score 0.3`."""
+        return f"{self.measure} {self.least:g}"
 
     @property
     def decided_by(self) -> str:
@@ -221,8 +227,13 @@ class Record(Conversion):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        objects, sure = confirm(self.candidates.of(self._sought), self._confirmed_places, self.least)
+        candidates = self.candidates.of(self._sought)
+        objects, sure = confirm(candidates, self._confirmed_places, self._counts(candidates))
         return replace(objects, classes=self.classes), sure
+
+    def _counts(self, candidates: Objects) -> Tensor:
+        """Which candidates of the classes that were searched for count as objects without being confirmed, `(M,)`."""
+        return candidates.scores >= self.least
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say from which score on.
@@ -233,7 +244,7 @@ class Record(Conversion):
         labels = self.objects.labels
         names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought]
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
-        return f"{', '.join(names) or every} from {self.measure} {self.least:g}"
+        return f"{', '.join(names) or every} from {self.threshold_in_words}"
 
     def summary(self) -> str:
         """Describe the outcome, and explain why it ended if it did."""
@@ -249,7 +260,7 @@ class Record(Conversion):
             )
         ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
-        found = f"objects from {self.measure} {self.least:g}: {', '.join([*named, *more]) or 'none'}"
+        found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"
         return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])
 
     def _lines(self) -> list[str]:

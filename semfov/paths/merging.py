@@ -78,9 +78,9 @@ def number_of(look: CloseUp) -> int:
 
 
 def confirm(
-    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], least: float
+    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], counts: Tensor
 ) -> tuple[Objects, Tensor]:
-    """The candidates that count as objects: those with a high score, and those that were confirmed; → `(M,)`."""
+    """The candidates that count `(N,)`, and those that were confirmed; and which of all these were, `(M,)`."""
     boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
     sure = torch.zeros(len(candidates), dtype=torch.bool)
     for place, label, chance, look in places:
@@ -92,9 +92,9 @@ def confirm(
             boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
             labels = torch.cat([labels, labels.new_tensor([label])])
             looks = torch.cat([looks, looks.new_tensor([look])])
-            sure = torch.cat([sure, torch.tensor([False])])
+            sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
         scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
         sure[same] = True
     order = scores.argsort(descending=True, stable=True)
-    order = order[((scores >= least) | sure)[order]]
+    order = order[(counts | sure)[order]]
     return Objects(boxes, scores, labels, looks)[order], sure[order]

@@ -20,6 +20,7 @@ from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import shown
 
 _WINDOW = {
     "fixation": Pair((Number(), Number(), POSITIVE)),
@@ -177,8 +178,22 @@ class ZoomPath(GazeRecord):
 
     @property
     def measure(self) -> str:
-        """What `least` is compared with: `probability` where the scores of objects are that, otherwise `score`."""
+        """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
         return "score" if self.unseen is None else "probability"
+
+    @property
+    def threshold_in_words(self) -> str:
+        """From what on objects count, such as `probability or score 0.5`; in a search only the probability counts."""
+        score = " or score" if self.decision is None and self.unseen is not None else ""
+        return f"{self.measure}{score} {self.least:g}"
+
+    def _counts(self, candidates: Objects) -> Tensor:
+        """Candidates from the probability `least` on, and those that a look at the whole shows with such a score."""
+        counts = super()._counts(candidates)
+        if self.decision is not None:
+            return counts
+        whole = [glance for glance in self.glances if self.is_whole(glance.window.region(self.lattice))]
+        return counts | shown(candidates, whole, self._sought, self.least)
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say how many this detector can show.
@@ -188,8 +203,8 @@ class ZoomPath(GazeRecord):
         found, the detector hardly reacts to what is there, and no number is given either.
 
         Returns:
-            A phrase such as `41 × person from probability 0.5 (about 47 ± 5 that this detector can show)`, or `9 ×
-            person from probability 0.5 (about 8 ± 1 of them right)`.
+            A phrase such as `41 × person from probability or score 0.5 (about 47 ± 5 that this detector can show)`, or
+            `9 × person from probability or score 0.5 (about 8 ± 1 of them right)`.
         """
         text = super().objects_in_words()
         if self.unseen is None or not self._sought:

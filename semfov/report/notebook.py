@@ -57,7 +57,7 @@ def record_html(record: Record) -> str:
             shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     green = ", and confirmed ones green" if record.confirmable else ""
-    key = f"Objects from {record.measure} {record.least:g} are orange{green}."
+    key = f"Objects from {record.threshold_in_words} are orange{green}."
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
 
 

@@ -33,7 +33,7 @@ def object_entries(record: Record) -> list[LegendEntry]:
     entries = [(FOUND, "-", f"confirmed: {name} ({count})")] if count else []
     if others:
         rest = "not confirmed: " if count or record.decision is not None else ""
-        entries.append((TARGET, "-", f"{rest}{name} from {record.measure} {record.least:g} ({others})"))
+        entries.append((TARGET, "-", f"{rest}{name} from {record.threshold_in_words} ({others})"))
     if record.refuted:
         entries.append((FOUND, ":", "not confirmed by a closer look"))
     return entries

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
+from semfov.observation.matching import box_iou
 from semfov.zoom.certainty import FACTS, Certainty, object_facts, overlapping
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
@@ -148,6 +149,18 @@ def probable_objects(
     before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
+
+
+def shown(objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float) -> Tensor:
+    """Which objects some looks show with a score: the one that a box of its class overlaps most, by half; → `(M,)`."""
+    counts = torch.zeros(len(objects), dtype=torch.bool)
+    if len(objects) and glances:
+        boxes, scores, labels, *_ = _detected(glances, target)
+        sure = scores >= score
+        overlap = box_iou(objects.boxes, boxes[sure].to(objects.boxes)) * (objects.labels[:, None] == labels[sure])
+        best, place = overlap.max(0)
+        counts[place[best >= _SAME]] = True
+    return counts
 
 
 def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:

@@ -13,6 +13,7 @@ from semfov.head import Flat, Panorama, Views
 from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
+from semfov.zoom.glances import Glance, around, overview
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
@@ -90,11 +91,23 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
 @pytest.mark.parametrize(
     ("chances", "unseen", "words"),
     [
-        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 × cup from probability 0.5 (about 4 ± 1 that this detector can show)"),
-        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 × cup from probability 0.5 (about 3 ± 1 that this detector can show)"),
-        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability 0.5 (about 2 ± 1 of them right)"),
-        ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability 0.5 (about 2 ± 1 of them right)"),
-        ([0.2], (0.0, 0.0), "0 × cup from probability 0.5 (the detector hardly reacts, so no number is given)"),
+        (
+            [0.9, 0.9, 0.9, 0.2],
+            (1.5, 0.25),
+            "3 × cup from probability or score 0.5 (about 4 ± 1 that this detector can show)",
+        ),
+        (
+            [0.9, 0.9, 0.9, 0.3],
+            (0.0, 0.0),
+            "3 × cup from probability or score 0.5 (about 3 ± 1 that this detector can show)",
+        ),
+        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
+        ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
+        (
+            [0.2],
+            (0.0, 0.0),
+            "0 × cup from probability or score 0.5 (the detector hardly reacts, so no number is given)",
+        ),
     ],
 )
 def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances, unseen, words):
@@ -104,6 +117,27 @@ def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances,
     lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"glances": (), "values": (), "least": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
     assert path.describe() == f"{words} in 0 passes"
+
+
+def test_objects_that_a_look_at_the_whole_picture_shows_count_too():
+    """From the same number on: the candidate of its class that the box overlaps most, by half. In a search none."""
+    lattice = Lattice.over((80, 60), (80, 60))
+    seen = look((LEFT, 1, 0.6), (RIGHT, 2, 0.7), (shifted(RIGHT, 12), 2, 0.9))
+    glances = tuple(
+        Glance(window, seen, torch.zeros(3).bool(), torch.zeros(2), None)
+        for window in (overview(lattice), around(lattice, (0.0, 0.0, 60.0, 60.0)))
+    )
+    boxes = torch.tensor([shifted(LEFT, 3), shifted(LEFT, -1), RIGHT, RIGHT])
+    labels, looks = torch.tensor([1, 1, 1, 2]), torch.zeros(4).long()
+    candidates = Objects(boxes, torch.tensor([0.45, 0.4, 0.3, 0.2]), labels, looks)
+    parts = {"classes": CLASSES, "values": (0.0,), "unseen": (0.0, 0.0), "least": 0.5}
+    path = ZoomPath(lattice=lattice, target=None, glances=glances[:1], candidates=candidates, **parts)
+    assert path.objects.scores.tolist() == pytest.approx([0.4, 0.2])
+    assert not path.confirmed.any()
+    assert len(replace(path, least=0.65).objects) == 1
+    assert len(replace(path, glances=glances[1:]).objects) == 0
+    searched = replace(path, target=1, decision=Decision("absent", 0.1, None, None))
+    assert len(searched.objects) == 0
 
 
 def test_looks_are_given_one_by_one():

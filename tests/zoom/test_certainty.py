@@ -234,13 +234,13 @@ def path(detector, picture):
 
 def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     assert path.least == 0.5
-    assert (path.objects.scores >= 0.5).all()
+    assert (path.objects.scores >= 0.5).all()  # the overview shows none with such a score
     assert path.unseen[0] > 0
     chances = path.candidates.scores.double()
     assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
-    assert path.describe() == f"{len(path.objects)} objects from probability 0.5 in 4 passes"
+    assert path.describe() == f"{len(path.objects)} objects from probability or score 0.5 in 4 passes"
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
