@@ -402,8 +402,7 @@ class ActivePerception(nn.Module):
             duration: in a scene, longest time in seconds that the movements of eye and head take.
             on_look: called after each look with the record so far; returning False ends it.
             worth: least gain of a look: of windows new objects (None: 0.01), of a head further right cells (None: 0).
-            least: score from which on an object counts, in windows its probability or its score in a look at the whole
-                picture; None takes `record.least`, 0.5 in windows.
+            least: score from which on an object counts; in windows, and for None, as for `ZoomAgent.find_all`.
             batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.

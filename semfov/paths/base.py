@@ -47,8 +47,7 @@ class Record(Conversion):
         target: class index 1..K that was searched for; None for all classes.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count; where scores are probabilities (`measure`), the probability, or the
-            score in a look at the whole picture.
+        least: score from which on objects count, in windows their probability or score (`threshold_in_words`).
         photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
         source: file of the picture; None if it does not come from a file.
 
@@ -227,8 +226,7 @@ class Record(Conversion):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        candidates = self.candidates.of(self._sought)
-        objects, sure = confirm(candidates, self._confirmed_places, self._counts(candidates))
+        objects, sure = confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
         return replace(objects, classes=self.classes), sure
 
     def _counts(self, candidates: Objects) -> Tensor:
@@ -253,12 +251,8 @@ class Record(Conversion):
     def __repr__(self) -> str:
         """The summary, the looks, and the most confident objects."""
         objects, sure = self.objects, self.confirmed.tolist()
-        named = [
-            f"{self.classes[label]} {score:.2f}{' (confirmed)' if confirmed else ''}"
-            for label, score, confirmed in zip(
-                objects.labels.tolist()[:_NAMED], objects.scores.tolist(), sure, strict=False
-            )
-        ]
+        rows = zip(objects.labels.tolist()[:_NAMED], objects.scores.tolist(), sure, strict=False)
+        named = [f"{self.classes[label]} {score:.2f}{' (confirmed)' * confirmed}" for label, score, confirmed in rows]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
         found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"
         return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])
@@ -331,8 +325,7 @@ class Record(Conversion):
 
         Args:
             ax: axes to draw in; None makes a new figure.
-            options: those of `semfov.viz.plot_scanpath`, such as `image`, the picture, which must be given where the
-                record does not keep it.
+            options: those of `semfov.viz.plot_scanpath`: `image`, the picture, where the record does not keep it, …
 
         Returns:
             The figure.
@@ -349,8 +342,8 @@ class Record(Conversion):
 
         Args:
             path: GIF file to write; None returns the film for a notebook.
-            options: those of `semfov.viz.animate`: `seconds`, the duration of a frame; `hold`, the additional duration
-                of the last frame; and `image`, the picture, which must be given where the record does not keep it.
+            options: those of `semfov.viz.animate`: `seconds`, how long a frame lasts; `hold`, how much longer the last
+                one does; and `image`, the picture, where the record does not keep it.
 
         Returns:
             The path, or an object that a notebook shows as an animation.

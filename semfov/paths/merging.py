@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -78,11 +78,13 @@ def number_of(look: CloseUp) -> int:
 
 
 def confirm(
-    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], counts: Tensor
+    candidates: Objects,
+    places: Sequence[tuple[Tensor, int, float, int]],
+    counting: Callable[[Objects], Tensor],
 ) -> tuple[Objects, Tensor]:
-    """The candidates that count `(N,)`, and those that were confirmed; and which of all these were, `(M,)`."""
+    """The candidates that count, and those that were confirmed; and which of all these were, `(M,)`."""
     boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
-    sure = torch.zeros(len(candidates), dtype=torch.bool)
+    sure, counts = torch.zeros(len(candidates), dtype=torch.bool), counting(candidates)
     for place, label, chance, look in places:
         box, probability = place[None].to(boxes), scores.new_tensor([chance])
         overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
