@@ -196,7 +196,7 @@ KNOWN = {
     "docs/guides/records.md": {
         f"which is {LEAST} unless": "code",
         f"begin at {FAINTEST}": "code",
-        f"is {LIKELY}. After": "code",
+        f"is {LIKELY}, and what": "code",
     },
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
 }
