@@ -112,6 +112,11 @@ class LivePerception:
             self._check_start()
         return self._episodes[self.how].step(frame, passed)
 
+    @property
+    def criterion(self) -> str | None:
+        """What a search needs for the decision `found`, in words, after the first frame; None for no decision."""
+        return self._episodes[self.how].criterion
+
     def describe(self) -> str:
         """What is done in a few words."""
         return self._episodes["windows"].describe()

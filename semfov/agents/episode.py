@@ -121,6 +121,11 @@ class Episode(ABC, Generic[_Record]):
     def decision(self) -> Decision | None:
         """The decision of a search as it stands; None where nothing is decided."""
 
+    @property
+    def criterion(self) -> str | None:
+        """What a search needs for the decision `found`, in words; None where nothing is decided."""
+        return None
+
     @abstractmethod
     def record(self) -> _Record:
         """The record of the looks so far."""

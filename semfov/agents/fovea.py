@@ -363,6 +363,13 @@ class FoveaEpisode(Episode[Scanpath]):
         meant = class_meant(step.belief, self.target)
         return conclude(self._outcome, step.belief, self._detections, grid, meant, cell)
 
+    @property
+    def criterion(self) -> str | None:
+        """What the decision `found` needs, in words."""
+        if self._verifier is not None:
+            return self._verifier.criterion
+        return None if self.thresholds is None else f"p is {self.thresholds.confirm:g} and the gaze was at the place"
+
     def record(self) -> Scanpath:
         """The scanpath so far."""
         decision = self.decision

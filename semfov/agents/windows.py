@@ -25,7 +25,7 @@ from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_c
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.closer import candidates, closer_window, look_closely
-from semfov.zoom.decision import WindowDecisions, decide_by_score
+from semfov.zoom.decision import WindowDecisions, decide_by_score, score_needed
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
@@ -458,6 +458,13 @@ class WindowEpisode(Episode[ZoomPath]):
         if not self.searches or self.target is None:
             return None
         return decide_by_score(self.glances, self.target, self._confirm)
+
+    @property
+    def criterion(self) -> str | None:
+        """What the decision `found` needs, in words, after the first look."""
+        if self._decisions is not None:
+            return self._decisions.criterion
+        return f"a detection scores {score_needed(self._confirm):g}" if self.searches else None
 
     @property
     def belief(self) -> ZoomBelief | None:

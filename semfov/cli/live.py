@@ -64,6 +64,8 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | No
             for picture in stream.frames:
                 moment = live.step(picture.image, picture.passed)
                 count += 1
+                if count == 1 and live.criterion is not None:
+                    print(f"  found: when {live.criterion} (--confirm)")
                 if count >= _WARM_UP:
                     ends.append(perf_counter())
                     began = began or ends[0]

@@ -151,6 +151,11 @@ class Verifier(Generic[LookType]):
         return Decision("found", max(presence, place), best.cell, best.box, place)
 
     @property
+    def criterion(self) -> str:
+        """What the decision `found` needs, in words."""
+        return f"a closer look gives p {self.thresholds.confirm:g} there"
+
+    @property
     def presence(self) -> float:
         """Probability that the picture holds the target: after the closer looks, or that without them.
 

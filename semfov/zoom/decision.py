@@ -201,6 +201,13 @@ class WindowDecisions:
         return None if self.verifier is None else self.verifier.candidate
 
     @property
+    def criterion(self) -> str:
+        """What the decision `found` needs, in words."""
+        if self.verifier is not None:
+            return self.verifier.criterion
+        return f"p is {self.thresholds.confirm:g} and a detection shows the target"
+
+    @property
     def looks(self) -> list[CloseUp]:
         """The closer looks, in order."""
         return [] if self.verifier is None else self.verifier.looks
@@ -228,6 +235,11 @@ class WindowDecisions:
         return Decision(outcome, presence, None, self._facts.box if outcome == "found" else None)
 
 
+def score_needed(confirm: float | None) -> float:
+    """Score from which on a detection alone counts as found."""
+    return _SCORE if confirm is None else confirm
+
+
 def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None = None) -> Decision:
     """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
     best, box = 0.0, None
@@ -235,5 +247,5 @@ def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None 
         scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
         if len(scores) and float(scores.max()) > best:
             best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
-    found = best >= (_SCORE if confirm is None else confirm)
+    found = best >= score_needed(confirm)
     return Decision("found" if found else "undecided", best, None, box if found else None)

@@ -147,6 +147,7 @@ def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, a
         r"^ +(\d)  closely at \((\d), (\d)\): p 0\.98 there +red: found, p .* \(there 0\.98\)", printed.out, re.M
     )
     assert len(shown) == 1
+    assert printed.out.splitlines()[1] == "  found: when a closer look gives p 0.7 there (--confirm)"
     number, column, row = map(int, shown[0])
     # Red covers rows 40 to 60 of 120, and starts at column 10 of 160 per frame.
     assert 20 * column < 10 * number + 20
