@@ -4,9 +4,10 @@ import logging
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from os import PathLike
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
 
     check_white(white)
     name = f"image {Path(path)}"
-    with quiet_decoders():
+    with quiet_decoders:
         try:
             with open_pillow(path) as image:
                 check_proportion(image, path)
@@ -117,20 +118,35 @@ def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
         )
 
 
-@contextmanager
-def quiet_decoders() -> Iterator[None]:
-    """Say nothing of damaged metadata, and of large files, which the limits refuse."""
-    logs = [logging.getLogger(name) for name in ("PIL", "tifffile")]
-    levels = [log.level for log in logs]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            for log in logs:
-                log.setLevel(logging.CRITICAL)
-            yield
-        finally:
-            for log, level in zip(logs, levels, strict=True):
-                log.setLevel(level)
+class _Quiet:
+    """Silence of decoders, which begins with the first thread in it and ends with the last one.
+
+    Filters of warnings and levels of logs are those of all threads: if each put back what it had found, one that began
+    in another's silence would leave it behind for ever.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._before.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("ignore")
+                for log in (logging.getLogger(name) for name in ("PIL", "tifffile")):
+                    self._before.callback(log.setLevel, log.level)
+                    log.setLevel(logging.CRITICAL)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._before.close()
+
+
+quiet_decoders = _Quiet()
+"""A context in which nothing is said of damaged metadata, and of large files, which the limits refuse."""
 
 
 @contextmanager
@@ -180,7 +196,7 @@ def check_tile(size: int, stored: int, name: str) -> None:
 
 def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
-    with quiet_decoders():
+    with quiet_decoders:
         try:
             _check_pixels(image.size, name)
             array = _pixels(image, name, upright=True, white=white)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ class RasterPicture(LargePicture):
             self._settings = raster_settings()
         except ImportError:
             raise DataError(f'{path}: expected rasterio for reading it; pip install "semfov[geo]"') from None
-        self.path = Path(path)
+        self.path, self._lock = Path(path), Lock()  # GDAL's datasets are for one thread at a time
         with opening(self.path, "opened"), self._settings:
             self._file: Any = open_raster(self.path)
         weakref.finalize(self, self._file.close)
@@ -94,7 +95,7 @@ class RasterPicture(LargePicture):
         x1, y1, x2, y2 = box
         shape = -(-(y2 - y1) // reduction), -(-(x2 - x1) // reduction)
         window = {"window": Window(x1, y1, x2 - x1, y2 - y1), "resampling": Resampling.average}
-        with opening(self.path, "decoded"), self._settings:
+        with self._lock, opening(self.path, "decoded"), self._settings:
             if mask:
                 found = self._file.read_masks([self._bands[0]], out_shape=(1, *shape), **window)
             else:

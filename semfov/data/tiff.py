@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ class TiffPicture(LargePicture):
             import tifffile
         except ImportError:
             raise DataError(f"{path}: expected tifffile for reading TIFFs; pip install tifffile") from None
-        self.path = Path(path)
+        self.path, self._lock = Path(path), Lock()
         with opening(self.path, "opened"):
             self._file = tifffile.TiffFile(path)
             weakref.finalize(self, self._file.close)
@@ -155,9 +156,10 @@ class TiffPicture(LargePicture):
         offset, count = page.dataoffsets[number], page.databytecounts[number]
         if not count:
             return None
-        self._file.filehandle.seek(offset)
         check_tile(size, count, f"image {self.path}")
-        data = self._file.filehandle.read(count)
+        with self._lock:
+            self._file.filehandle.seek(offset)
+            data = self._file.filehandle.read(count)
         make = _INFLATERS.get(int(page.compression))
         most = 2 * size + 2**16
         if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
@@ -207,7 +209,7 @@ def is_converted(path: str | PathLike[str]) -> bool:
     """Whether a TIFF is turned, or of other colours than grey and RGB: Pillow converts these, or nobody reads them."""
     tags: Any = {}
     check_regular(path, f"image {Path(path)}")
-    with quiet_decoders():
+    with quiet_decoders:
         try:
             with open_pillow(path) as image:
                 tags = getattr(image, "tag_v2", {})

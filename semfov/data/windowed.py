@@ -125,7 +125,7 @@ def tone_of(
 def opening(path: Path, what: str) -> Iterator[None]:
     """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
     check_regular(path, f"image {path}")
-    with quiet_decoders():
+    with quiet_decoders:
         try:
             yield
         except FileNotFoundError:

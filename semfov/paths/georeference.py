@@ -1,7 +1,6 @@
 """The place of a picture on earth, from a GeoTIFF or another raster that GDAL reads."""
 
 import struct
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.gdal import open_raster, raster_settings
+from semfov.data.images import quiet_decoders
 from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
@@ -31,8 +31,7 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
             'pip install "semfov[geo]"'
         ) from None
     try:
-        with warnings.catch_warnings(), raster_settings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with quiet_decoders, raster_settings():
             picture = open_raster(source)
         with picture:
             system, affine = picture.crs, picture.transform

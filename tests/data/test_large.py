@@ -1,8 +1,11 @@
 """Large pictures read window by window: every source gives the same pixels, with limited memory."""
 
+import logging
 import os
 import sys
 import tracemalloc
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from PIL import Image
 
 from semfov.data.images import read_image
 from semfov.data.large import _ArrayPicture, _MemoryPicture, open_large
+from semfov.data.raster import RasterPicture
 from semfov.data.tiff import TiffPicture
 from semfov.errors import DataError, InputError
 
@@ -44,6 +48,28 @@ def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch
             assert picture.reduction(9) == (1 if large > 450 * 330 else 4)
             for reduction in (1, 8):
                 assert torch.equal(picture.read(box, reduction), open_large(array).read(box, reduction))
+
+
+@pytest.mark.parametrize("reader", [TiffPicture, RasterPicture])
+def test_threads_read_windows_of_one_picture_at_once(tmp_path, reader):
+    """Each gets the pixels of its window, and afterwards warnings and logs are what they were."""
+    tifffile = pytest.importorskip("tifffile")
+    if reader is RasterPicture:
+        pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    array, logs = pixels(512, 512), [logging.getLogger(name) for name in ("PIL", "tifffile")]
+    tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb", compression="zlib")
+    picture, before = reader(tmp_path / "a.tif"), ([*warnings.filters], [log.level for log in logs])
+    places = np.random.default_rng(1).integers(0, 380, size=(200, 2)).tolist()
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            windows = list(threads.map(lambda place: picture.pixels((*place, place[0] + 130, place[1] + 90)), places))
+    finally:
+        sys.setswitchinterval(usual)
+    for (x, y), window in zip(places, windows, strict=True):
+        assert np.array_equal(window, array[y : y + 90, x : x + 130])
+    assert ([*warnings.filters], [log.level for log in logs]) == before
 
 
 def test_grey_has_three_channels(tmp_path):
