@@ -29,6 +29,7 @@ from semfov.detection.scores import HALVES
 from semfov.errors import InputError, check, check_number, check_options, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
+from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.io.schema import is_number
 from semfov.live import LivePerception
@@ -211,10 +212,8 @@ class ActivePerception(nn.Module):
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
         fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
-        eye = (
-            f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes, {type(self.eye.sensor).__name__}"
-        )
-        return f"{type(self).__name__}({eye}, cells={(self.columns, self.rows)}, fitted={fitted})"
+        eye, sensor = f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes", type(self.eye.sensor)
+        return f"{type(self).__name__}({eye}, {sensor.__name__}, cells={(self.columns, self.rows)}, fitted={fitted})"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -350,14 +349,8 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            settings: dict[str, Any] = {
-                "start": start,
-                "seed": seed,
-                "boxes": boxes,
-                "confirm": confirm,
-                "give_up": give_up,
-            }
-            settings |= {"shifts": shifts, "closer": MOST_CLOSER if closer is None else closer}
+            settings: dict[str, Any] = {"start": start, "seed": seed, "boxes": boxes, "confirm": confirm}
+            settings |= {"give_up": give_up, "shifts": shifts, "closer": MOST_CLOSER if closer is None else closer}
             return self.fovea.search(image, target, bounds, **settings)
         check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
               target)  # fmt: skip
@@ -495,12 +488,19 @@ class ActivePerception(nn.Module):
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
     def gaze(
-        self, picture: PictureLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
+        self,
+        picture: PictureLike,
+        *,
+        model: FixationDensity | None = None,
+        color: Color = "rgb",
+        white: White | None = None,
+        bands: ChosenBands = None,
     ) -> GazePrediction:
         """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
 
         Args:
             picture: a photograph, as for `search`.
+            model: a model that was fitted to the detector (`semfov fit`); None for the one that is shipped for it.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -509,12 +509,12 @@ class ActivePerception(nn.Module):
             The density of fixations, from which scanpaths are drawn.
 
         Raises:
-            InputError: no model is shipped for the detector (`semfov.saliency.FixationDensity`).
+            InputError: no model is shipped for the detector, or the given one was fitted to another.
             DataError: the file of the picture cannot be read.
         """
         image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(self.eye.detector, image, source=source)
+        return GazePrediction.of(self.eye.detector, image, model=model, source=source)
 
     def live(
         self,

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from semfov.agent import ActivePerception
-from semfov.cli.options import AgentOptions
+from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.data.classes import class_index
 from semfov.detection.load import check_detector, class_lines, detector_name
 from semfov.detection.weights import WEIGHTS
@@ -25,7 +25,7 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     if options.models is not None:
         return Manifest.read(options.models).classes
     classes, weights = check_detector(options.detector), options.weights
-    given = _class_names(options)
+    given = class_names(options)
     named = f"none for {options.detector}, which has its own; --target names the class to look for"
     check(given is None or classes is None, "classes", named, given and ", ".join(given))
     classes = classes or given
@@ -36,7 +36,7 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     return classes
 
 
-def _class_names(options: AgentOptions) -> tuple[str, ...] | None:
+def class_names(options: AgentOptions | GazeOptions) -> tuple[str, ...] | None:
     """The class names of `--classes`: words, or the lines of a text file."""
     names = options.classes
     return class_lines(names[0]) if names is not None and len(names) == 1 and Path(names[0]).is_file() else names
@@ -67,7 +67,7 @@ def check_device(name: str | None) -> str | None:
 
 def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
     """The agent that the options name, with further options of `load_detector`."""
-    given = {"weights": options.weights, "classes": _class_names(options)}
+    given = {"weights": options.weights, "classes": class_names(options)}
     loaded |= {name: value for name, value in given.items() if value is not None}
     if options.models is not None:
         check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)

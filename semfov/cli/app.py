@@ -24,7 +24,7 @@ from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError, SemfovError
 from semfov.report.episode import pillow
-from semfov.report.gaze import DrawnGaze, gaze_page_html
+from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
 from semfov.viz.animation import render
 from semfov.viz.belief import plot_belief
@@ -196,8 +196,8 @@ def _look(agent: ActivePerception, picture: Any, target: str, task: str, passes:
     """Words about a record of the picture, and its page in a frame."""
     if task == "gaze":
         prediction = agent.gaze(picture)
-        paths = tuple(prediction.scanpaths(_VIEWERS))
-        return prediction.describe(), _framed(gaze_page_html("Where people look", [DrawnGaze(prediction, paths)]))
+        part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
+        return prediction.describe(), _framed(gaze_page_html("Where people look", [part]))
     if task == "search":
         record = agent.search(picture, _one(target, list(agent.classes)), passes=passes)
     elif task == "find all":

@@ -2,104 +2,153 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
 from semfov.agents.picture import open_picture
-from semfov.cli.agent import check_device
+from semfov.cli.agent import check_device, class_names
 from semfov.cli.options import GazeOptions
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
-from semfov.data.fixations import write_table
+from semfov.data.fixations import Fixations, write_table
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import SemfovError, check
+from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.io.code import package_digest
 from semfov.io.files import check_writable
 from semfov.paths.gaze import GazePrediction
-from semfov.report.gaze import DrawnGaze, write_gaze_page
+from semfov.report.gaze import gaze_part, write_gaze_page
 from semfov.report.page import page_path
+from semfov.runs.config import WHERE
+from semfov.runs.results import SceneResults
+from semfov.runs.scene_run import digest_of
 
 _DENSITIES = (".npy", ".tif", ".tiff", ".png")
+
+_Outcome = dict[str, Any]
+"""What is written of a picture, as JSON values: text, drawn viewers, part of a page, and file of the density."""
 
 
 def predict_gaze(options: GazeOptions) -> int:
     """Predict where people look in all pictures; returns the exit code, 1 if a picture was left out."""
-    sources = picture_sources(options)
-    kind = None if options.out is None or options.out.is_dir() else options.out.suffix.lower()
-    check(kind in (None, "", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", options.out)
-    check(
-        kind not in _DENSITIES or len(sources) < 2, "out", "a .csv file or a folder for several pictures", options.out
-    )
-    if options.report is not None:
-        check_writable(page_path(options.report))
-    check_detector(options.detector)
-    given = {"weights": options.weights, "device": check_device(options.device)}
-    loaded: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    detector = load_detector(options.detector, **loaded)
-    if not sources:
-        print("no picture was given: looking at an embedded scene")
-        scene = embedded_picture(detector.classes, None, options.seed)
-        sources = [PictureSource("embedded scene", scene=scene)]
-    drawn: list[DrawnGaze] = []
-    skipped = 0
+    job = _GazeJob(options)
+    sources, outcomes = job.sources, job.outcomes
+    if outcomes:
+        print(f"continuing: {len(outcomes)} of {len(sources)} pictures were looked at before")
+    left, complete = [number for number in range(len(sources)) if number not in outcomes], False
+    hidden = not job.several or options.quiet or not sys.stderr.isatty()
     try:
-        for source in tqdm(
-            sources, unit="picture", leave=False, disable=len(sources) == 1 or options.quiet or not sys.stderr.isatty()
-        ):
+        for number in tqdm(left, unit="picture", leave=False, disable=hidden):
             try:
-                image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
-                prediction = GazePrediction.of(
-                    detector, image, source=None if source.file is None else str(source.file)
-                )
+                job.look(number)
             except SemfovError as error:
-                if len(sources) == 1:
+                if not job.several:
                     raise
-                skipped += 1
-                tqdm.write(f"skipped {source.name}: {error}", file=sys.stderr)
-                continue
-            paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-            drawn.append(DrawnGaze(prediction, tuple(paths)))
-            places = "; ".join(
-                f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
-                for number, peak in enumerate(prediction.peaks(), 1)
-            )
-            terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
-            mean = sum(map(len, paths)) / len(paths)
-            tqdm.write(
-                f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
-                f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
-                file=sys.stdout,
-            )
+                tqdm.write(f"skipped {sources[number].name}: {error}", file=sys.stderr)
+            else:
+                tqdm.write(outcomes[number]["text"], file=sys.stdout)
+        complete = True
     finally:  # a command that is stopped has written the pictures so far
-        if drawn:
-            written = _write(options, kind, drawn)
-            if written:
-                print("written:", *(f"  {path}" for path in written), sep="\n")
-    return 1 if skipped else 0
+        job.write(complete=complete)
+    return 1 if len(outcomes) < len(sources) else 0
 
 
-def _write(options: GazeOptions, kind: str | None, drawn: list[DrawnGaze]) -> list[Path]:
-    """Write what the options name, and return the files."""
-    written: list[Path] = []
-    out = options.out
-    paths = [path for each in drawn for path in each.scanpaths]
-    if out is not None and kind == ".csv":
-        write_table(out, paths)
-        written.append(out)
-    elif out is not None and kind in _DENSITIES:
-        written.append(drawn[0].prediction.save_density(out))
-    elif out is not None:
-        write_table(out / "scanpaths.csv", paths)
-        written.append(out / "scanpaths.csv")
-        for number, each in enumerate(drawn):
-            name = plain_name(Path(each.prediction.name).stem)
-            start = f"{number:03d}-" if len(drawn) > 1 else ""
-            written.append(each.prediction.save_density(out / f"{start}{name}.png"))
-    if options.report is not None:
-        title = "semfov: where people look"
-        written.append(write_gaze_page(options.report, title, drawn))
-    return written
+class _GazeJob:
+    """Predicts where people look in pictures; what an interrupted command has predicted is read again."""
+
+    def __init__(self, options: GazeOptions) -> None:
+        self.options, self.sources, out = options, picture_sources(options), options.out
+        kind = "" if out is None or out.is_dir() else out.suffix.lower()
+        check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
+        several = len(self.sources) > 1
+        check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
+        if options.report is not None:
+            check_writable(page_path(options.report))
+        check_detector(options.detector)
+        given = {"weights": options.weights, "device": check_device(options.device), "classes": class_names(options)}
+        loaded: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        own = None if options.model is None else FixationDensity.from_pretrained(options.model)
+        self.detector = load_detector(options.detector, **loaded)
+        self.model = FixationDensity.for_detector(self.detector) if own is None else own
+        if not self.sources:
+            print("no picture was given: looking at an embedded scene")
+            scene = embedded_picture(self.detector.classes, None, options.seed)
+            self.sources = [PictureSource("embedded scene", scene=scene)]
+        self.kind, self.several = kind, several
+        self.table = None if out is None or kind in _DENSITIES else out if kind else out / "scanpaths.csv"
+        self.outcomes: dict[int, _Outcome] = {}
+        self.finished: SceneResults | None = None
+        if several and self.table is not None:
+            settings = {name: value for name, value in options.plain().items() if name not in (*WHERE, "quiet")}
+            key = digest_of([settings, self.detector.settings(), self.model.digest(), package_digest()])[:32]
+            versions = [json.dumps(source.version()) for source in self.sources]
+            folder = self.table.with_name(f"{self.table.name}.unfinished")
+            self.finished = SceneResults(folder, key, versions.__getitem__)
+            self.outcomes |= {number: each["records"][0] for number, each in self.finished.items(len(versions))}
+
+    def look(self, number: int) -> None:
+        """Predict where people look in a picture, and write the density."""
+        source, out = self.sources[number], self.options.out
+        image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
+        file = None if source.file is None else str(source.file)
+        prediction = GazePrediction.of(self.detector, image, model=self.model, source=file)
+        outcome = _outcome(prediction, self.options, source.name)
+        if out is not None and self.kind != ".csv":
+            name = f"{plain_name(Path(prediction.name).stem)}.png"
+            name = f"{number:03d}-{name}" if self.several else name
+            outcome["density"] = str(prediction.save_density(out if self.kind else out / name))
+        self.outcomes[number] = outcome
+        if self.finished is not None:
+            self.finished.save(number, [outcome], {})
+
+    def write(self, *, complete: bool) -> None:
+        """Write scanpaths and page of the pictures so far, and list all files."""
+        outcomes = [self.outcomes[number] for number in sorted(self.outcomes)]
+        written = [Path(each["density"]) for each in outcomes if "density" in each]
+        if self.table is not None and outcomes:
+            paths = [
+                Fixations(each["picture"], subject, np.array(points), tuple(each["size"]), np.array(durations))
+                for each in outcomes
+                for subject, points, durations in each["viewers"]
+            ]
+            write_table(self.table, paths)
+            written.insert(0, self.table)
+        if self.options.report is not None and outcomes:
+            parts = [each["part"] for each in outcomes]
+            written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
+        if written:
+            print("written:", *(f"  {path}" for path in written), sep="\n")
+        if self.finished is None:
+            return
+        self.finished.flush()
+        if complete:
+            shutil.rmtree(self.finished.path.parent, ignore_errors=True)
+        else:
+            count = f"{len(outcomes)} of {len(self.sources)} pictures were looked at"
+            print(f"{count}; the same command continues", file=sys.stderr)
+
+
+def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Outcome:
+    """Draw viewers, and say what was predicted."""
+    paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
+    places = "; ".join(
+        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
+        for number, peak in enumerate(prediction.peaks(), 1)
+    )
+    terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
+    mean = sum(map(len, paths)) / len(paths)
+    text = (
+        f"{name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
+        f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
+    )
+    viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
+    part = None if options.report is None else gaze_part(prediction, paths)
+    return {"text": text, "picture": prediction.name, "size": prediction.size, "viewers": viewers, "part": part}

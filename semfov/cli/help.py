@@ -141,12 +141,14 @@ usage: semfov gaze [PICTURE ...] [options]
   PICTURE              photographs, or folders of them (none: an embedded scene)
   --detector NAME      the detector whose features are read: yolov3-tiny (default), yolox-nano, nanodet-plus-m-1.5x
   --weights FILE       its weights, where they are not downloaded
+  --model FILE         model for your own detector, from semfov fit mine.onnx --gaze.fixations …
   --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
   --seconds S          time for which each views a picture (default 3)
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
   --out FOLDER         scanpaths, and a heat map of each picture
   --report PAGE.html   a page with heat map, contours and scanpaths, in which to step through the fixations
 
+If a command with --out of scanpaths or a folder is stopped, the same command continues with the pictures that are left.
 It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
 pages of text or to interfaces. --help-all: all options.
 """,

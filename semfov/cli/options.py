@@ -217,6 +217,8 @@ class GazeOptions(Settings):
         recursive: also take the photographs of the folders in a folder.
         detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
         weights: file of the weights, for a detector whose weights are not downloaded.
+        classes: names of the detector's classes, as for `semfov search`.
+        model: file of a model for your own detector, from `semfov fit` (none: the one that is shipped).
         device: where the detector runs, such as `cuda` (none: the processor).
         people: number of viewers whose scanpaths are drawn.
         seconds: time in seconds for which each views a picture.
@@ -233,6 +235,8 @@ class GazeOptions(Settings):
     recursive: bool = False
     detector: str = AgentOptions.detector
     weights: Path | None = None
+    classes: tuple[str, ...] | None = None
+    model: Path | None = None
     device: str | None = None
     people: Annotated[int, Range(1, 1000)] = 15
     seconds: Annotated[float, Range(0.1, 60)] = 3.0

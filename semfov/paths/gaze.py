@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -60,21 +61,26 @@ class GazePrediction:
     source: str | None = None
 
     @classmethod
-    def of(cls, detector: Detector, image: Tensor, *, source: str | None = None) -> Self:
+    def of(
+        cls, detector: Detector, image: Tensor, *, model: FixationDensity | None = None, source: str | None = None
+    ) -> Self:
         """Predict where people look in a picture, from one pass of a detector.
 
         Args:
-            detector: the detector, for which a model is shipped.
+            detector: the detector.
             image: `(3, H, W)`, RGB in [0, 1].
+            model: a model that was fitted to the detector; None for the one that is shipped for it.
             source: file of the picture.
 
         Returns:
             The prediction.
 
         Raises:
-            InputError: no model is shipped for the detector.
+            InputError: no model is shipped for the detector, or the given one was fitted to another detector.
         """
-        model = FixationDensity.for_detector(detector)
+        if model is not None:
+            model.check_compatible(detector)
+        model = FixationDensity.for_detector(detector) if model is None else deepcopy(model)
         with torch.no_grad():
             features = detector.features(image[None], [*model.layers])
             terms = model.to(image).terms(features, (image.shape[-2], image.shape[-1]))
@@ -222,7 +228,8 @@ class GazePrediction:
             people, blurred by 3 % of the longer side, `CC`, `SIM` and `KL` in nats. Fixations outside are left out.
 
         Raises:
-            InputError: there are no fixations, they are of several pictures, or their frame has other proportions.
+            InputError: there are no fixations beside the first ones, they are of several pictures, or their frame has
+                other proportions.
         """
         check(len(people) > 0, "people", "fixations of at least one person", "none")
         pictures = sorted({each.picture for each in people})
@@ -285,10 +292,10 @@ class GazePrediction:
             InputError: the file does not end in `.html` or `.htm`, or an argument is out of range.
             DataError: the file cannot be written.
         """
-        from semfov.report.gaze import DrawnGaze, write_gaze_page
+        from semfov.report.gaze import gaze_part, write_gaze_page
 
-        drawn = DrawnGaze(self, tuple(self.scanpaths(people, seconds=seconds, seed=seed)))
-        return write_gaze_page(path, f"semfov: where people look in {self.name}", [drawn])
+        part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed))
+        return write_gaze_page(path, f"semfov: where people look in {self.name}", [part])
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
         """Write drawn scanpaths as a table that `semfov.data.fixations.read_table` reads.

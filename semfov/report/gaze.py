@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +26,22 @@ _MOST_STEPS = 12
 """Largest number of fixations of the slider."""
 
 
-class DrawnGaze(NamedTuple):
-    """A prediction with the scanpaths that are drawn from it."""
-
-    prediction: GazePrediction
-    scanpaths: tuple[Fixations, ...]
+def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
+    """What the page has of a picture, as JSON values: a prediction, and scanpaths that are drawn from it."""
+    return {"picture": _picture(prediction, scanpaths), "facts": _facts(prediction)}
 
 
-def write_gaze_page(path: str | PathLike[str], title: str, drawn: Sequence[DrawnGaze]) -> Path:
+def write_gaze_page(path: str | PathLike[str], title: str, parts: Sequence[Data]) -> Path:
     """Write the page of one or several pictures; the path must end in `.html` or `.htm`."""
     path = page_path(Path(path))
-    write_text(path, gaze_page_html(title, drawn))
+    write_text(path, gaze_page_html(title, parts))
     return path
 
 
-def gaze_page_html(title: str, drawn: Sequence[DrawnGaze]) -> str:
+def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
     """Make the page of one or several pictures."""
     data = {
-        "pictures": [_picture(each) for each in drawn],
+        "pictures": [each["picture"] for each in parts],
         "heat": colour_steps(overlay_colours()),
         "colours": list(COLOURS),
     }
@@ -52,16 +49,18 @@ def gaze_page_html(title: str, drawn: Sequence[DrawnGaze]) -> str:
         "title": escape(title),
         "program": (_FOLDER / "gaze.js").read_text(encoding="utf-8"),
         "data": json_script(data),
-        "facts": "".join(_facts(each.prediction, number) for number, each in enumerate(drawn)),
+        "facts": "".join(
+            f'<section class="facts-of" id="facts-{number}">{each["facts"]}</section>'
+            for number, each in enumerate(parts)
+        ),
     }
     return filled("gaze.html", contents)
 
 
-def _picture(drawn: DrawnGaze) -> Data:
+def _picture(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
     """The data of a picture: maps before and after each fixation, contours and scanpaths."""
-    prediction = drawn.prediction
-    steps = min(max(map(len, drawn.scanpaths)), _MOST_STEPS)
-    maps = [prediction.cells, *(prediction.given(drawn.scanpaths, number) for number in range(1, steps + 1))]
+    steps = min(max(map(len, scanpaths)), _MOST_STEPS)
+    maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
     return {
         "name": prediction.name,
         "size": list(prediction.size),
@@ -69,7 +68,7 @@ def _picture(drawn: DrawnGaze) -> Data:
         "cells": list(prediction.cells.shape),
         "maps": [_quantised(each) for each in maps],
         "contours": [_contours(each, prediction.size) for each in maps],
-        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in drawn.scanpaths],
+        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in scanpaths],
     }
 
 
@@ -98,7 +97,7 @@ def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
     ]
 
 
-def _facts(prediction: GazePrediction, number: int) -> str:
+def _facts(prediction: GazePrediction) -> str:
     """What is known of a picture without the script: entropy, terms, and places in order."""
     bits = ", ".join(f"{name} {value:.2f}" for name, value in prediction.parts.items())
     rows = "".join(
@@ -106,11 +105,11 @@ def _facts(prediction: GazePrediction, number: int) -> str:
         for place, peak in enumerate(prediction.peaks(), 1)
     )
     return (
-        f'<section class="facts-of" id="facts-{number}"><h2>{escape(prediction.name)}</h2>'
+        f"<h2>{escape(prediction.name)}</h2>"
         f'<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
         f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
         '<div class="wide" tabindex="0" role="region" aria-label="Places">'
         '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
         f'<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 %</th></tr></thead><tbody>{rows}'
-        "</tbody></table></div></section>"
+        "</tbody></table></div>"
     )

@@ -1,5 +1,7 @@
 """The command `semfov gaze`: what it prints and writes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -69,19 +71,39 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
 
 
-def test_a_command_that_is_stopped_has_written_the_pictures_so_far(run, photos, tmp_path, monkeypatch):
-    made = GazePrediction.of
+def test_a_command_that_is_stopped_has_written_the_pictures_so_far_and_continues(run, photos, tmp_path, monkeypatch):
+    made, looked = GazePrediction.of, []
 
     def stopped(detector, image, **options):
-        if options["source"].endswith("1.png"):
+        looked.append(Path(options["source"]).name)
+        if looked == ["0.png", "1.png"]:
             raise KeyboardInterrupt
         return made(detector, image, **options)
 
+    def words(name):
+        return photos, "--people", 2, "--out", tmp_path / f"{name}.csv", "--report", tmp_path / f"{name}.html"
+
+    assert run(*words("whole"))[0] == 0
     monkeypatch.setattr(GazePrediction, "of", stopped)
-    code, out, _ = run(photos, "--people", 2, "--out", tmp_path / "gaze.csv")
+    code, out, err = run(*words("parts"))
     assert code == 130
-    assert {each.picture for each in read_table(tmp_path / "gaze.csv")} == {"0.png"}
-    assert "gaze.csv" in out
+    assert {each.picture for each in read_table(tmp_path / "parts.csv")} == {"0.png"}
+    assert "parts.csv" in out
+    assert "1 of 2 pictures" in err
+    assert run(*words("parts"))[0] == 0
+    assert looked == ["0.png", "1.png", "1.png"]
+    for kind in ("csv", "html"):
+        assert (tmp_path / f"parts.{kind}").read_text() == (tmp_path / f"whole.{kind}").read_text()
+    assert not [*tmp_path.glob("*.unfinished")]
+
+
+def test_a_model_of_ones_own(run, photos, tmp_path):
+    torch.manual_seed(1)
+    other = FixationDensity({"backbone8": 3}, centre=-torch.rand(39, 52))
+    other.save(tmp_path / "own.safetensors")
+    shipped, own = (run(photos / "0.png", *words)[1] for words in ([], ["--model", tmp_path / "own.safetensors"]))
+    assert "entropy" in own
+    assert own != shipped
 
 
 def test_the_seed_repeats_the_table(run, photos, tmp_path):

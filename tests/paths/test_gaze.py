@@ -138,6 +138,12 @@ def test_frames_of_other_proportions_are_refused(gaze):
         gaze.compare([])
 
 
+def test_first_fixations_alone_are_refused(gaze):
+    only = Fixations("a.png", "1", np.array([[5.0, 5.0]]), (104, 78))
+    with pytest.raises(InputError, match="after the first of each person"):
+        gaze.compare([only])
+
+
 def test_words(gaze):
     assert "entropy" in gaze.describe()
     assert repr(gaze).count("\n") == len(gaze.peaks())

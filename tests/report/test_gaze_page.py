@@ -5,18 +5,22 @@ import torch
 
 from semfov.gaze.saliency import FixationDensity
 from semfov.paths import GazePrediction
-from semfov.report.gaze import DrawnGaze, write_gaze_page
+from semfov.report.gaze import gaze_part, write_gaze_page
 from tests.report.test_browser import axe, chromium, pytestmark, watched  # noqa: F401
 from tests.small import rand
 
 
-def drawn(name, size=(104, 78), seed=0):
+def predicted(name, size=(104, 78), seed=0):
     torch.manual_seed(seed)
     model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
     model.oculomotor.saccade.normal_(0, 0.5)
     terms = {"map": 4 * torch.randn(1, 39, 52), "centre bias": -rand(1, 39, 52)}
-    prediction = GazePrediction(model, terms, size, (rand(3, 78, 104) * 255).byte(), name)
-    return DrawnGaze(prediction, tuple(prediction.scanpaths(5, seed=seed)))
+    return GazePrediction(model, terms, size, (rand(3, 78, 104) * 255).byte(), name)
+
+
+def drawn(name, seed=0):
+    prediction = predicted(name, seed=seed)
+    return gaze_part(prediction, prediction.scanpaths(5, seed=seed))
 
 
 @pytest.fixture
@@ -78,7 +82,7 @@ def test_another_picture_can_be_chosen(opened, hostile):
 
 def test_the_heat_map_has_the_densities(opened):
     """The most opaque pixel is the cell of the largest probability."""
-    cells = drawn("b.png").prediction.cells
+    cells = predicted("b.png").cells
     context = 'each.getContext("2d").getImageData(0, 0, each.width, each.height).data'
     read = f"each => [...{context}].filter((_, n) => n % 4 == 3)"
     opacity = torch.tensor(opened.locator("#map").evaluate(read)).view(39, 52)

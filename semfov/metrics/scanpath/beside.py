@@ -53,9 +53,11 @@ class ScanpathComparison(dict[str, BesidePeople]):
     """
 
     def __str__(self) -> str:
-        """The measures as a table."""
+        """The measures as a table, and why some are missing."""
         wide = max(map(len, ["measure", *self]))
         lines = [f"{name:{wide}}  {each.scanpath:8.2f}  {each.people:6.2f}" for name, each in self.items()]
+        if np.isnan([*self.values()]).any():
+            lines.append("nan: too few people (two for the last column), or too few fixations inside the picture")
         return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
 
 

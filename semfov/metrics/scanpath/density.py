@@ -8,6 +8,7 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_outside
+from semfov.errors import check
 from semfov.metrics.scanpath.beside import people_density
 from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity
@@ -21,6 +22,7 @@ def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> 
     """
     records = warn_outside("people", [each.resized(prediction.size) for each in people])
     points = np.concatenate([each.points[1:][each.inside[1:]] for each in records])
+    check(len(points) > 0, "people", "fixations inside the picture after the first of each person", "none")
     cells = prediction.cells.double().numpy()
     ratio = np.array(cells.shape[::-1]) / np.array(prediction.size)
     x, y = ((points + 0.5) * ratio - 0.5).T

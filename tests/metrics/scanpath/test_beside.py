@@ -52,7 +52,9 @@ def test_a_person_is_nearer_to_people_than_a_random_scanpath_in_any_size():
         assert person[name].people == worse.people
     smaller = compare_scanpath(mine.resized((400, 300)), others)
     assert all(smaller[name] == pytest.approx(person[name]) for name in person)
-    assert np.isnan(compare_scanpath(mine, others[:1])["NSS"].people)
+    alone = compare_scanpath(mine, others[:1])
+    assert np.isnan(alone["NSS"].people)
+    assert "nan: too few people" in str(alone)
 
 
 def test_other_pictures_and_fixations_in_another_unit_are_told():
