@@ -52,6 +52,17 @@ LAB = {"lab", "eval"}
 NO_CALL = SimpleNamespace(params={})
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files whose tests would all be deselected, with the laboratory or without: to read them takes long."""
+    asked, folder = config.option.markexpr, collection_path.parent.relative_to(config.rootpath).parts[1:2]
+    if collection_path.suffix != ".py" or not asked.startswith(("lab", "not lab")):
+        return None
+    if asked.startswith("not"):
+        return True if LAB & {*folder} else None
+    marked = "mark.lab" in collection_path.read_text(encoding="utf-8")
+    return None if marked or {*LAB, "site"} & {*folder} else True
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests of the laboratory and of the built site, and as slow those that use a fixture that runs a command.

@@ -10,10 +10,8 @@ import torch
 from semfov import ActivePerception, Eye, Foveation, Grid
 from semfov.agents import FoveaEpisode
 from semfov.belief import MapEvidence, TargetEvidence
-from semfov.belief.look_features import class_features, nothing_seen
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.detection import Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
@@ -115,24 +113,6 @@ def test_dirichlet_parameters_return_to_the_prior_exponentially():
     torch.testing.assert_close(later - 0.25, math.exp(-1.5) * (first - 0.25), atol=1e-6, rtol=1e-5)
     with pytest.raises(InputError, match="passed: expected a number"):
         live.step(torch.full((3, 120, 160), 0.4), passed=math.nan)
-
-
-def test_learned_evidence_returns_to_that_of_a_look_without_detections():
-    observer = Target(learned(TargetEvidence))
-    grid, distance = Grid(8, 6, SIZE), torch.rand(4)
-    fixation = torch.tensor([[10.0, 20.0]])
-    none = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
-    features = class_features(none, fixation, grid, torch.tensor([1]))[0, 0]
-    torch.testing.assert_close(nothing_seen(grid.distance(fixation)[0]), features)
-    unseen = observer.model.unseen(distance)
-    torch.testing.assert_close(unseen, observer.model.evidence(nothing_seen(torch.ones(1)))[0])
-    look = observer.weigh(none, fixation, grid, 1)
-    belief = observer.update(observer.start(1, grid, distance), look)
-    for _ in range(30):
-        belief = observer.fade(belief, look, math.exp(-0.5), belief.visited)
-    torch.testing.assert_close(belief.nearest, unseen.expand_as(belief.nearest), atol=1e-4, rtol=1e-4)
-    # The weight of a look at distance d is exp(-6 d); fading by a factor f adds -log(f) / 6 to the distance.
-    torch.testing.assert_close((-6 * (belief.closest - look.distance)).exp(), torch.full((1, 48), math.exp(-15)))
 
 
 def test_the_belief_follows_a_moving_target_and_old_evidence_fades():

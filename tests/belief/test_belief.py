@@ -280,15 +280,6 @@ def test_put_replaces_the_beliefs_of_the_given_episodes():
     assert torch.equal(before.beta, rand(4, 3, 2))
 
 
-@pytest.mark.parametrize("kind", OBSERVERS)
-def test_fading_by_a_factor_of_one_changes_nothing(kind):
-    observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
-    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
-    same = observer.fade(belief, look, 1, visited)
-    for one, other in zip(tensors_of(same), tensors_of(belief), strict=True):
-        assert torch.equal(one, other)
-
-
 def test_parameters_fade_towards_the_prior():
     """A quarter of the evidence is left; the nearness exp(-6 d) of the closest look is a quarter as large."""
     observer = Semantic(4, prior=0.3)

@@ -7,7 +7,7 @@ called from semfov.
 """
 
 import math
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -149,11 +149,6 @@ def paper(request):
     return Paper(SHAPES[shape], components, seed)
 
 
-@cache
-def full_size():
-    return Paper((10, 10, (640, 480)), 81, 0)
-
-
 EXPLORATION = {
     "kl": lambda paper: paper.total(divergence),
     "negative-entropy": lambda paper: paper.total(negentropy),
@@ -201,16 +196,6 @@ def test_neighbourhood(paper, sigma):
     assert_agree(paper.values(function, torch.float32), wanted, 1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EXPLORATION)
-def test_a_map_of_the_size_in_the_paper(name):
-    """10 × 10 cells of 81 classes: a hundred fixations, ten thousand simulated updates."""
-    paper = full_size()
-    function, wanted = named_policy(name, "exploration", Means(paper.model))(None, paper.grid), EXPLORATION[name](paper)
-    assert_agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
-    assert_agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
-
-
 @pytest.mark.parametrize("prior", [0.1, 0.5, 2.0])
 def test_divergence_from_another_prior(prior):
     paper = Paper(SHAPES["wide"], 5, 3)
@@ -223,15 +208,3 @@ def test_the_constant_is_the_value_of_the_present_map(name, metric, paper):
     function = named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
     present = sum(metric(beta) for beta in paper.beta)
     np.testing.assert_allclose(paper.values(function), np.array(paper.total(metric)) - present, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_the_compared_maps_are_varied(shape):
-    """Cells are seen at several levels, values differ between fixations, and the best one differs between maps."""
-    papers = [Paper(SHAPES[shape], 5, seed) for seed in range(12)]
-    far = papers[0]
-    assert len({sum(far.distance(x, 0) > edge for edge in far.edges) for x in range(far.cells)}) >= 5
-    for name, twin in EXPLORATION.items():
-        values = np.array([twin(paper) for paper in papers])
-        assert np.ptp(values, axis=1).min() > 1e-4
-        assert len(set(values.argmax(1))) > 1, name

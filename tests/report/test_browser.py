@@ -129,26 +129,6 @@ def test_cells_have_the_colours_of_their_values(opened, scanpath):
     assert opened.locator("#belief image").evaluate("each => getComputedStyle(each).filter") == "grayscale(1)"
 
 
-def test_the_head_shows_photograph_settings_and_outcome_at_once(opened, hostile):
-    told = dict(
-        zip(opened.locator("#about dt").all_inner_texts(), opened.locator("#about dd").all_inner_texts(), strict=True)
-    )
-    assert told == {
-        "Photograph": hostile,
-        "Detector": "none",
-        "Sensor": "fovea of 20 px in 640, growth 2",
-        "Outcome": f"“{hostile}” found after 2 gaze shifts.",
-    }
-    assert opened.locator("#number").inner_text() == "0 of 2"
-    opened.locator("#episode").select_option(index=1)
-    assert opened.locator("#about dd").first.inner_text() == "another"
-
-
-def test_the_menu_has_one_entry_for_each_class(opened, scanpath):
-    entries = opened.locator("#class option").all_inner_texts()
-    assert sorted(entries) == sorted(scanpath.classes)
-
-
 def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
     opened.keyboard.press("End")
     fills = opened.locator("#path circle").evaluate_all("all => all.map(each => each.getAttribute('fill'))")
@@ -182,15 +162,6 @@ def test_axe_finds_no_accessibility_violation_and_the_page_fits(
         assert len(ratios) > 20
         assert min(ratios.values()) >= 4.5, ratios
     context.close()
-
-
-def test_axe_finds_a_label_that_was_removed(chromium, path):
-    page = chromium.new_page()
-    page.goto(path.as_uri())
-    page.evaluate("document.querySelector('label[for=fixation]').remove()")
-    found = axe.Axe().run(page)
-    assert [each["id"] for each in found.response["violations"]] == ["label"]
-    page.close()
 
 
 def test_the_page_in_a_frame_is_isolated_from_the_notebook(chromium, scanpath, tmp_path):

@@ -56,14 +56,6 @@ def test_the_page_loads_nothing_from_elsewhere(page):
     loads_nothing(page)
 
 
-def test_every_control_has_a_label(page):
-    elements = Elements(page).found
-    labelled = {attributes.get("for") for tag, attributes in elements if tag == "label"}
-    controls = [attributes for tag, attributes in elements if tag in ("select", "input")]
-    assert len(controls) == 3
-    assert all(attributes["id"] in labelled for attributes in controls)
-
-
 def test_the_page_contains_the_beliefs(page, scanpath):
     (episode,) = data_of(page)["episodes"]
     maps = {each["label"]: decoded(each, 3, 12) for each in episode["maps"]}

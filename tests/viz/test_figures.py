@@ -210,16 +210,6 @@ def test_views_may_be_smaller_than_the_photograph(scanpath, image):
     assert tuple(figure.axes[0].images[0].get_extent()) == (0, 80, 60, 0)
 
 
-def test_labels_do_not_overlap(scanpath, image):
-    boxes = torch.tensor([[[10.0, 10, 30, 30], [11, 11, 31, 31], [12, 12, 32, 32], [9, 9, 29, 29]]])
-    crowd = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]).expand(1, 4, 3), torch.ones(1, 4, dtype=torch.bool))
-    figure = draw(plot_foveated_strip(replace(scanpath, detections=(crowd,) * 3), [image] * 3))
-    for axes in figure.axes:
-        extents = [text.get_window_extent().padded(-0.5) for text in axes.texts]
-        assert len(extents) == 4
-        assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
-
-
 def test_plot_of_a_fixation_shows_scanpath_view_and_belief(scanpath, image):
     path, seen, believed, _ = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
     assert [text.get_text() for text in path.texts if text.get_visible()] == ["0", "1"]

@@ -65,17 +65,6 @@ def test_colours_show_the_time_of_fixations():
                                                               axes.collections[-1].get_offsets()[1:]], 1))  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2, 400])
-def test_numbers_of_few_and_of_very_many_fixations_do_not_overlap(count):
-    """Numbers without enough space are left out, but never the first and the last."""
-    axes = drawn(path_of(torch.randperm(1600, generator=torch.Generator().manual_seed(0))[:count], 40, 40))
-    numbers = {int(text.get_text()) for text in axes.texts}
-    assert {0, count - 1} <= numbers
-    boxes = [text.get_bbox_patch().get_window_extent() for text in axes.texts]
-    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
-
-
 def test_fixations_of_people_are_drawn_as_those_of_an_agent():
     points = np.array([[10.0, 20.0], [300.0, 40.0], [200.5, 400.25]])
     person = Fixations("a.jpg", "7", points, (640, 480), target="cup", box=(180.0, 380.0, 230.0, 430.0), found=True)

@@ -130,16 +130,6 @@ def test_borders_go_around_regions():
             assert len({int(each) for each in pair}) == 2
 
 
-def test_names_of_many_regions_do_not_overlap():
-    generator = torch.Generator().manual_seed(0)
-    probabilities = torch.rand(1, 100, 4, generator=generator).pow(4)
-    figure = plot_semantic_map(scanpath_of(probabilities, 10, ("background", "fire hydrant", "dining table", "cup")))
-    figure.draw_without_rendering()
-    extents = [text.get_window_extent().padded(-0.5) for text in figure.axes[0].texts]
-    assert len(extents) == len(named_regions(scanpath_of(probabilities, 10))) > 15
-    assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
-
-
 def test_entropy_is_that_of_normalised_probabilities():
     scanpath = marginal_map()
     got = cell_entropy(scanpath)

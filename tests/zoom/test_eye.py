@@ -46,19 +46,6 @@ def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
     assert float((covered - torch.tensor([640.0, 320, 672, 352])).abs().max()) <= cell
 
 
-def test_a_batch_equals_its_looks_one_by_one(detector, picture):
-    eye = WindowEye(detector)
-    view = eye.open(picture)
-    fixations = torch.tensor([[655.5, 335.5, 1.0], [159.5, 95.5, 0.5], [511.5, 383.5, 0.125]])
-    together = eye.look(view, fixations)
-    for number in range(3):
-        alone = eye.look(view, fixations[number : number + 1])
-        count = int(alone.count)
-        assert count == int(together.count[number])
-        torch.testing.assert_close(together.boxes[number, :count], alone.boxes[0, :count])
-        torch.testing.assert_close(together.scores[number, :count], alone.scores[0, :count])
-
-
 def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, picture):
     fixation = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0]])  # its window ends in the red square
     keep, drop, nothing = (WindowEye(detector, cut=cut) for cut in ("keep", "drop", "background"))

@@ -176,53 +176,6 @@ def test_merging_keeps_small_objects_in_front_of_large_ones():
     assert len(merge([])) == 0
 
 
-def overlap(a, b):
-    """Area that two boxes share."""
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
-
-
-def area(box):
-    return (box[2] - box[0]) * (box[3] - box[1])
-
-
-def test_merging_equals_a_plain_loop():
-    """Many boxes of two classes from looks of all levels, a third of them cut."""
-    generator = torch.Generator().manual_seed(1)
-    glances = []
-    for turn in range(6):
-        corner = torch.rand(40, 2, generator=generator) * 150
-        boxes = torch.cat([corner, corner + 5 + torch.rand(40, 2, generator=generator) * 60], -1)
-        scores, cut = torch.rand(40, generator=generator), torch.rand(40, generator=generator) < 0.33
-        glance = make_glance(turn % 3, 0, 0, boxes.tolist(), scores.tolist(), cut.tolist())
-        vectors = glance.detections.scores
-        vectors[0, ::2, 2], vectors[0, ::2, 1] = vectors[0, ::2, 1].clone(), 0.0
-        glances.append(glance)
-    rows = []
-    for turn, glance in enumerate(glances):
-        found = glance.detections
-        for n, (box, score, label) in enumerate(
-            zip(found.boxes[0].tolist(), found.confidence[0].tolist(), found.labels[0].tolist(), strict=True)
-        ):
-            if score >= 0.05:
-                rows.append((bool(glance.cut[n]), -glance.window.fixation[2], -score, turn, label, box))
-    kept = []
-    for cut, _, score, turn, label, box in sorted(rows):
-        for _, other_turn, other_label, other in kept:
-            shared = overlap(box, other)
-            same = shared >= 0.5 * (area(box) + area(other) - shared)
-            same = same or (cut and turn != other_turn and shared >= 0.8 * area(box))
-            if same and label == other_label:
-                break
-        else:
-            kept.append((score, turn, label, box))
-    kept.sort(key=lambda row: row[0])
-    objects = merge(glances)
-    assert 10 < len(kept) < len(rows) - 10
-    assert objects.passes.tolist() == [turn for _, turn, _, _ in kept]
-    assert objects.labels.tolist() == [label for _, _, label, _ in kept]
-    torch.testing.assert_close(objects.boxes, torch.tensor([box for *_, box in kept]))
-
-
 def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     found = {}
     for cut in ("keep", "drop", "background"):

@@ -7,7 +7,7 @@ import torch
 
 from semfov.errors import InputError
 from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
-from semfov.gaze.saliency.itti import _across_scales, _dyadic_pyramid, _gabor_kernels, _orientation_energy, _promote
+from semfov.gaze.saliency.itti import _dyadic_pyramid, _orientation_energy, _promote
 
 
 def numpy_promote(image: np.ndarray) -> np.ndarray:
@@ -86,38 +86,6 @@ def test_saliency_equals_the_steps_in_opencv(photograph: np.ndarray, dtype: torc
     # In single precision a peak may still appear or vanish.
     atol = 1e-6 if dtype == torch.float64 else 5e-4
     np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(picture), atol=atol)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
-def test_pyramid_equals_opencv(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
-    image = np.random.default_rng(1).random((*size, 3))
-    levels = _dyadic_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
-    assert len(levels) == 9
-    for level in levels:
-        np.testing.assert_allclose(level[0].permute(1, 2, 0).numpy(), image, atol=tolerance)
-        image = cv2.pyrDown(image).reshape((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2, 3)
-
-
-def test_gabor_kernels_equal_opencv() -> None:
-    kernels = _gabor_kernels().unflatten(0, (4, 2))
-    for angle, pair in zip((0, 45, 90, 135), kernels, strict=True):
-        for phase, kernel in zip((0, np.pi / 2), pair, strict=True):
-            np.testing.assert_allclose(kernel.numpy(), opencv_gabor(angle, phase), atol=1e-12)
-
-
-def test_orientation_energy_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
-    image = np.random.default_rng(2).random((19, 26))
-    energy = _orientation_energy(torch.from_numpy(image)[None, None].to(dtype))
-    for angle, answer in zip((0, 45, 90, 135), energy[0], strict=True):
-        np.testing.assert_allclose(answer.numpy(), opencv_energy(image, angle), atol=tolerance)
-
-
-def test_difference_across_scales_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
-    rng = np.random.default_rng(3)
-    centre, surround = rng.random((31, 44)), rng.random((4, 6))
-    difference = _across_scales(*(torch.from_numpy(each)[None, None].to(dtype) for each in (centre, surround)))
-    expected = np.abs(centre - cv2.resize(surround, (44, 31), interpolation=cv2.INTER_LINEAR))
-    np.testing.assert_allclose(difference[0, 0].numpy(), expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("steps", [3, 10, 1000])

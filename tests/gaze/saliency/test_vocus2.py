@@ -62,23 +62,8 @@ def opencv_vocus2(
     return (saliency - saliency.min()) / (saliency.max() - saliency.min())
 
 
-@pytest.mark.parametrize(("centre", "surround"), [(2.0, 6.0), (3.0, 13.0)])
-@pytest.mark.parametrize("scales", [1, 2, 3])
-def test_pyramids_equal_opencv(centre: float, surround: float, scales: int, dtype: torch.dtype) -> None:
-    channels = np.random.default_rng(scales).random((41, 75, 3))
-    tensor = torch.from_numpy(channels).permute(2, 0, 1)[None].to(dtype)
-    pyramids = _twin_pyramids(tensor, centre, surround, layers=5, scales=scales)
-    for c in range(3):
-        expected = opencv_pyramids(channels[..., c], centre, surround, 5, scales)
-        assert [len(layer) for layer in pyramids] == [len(layer) for layer in expected]
-        for layer, twins in zip(pyramids, expected, strict=True):
-            for twin, (middle, around) in zip(layer, twins, strict=True):
-                np.testing.assert_allclose(twin.centre[0, c].numpy(), middle, atol=3e-6)
-                np.testing.assert_allclose(twin.surround[0, c].numpy(), around, atol=3e-6)
-
-
 @pytest.mark.parametrize("fusion", ["mean", "max"])
-@pytest.mark.parametrize(("centre", "surround", "scales"), [(2.0, 6.0, 2), (3.0, 13.0, 2), (2.0, 6.0, 3)])
+@pytest.mark.parametrize(("centre", "surround", "scales"), [(2.0, 6.0, 1), (3.0, 13.0, 2), (2.0, 6.0, 3)])
 def test_saliency_equals_the_steps_in_opencv(
     photograph: np.ndarray, fusion: str, centre: float, surround: float, scales: int, dtype: torch.dtype
 ) -> None:
