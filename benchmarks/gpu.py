@@ -153,7 +153,8 @@ def counted(run: Callable[[], object]) -> tuple[int, int]:
 
 def rows(name: str, make: Work, device: torch.device, seconds: float, equal: bool = True) -> list[list[str]]:
     """Table rows of one work: the processor's time, the GPU's, their ratio, launches and waits."""
-    ours, there = make(torch.device("cpu")), make(device)
+    with torch.inference_mode(False):  # as models are loaded
+        ours, there = make(torch.device("cpu")), make(device)
 
     def agree() -> None:
         if equal:
@@ -167,7 +168,8 @@ def rows(name: str, make: Work, device: torch.device, seconds: float, equal: boo
 
 def compiled(name: str, make: Callable[..., Callable[[], Tensor]], device: torch.device, seconds: float) -> list[str]:
     """The table row of a compiled function."""
-    ours, eager = make(device, compiled=True), make(device)
+    with torch.inference_mode(False):
+        ours, eager = make(device, compiled=True), make(device)
     comparison = Comparison(
         name, finished(ours), {"eager": finished(eager)}, agree=lambda: torch.testing.assert_close(ours(), eager())
     )

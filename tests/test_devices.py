@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 import semfov
 from docs.api import entries
+from semfov.agents.episode import on_cpu
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
 from semfov.episode import Step, StoredLooks, rollout
@@ -229,11 +230,24 @@ def explored(count: int) -> object:
     return value(belief, torch.zeros(count, 4, dtype=torch.bool, device=GPU))
 
 
+def test_a_copy_on_the_cpu_is_made_once_for_each_state_of_a_module():
+    with torch.no_grad(), a_gpu():
+        module = nn.Linear(2, 1).to(GPU)
+        first = on_cpu(module)
+        assert first.weight.device == CPU
+        with waits() as found:
+            assert on_cpu(module) is first
+        assert not found
+        module.weight.fill_(3.0)
+        assert on_cpu(module).weight.tolist() == [[3.0, 3.0]]
+
+
 @pytest.mark.parametrize("work", [foveated, fused, explored])
 def test_more_episodes_do_not_wait_for_the_gpu_more_often(work):
     """Nor do more fixations: they are computed together, and few values are read."""
     often = []
     with torch.no_grad(), a_gpu():
+        work(2)  # makes what is kept for further calls
         for count in (2, 9):
             with waits() as found:
                 work(count)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Generic, Literal, TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import nn
@@ -18,6 +19,8 @@ from semfov.paths import Ending, GazeRecord, Moment, RecordedLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record = TypeVar("_Record", bound=GazeRecord)
+
+_COPIES: WeakKeyDictionary[nn.Module, tuple[list[tuple[int, int]], Any]] = WeakKeyDictionary()
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
@@ -203,7 +206,16 @@ def without_none(**values: Any) -> dict[str, Any]:
 
 
 def on_cpu(module: _Module) -> _Module:
-    """A module on the CPU, without moving the given one, which other parts of the agent may share."""
-    if all(each.device.type == "cpu" for each in (*module.parameters(), *module.buffers())):
+    """A module on the CPU, without moving the given one, which other parts of the agent may share.
+
+    A copy is kept as long as the module, until one of its tensors changes: copying waits for a GPU once for each.
+    """
+    tensors = (*module.parameters(), *module.buffers())
+    if all(each.device.type == "cpu" for each in tensors):
         return module
-    return copy.deepcopy(module).cpu()
+    state = [(id(each), 0 if each.is_inference() else each._version) for each in tensors]
+    kept = _COPIES.get(module)
+    if kept is None or kept[0] != state:
+        kept = _COPIES[module] = state, copy.deepcopy(module).cpu()
+    copied: _Module = kept[1]
+    return copied
