@@ -478,11 +478,13 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def record(self) -> ZoomPath:
         """The record of the looks so far."""
-        path = self._glances.view.picture.path if isinstance(self._glances, LiveGlances) else None
+        picture = self._glances.view.picture if isinstance(self._glances, LiveGlances) else None
+        path = None if picture is None else picture.path
         return ZoomPath(
             **self._recorded(),
             photograph=self._photograph,
             source=None if path is None else str(path),
+            shown=None if picture is None else picture.shown,
             ending=self.ending,
         )
 

@@ -22,7 +22,7 @@ from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check
 from semfov.data.raster import RasterPicture
 from semfov.data.reduction import PixelBox
 from semfov.data.tiff import TiffPicture, is_converted
-from semfov.data.tone import White, check_bands, check_white
+from semfov.data.tone import White, black_and_white, check_bands, check_white
 from semfov.data.windowed import BY_WINDOWS, RASTERS, TILED, ChosenBands, LargePicture, opening
 from semfov.errors import DataError, check, check_pixels, lookup
 
@@ -146,9 +146,17 @@ def open_large(
     if not isinstance(source, str | PathLike):
         return _MemoryPicture(source, color=color, white=white)
     check_local(source, "picture")
-    if kind in RASTERS:
-        return _raster(source, white, bands)
-    return _tiff(source, white, bands) if kind in TILED else _PhotographPicture(source, white)
+    opened = _raster if kind in RASTERS else _tiff if kind in TILED else _photograph
+    picture = opened(source, white, bands)
+    if white is not None or bands is not None:
+        values = white if white is None or isinstance(white, str) else black_and_white(white, np.zeros(0))
+        picture.shown = {"white": values, "bands": bands}
+    return picture
+
+
+def _photograph(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
+    """A photograph that is decoded as a whole, and has no bands to choose from."""
+    return _PhotographPicture(path, white)
 
 
 def _raster(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:

@@ -2,7 +2,7 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ class LargePicture(ABC):
 
     size: tuple[int, int]
     path: Path | None = None
+    shown: Mapping[str, Any] | None = None  # `white` and `bands` with which the file was opened; None for neither
     nothing: tuple[int, int, int] | None = None  # the colour in which pixels without data are shown, if a file has some
 
     @abstractmethod

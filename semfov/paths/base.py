@@ -50,6 +50,7 @@ class Record(Conversion):
         least: score from which on objects count, in windows their probability or score (`threshold_in_words`).
         photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
         source: file of the picture; None if it does not come from a file.
+        shown: the `white` and the `bands` that were shown of the file; None for neither.
 
     Example::
 
@@ -66,6 +67,7 @@ class Record(Conversion):
     least: float = LEAST
     photograph: Tensor | None = None
     source: str | None = None
+    shown: Mapping[str, Any] | None = None
 
     how: ClassVar[Literal["fovea", "windows", "head"]]
     """Kind of look: of a fovea, at windows, or of a head that turns."""

@@ -43,6 +43,7 @@ class Conversion(ABC):
 
     classes: tuple[str, ...]
     source: str | None
+    shown: Mapping[str, Any] | None
 
     _columns: ClassVar[tuple[str, ...]] = COLUMNS
     """Columns of the table of objects."""
@@ -248,8 +249,8 @@ class Conversion(ABC):
         """Cut what the box of each object shows out of the picture.
 
         Args:
-            picture: the picture in full size, opened by `semfov.data.large.open_large` where it was looked at with
-                `white=` or `bands=`; None takes the file that the record comes from as it is.
+            picture: the picture in full size; None takes the file that the record comes from, with the values and
+                bands that were shown.
 
         Returns:
             `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.
@@ -258,10 +259,11 @@ class Conversion(ABC):
             InputError: no picture is given, or the record's is not known, or it has another size.
             DataError: the file cannot be read.
         """
+        shown = self.shown if picture is None and self.shown is not None else {}
         picture = self.source if picture is None else picture
         if picture is None:
             raise InputError("picture: expected the picture, as the record does not come from a file, got None")
-        opened, (width, height) = open_large(picture), self.size
+        opened, (width, height) = open_large(picture, **shown), self.size
         check(opened.size == (width, height), "picture", f"the record's, {width} × {height} px", opened.size)
         crops = []
         for x1, y1, x2, y2 in self._inside():

@@ -14,7 +14,7 @@ from semfov.belief.grid import Grid
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
-from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
+from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
 from semfov.io.storage import read, write_file
 from semfov.paths.endings import Ending
 from semfov.paths.stimulus import LONGEST
@@ -54,11 +54,12 @@ _SHARED = {
     "found": Flag(),
     "least": CHANCE,
     "source": Maybe(Text()),
+    "shown": Maybe(Object({"white": Anything(), "bands": Anything()})),
     "ending": Maybe(Text(get_args(Ending))),
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = "target", "found", "least", "source", "ending"
+_PLAIN = "target", "found", "least", "source", "shown", "ending"
 
 
 _OTHERS = {

@@ -18,6 +18,7 @@ from torchvision.utils import draw_bounding_boxes
 
 from semfov import Detections, Grid, InputError
 from semfov.cli.results import check_places
+from semfov.data.large import open_large
 from semfov.errors import DataError
 from tests import small
 
@@ -63,6 +64,18 @@ def test_labels_of_yolo_are_shares_and_crops_the_pixels_of_the_boxes(record):
         record.crops(picture[:, :30])
     with pytest.raises(InputError, match="as the record does not come from a file, got None"):
         record.crops()
+
+
+def test_crops_of_a_file_show_the_values_and_bands_that_were_looked_at(record, tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    values = np.random.default_rng(0).integers(0, 4096, (60, 80, 4), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
+    opened = open_large(tmp_path / "a.tif", white=4095, bands=(4, 3, 2))
+    replace(record, source=str(opened.path), shown=opened.shown).save(tmp_path / "a.safetensors")
+    crops = type(record).load(tmp_path / "a.safetensors").crops()
+    assert [*map(torch.equal, crops, record.crops(opened))] == [True] * 3
+    expected = values[5:20, 40:61, [3, 2, 1]] * (255 / 4095)
+    np.testing.assert_allclose(crops[2].permute(1, 2, 0).numpy(), expected, atol=0.51)
 
 
 def test_torchvision_draws_them(record):
