@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,71 +13,98 @@ from torch import Tensor
 from eval.bootstrap import Bootstrap
 from semfov.agents.windows import LIKELY
 from semfov.data.scene import Annotation
+from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
+from semfov.detection.selection import Selection, suppress
 from semfov.metrics.calibration import BinarySums
+from semfov.observation.matching import box_iou
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom.certainty import Certainty
 from semfov.zoom.glances import Glance
-from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import merge, probable_objects
+from semfov.zoom.objects import merge
 
-AFTER = (1, 4, 8, 12, 16, 24)
+AFTER = (1, 2, 4, 8, 12, 16, 24)
 """Numbers of passes after which objects are compared with the annotated ones."""
 
 _RECALLS = 101
+_SAME = 0.5
 
 
-def object_record(
-    way: str,
-    looks: Sequence[Glance],
-    lattice: Lattice,
-    target: int | None,
-    annotation: Annotation,
-    passes: int,
-    certainty: Certainty | None,
-    ahead: Sequence[tuple[tuple[float, float], float]] = (),
-) -> ResultRecord:
-    """Compare the objects after some numbers of passes with the annotated ones.
+class Returned(NamedTuple):
+    """What a way of looking returns: all objects, those that are listed, and the number that was not seen, if known."""
+
+    objects: Objects
+    listed: Objects
+    unseen: tuple[float, float] | None = None
+
+
+def merged(looks: Sequence[Glance], target: int | None) -> Returned:
+    """The objects of looks by the scores of the detector (`semfov.zoom.objects.merge`)."""
+    objects = merge(looks, target)
+    return Returned(objects, objects.above(LIKELY))
+
+
+def suppressed(looks: Sequence[Glance], target: int | None) -> Returned:
+    """The objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
+    every = [look.detections.boxes[0, ~look.cut] for look in looks]
+    scores = torch.cat([look.detections.scores[0, ~look.cut] for look in looks])
+    value, label = scores[:, 1:].max(-1) if target is None else (scores[:, target], torch.full((len(scores),), target))
+    label = label + 1 if target is None else label
+    numbers = torch.arange(len(every)).repeat_interleave(torch.tensor([len(each) for each in every]))
+    kept = suppress(torch.cat(every), value, label, Selection(threshold=0.0, iou=0.5, limit=10_000, per_class=True))
+    objects = Objects(*(each[kept] for each in (torch.cat(every), value, label, numbers)))
+    return Returned(objects, objects.above(LIKELY))
+
+
+def sure_boxes(detections: Detections, target: int | None) -> Objects:
+    """What a plain pass of the detector shows from 0.5 on."""
+    boxes, scores, labels = detections.boxes[0], detections.confidence[0], detections.labels[0]
+    kept = detections.mask[0] & (scores >= LIKELY) & (labels == (labels if target is None else target))
+    return Objects(boxes[kept], scores[kept], labels[kept], torch.zeros_like(labels[kept]))
+
+
+def object_record(way: str, returned: Mapping[int, Returned], annotation: Annotation, plain: Objects) -> ResultRecord:
+    """Compare the objects after some numbers of passes with the annotated ones, and with those of a plain pass.
 
     Args:
         way: name of the way of looking.
-        looks: the looks.
-        lattice: lattice of the picture.
-        target: class whose objects are looked for, 1..K; None for all classes.
+        returned: what it returns, by number of passes.
         annotation: the annotated objects.
-        passes: largest number of passes.
-        certainty: gives objects probabilities; None leaves them the detector's scores.
-        ahead: after each look, the numbers of objects that further looks are expected to find (`ZoomBelief.remaining`),
-            and the number that the looks after the first were expected to find.
+        plain: what a plain pass of the detector shows (`sure_boxes`).
 
     Returns:
-        The record: for each number of passes the scores of the objects, which of them are right, and the number of
-        objects that are expected in all, or None without `ahead`. Objects in areas that are annotated as crowds are
-        left out.
+        The record: for each number of passes scores and classes of the objects, which of them are right, how many are
+        listed, how many of those are right, how many of the plain pass are among them, and where it is known the number
+        of objects that are expected in all, with its standard deviation. Objects in areas that are annotated as crowds
+        are left out.
     """
     after = {}
-    for number in sorted({n for n in AFTER if n < passes} | {passes}):
-        objects: Objects
-        unseen: float | None = None
-        if certainty is None:
-            objects = merge(looks[:number], target)
-        else:
-            remaining, promised = ahead[min(number, len(looks)) - 1] if ahead else ((0.0, 0.0), 0.0)
-            objects, (unseen, _) = probable_objects(
-                looks[:number], lattice, target, certainty, remaining=remaining, promised=promised
-            )
-        right = right_boxes(objects, annotation)
+    for number, (objects, listed, unseen) in returned.items():
+        right, sure = right_boxes(objects, annotation), right_boxes(listed, annotation)
         counts = right >= 0
-        in_all = None if unseen is None else float(objects.scores[counts].sum()) + unseen
+        chances = objects.scores[counts].double()
+        alike = (box_iou(plain.boxes, listed.boxes) >= _SAME) & (plain.labels[:, None] == listed.labels)
         after[str(number)] = {
             "scores": objects.scores[counts].tolist(),
+            "labels": objects.labels[counts].tolist(),
             "right": right[counts].tolist(),
-            "in all": in_all,
+            "listed": int((sure >= 0).sum()),
+            "listed right": int((sure > 0).sum()),
+            "kept": int(alike.any(1).sum()) if len(listed) else 0,
+            "in all": None if unseen is None else float(chances.sum()) + unseen[0],
+            "error": None if unseen is None else (float((chances * (1 - chances)).sum()) + unseen[1]) ** 0.5,
         }
-    single = len(annotation.boxes) - int(annotation.crowd.sum())
-    return {"measure": "objects", "way": way, "objects": single, "after": after}
+    labels = annotation.labels[~annotation.crowd]
+    counted = {str(label): int((labels == label).sum()) for label in labels.unique().tolist()}
+    return {
+        "measure": "objects",
+        "way": way,
+        "objects": len(labels),
+        "by class": counted,
+        "plain": len(plain),
+        "after": after,
+    }
 
 
 def average_precision(scores: Tensor, right: Tensor, objects: int) -> float:
@@ -111,8 +140,9 @@ def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]
 
     Returns:
         `(ways, len(numbers) + 6)`, float64: the average precision after each number of passes, and after the last one,
-        of the objects from 0.5 on, precision, recall, number for each annotated object, and the mean absolute error of
-        their number in a picture; then that of the sum of all scores, and the expected calibration error of the scores.
+        of the objects that are listed, precision, recall, number for each annotated object, and the mean absolute error
+        of their number in a picture; then that of the sum of all scores, and the expected calibration error of the
+        scores.
     """
     rows = []
     for group in groups.values():
@@ -124,12 +154,11 @@ def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]
             scores = torch.cat([torch.as_tensor(each["scores"], dtype=torch.float64) for each in after])
             right = torch.cat([torch.as_tensor(each["right"]) for each in after]) > 0
             line.append(average_precision(scores, right, total))
-        sure = scores >= LIKELY
-        hits = float(right[sure].sum())
-        pairs = [(torch.as_tensor(record["after"][number]["scores"]), record["objects"]) for record in chosen]
-        off = [float(((each >= LIKELY).sum() - count).abs()) for each, count in pairs]
-        apart = [float((each.sum() - count).abs()) for each, count in pairs]
-        line += [hits / max(int(sure.sum()), 1), hits / max(total, 1), int(sure.sum()) / max(total, 1)]
+        listed, hits = (sum(each[name] for each in after) for name in ("listed", "listed right"))
+        pairs = [(each, record["objects"]) for each, record in zip(after, chosen, strict=True)]
+        off = [abs(each["listed"] - count) for each, count in pairs]
+        apart = [abs(float(torch.as_tensor(each["scores"]).sum()) - count) for each, count in pairs]
+        line += [hits / max(listed, 1), hits / max(total, 1), listed / max(total, 1)]
         line += [sum(off) / len(off), sum(apart) / len(apart), BinarySums.of(scores, right).ece if len(scores) else 0]
         rows.append(line)
     return torch.tensor(rows, dtype=torch.float64)
@@ -141,7 +170,7 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     for record in records:
         # The bootstrap reads the numbers many times.
         after = {
-            n: {name: torch.tensor(outcome[name]) for name in ("scores", "right")}
+            n: outcome | {name: torch.tensor(outcome[name]) for name in ("scores", "labels", "right")}
             for n, outcome in record["after"].items()
         }
         groups.setdefault(record["way"], []).append(record | {"after": after})
@@ -157,14 +186,46 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     objects = sum(record["objects"] for record in first)
     return [
         f"Objects of {len(first)} pictures with {objects} annotated ones: average precision (IoU 0.5) after n passes; "
-        f"after {numbers[-1]} passes, of the objects from {LIKELY} on, precision, recall, their number for each "
-        "annotated object, and the mean absolute error of their number in a picture; that of the sum of all scores; "
-        "and the expected calibration error of the scores. ± is the standard error by bootstrap over pictures.",
+        f"after {numbers[-1]} passes, of the objects that are listed, precision, recall, their number for "
+        "each annotated object, and the mean absolute error of their number in a picture; that of the sum of all "
+        "scores; and the expected calibration error of the scores. ± is the standard error by bootstrap over pictures.",
         "",
         *table(rows),
         "",
+        *plain_table(groups, numbers),
         *in_all_table(records, numbers),
     ]
+
+
+def plain_table(groups: Mapping[str, Sequence[ResultRecord]], numbers: Sequence[str]) -> list[str]:
+    """Table of the mean of AP50 over the classes, and of what is kept of a plain pass, as Markdown."""
+    rows = [["", *(f"AP50, {number}" for number in numbers), "kept", "pictures without"]]
+    for way, group in groups.items():
+        last, shown = [record["after"][numbers[-1]] for record in group], [record["plain"] for record in group]
+        kept = f"{sum(after['kept'] for after in last) / sum(shown):.3f}" if sum(shown) else "-"
+        without = sum(count > 0 and not after["listed"] for count, after in zip(shown, last, strict=True))
+        means = [class_mean([(record, record["after"][number]) for record in group]) for number in numbers]
+        rows.append([way, *(f"{mean:.3f}" for mean in means), kept, str(without)])
+    return [
+        f"The mean of AP50 over the classes that are annotated; the share of the {sum(shown)} boxes that one plain "
+        f"pass of the detector shows from {LIKELY} on of which a listed object has the class and an IoU of "
+        f"{_SAME}, after {numbers[-1]} passes; and the pictures in which it shows some and nothing is listed.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def class_mean(outcomes: Sequence[tuple[ResultRecord, ResultRecord]]) -> float:
+    """Mean over the annotated classes of the average precision of records, after some number of passes."""
+    scores, labels, right = (
+        torch.cat([torch.as_tensor(after[name]) for _, after in outcomes]) for name in ("scores", "labels", "right")
+    )
+    totals = Counter[int]()
+    for record, _ in outcomes:
+        totals.update({int(label): count for label, count in record["by class"].items()})
+    each = [average_precision(scores[labels == label], right[labels == label] > 0, n) for label, n in totals.items()]
+    return sum(each) / max(len(each), 1)
 
 
 def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> list[str]:
@@ -178,10 +239,15 @@ def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> lis
     )
     true = torch.tensor([[record["objects"]] for record in expecting], dtype=torch.float64)
     rows.append(["expected in all", *(f"{each:.1f}" for each in expected.mean(0).tolist())])
-    rows.append(["off by", *(f"{each:.1f}" for each in (expected - true).abs().mean(0).tolist())])
+    off = (expected - true).abs()
+    rows.append(["off by", *(f"{each:.1f}" for each in off.mean(0).tolist())])
+    error = torch.tensor([[record["after"][n]["error"] for n in numbers] for record in expecting], dtype=torch.float64)
+    rows.append(["its error", *(f"{each:.1f}" for each in error.mean(0).tolist())])
+    rows.append(["within two errors", *(f"{each:.2f}" for each in (off <= 2 * error).double().mean(0).tolist())])
     return [
         f"The number of objects that semfov expects in all after n passes, those that no look has shown included: the "
-        f"mean over pictures, and the mean absolute error. There are {float(true.mean()):.1f} in the mean.",
+        f"mean over pictures, the mean absolute error, the error that it is given with, and the share of the pictures "
+        f"in which it is off by at most twice that. There are {float(true.mean()):.1f} in the mean.",
         "",
         *table(rows),
         "",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -14,14 +14,16 @@ from torch import Tensor
 
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
-from eval.zoom.objects import object_record
+from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
 from eval.zoom.orders import in_order, oracle, quad_tree, shuffled, sparse
+from semfov.agents.windows import WindowEpisode
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
+from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
@@ -40,19 +42,12 @@ from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.slices import adaptive_slices, ranked, slices
+from semfov.zoom.slices import adaptive_slices, ranked, slices, usual_slices
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
 
-_COMPARED = (
-    "slices, raster",
-    "slices, sparse",
-    "slices as in ASAHI",
-    "slices, ranked by the overview",
-    "quad-tree, best first",
-    "semfov",
-)
-"""Ways of looking whose objects are compared with the annotated ones."""
+RASTER, SEMFOV = "slices, raster", "semfov"
+"""Names of slices in raster order, and of the agent."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,8 @@ class ZoomConfig(WindowLookingConfig):
 
     Args:
         target: class whose objects are to be found (None: objects of any class).
-        slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
+        slice: side in pixels of the slices of a large picture; a mosaic's slices are its photographs, and those of a
+            photograph are four that overlap.
         overlap: overlap of neighbouring slices, as a share of their side.
         sparse: sparse slices are those in which the overview has a score of at least this.
         passes: largest number of detector passes.
@@ -106,11 +102,18 @@ class ZoomRun(WindowLooking, SceneRun):
         return {"eye": self.eye.settings(), "models": models, "settings": settings}
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
-        """The slices of a scene: the photographs of a mosaic, or squares of a picture."""
+        """The slices of a scene: the photographs of a mosaic, or squares of a picture, in a photograph four."""
         if isinstance(self.scenes, Mosaics):
             boxes = [tile.slot for tile in self.scenes.tiles(index)]
             return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+        if lattice.levels == 1:
+            return usual_slices(lattice)
         return slices(lattice, self.config.slice, self.config.overlap)
+
+    @cached_property
+    def numbers(self) -> list[int]:
+        """Numbers of passes after which objects are compared."""
+        return sorted({number for number in AFTER if number < self.config.passes} | {self.config.passes})
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Measure all ways of looking at a scene; returns records, and the seconds that each stage took."""
@@ -118,19 +121,8 @@ class ZoomRun(WindowLooking, SceneRun):
         glances = self.glances(index)
         records: list[ResultRecord] = []
         measures = self.config.measures
-        for name, turns in self._finding(index, glances) if {"objects", "recall"} & {*measures} else ():
-            if "recall" not in measures and name not in _COMPARED:
-                continue
-            looks, ahead = looked(islice(turns, self.config.passes))
-            if "objects" in measures:
-                records += self._objects(name, index, looks, ahead)
-            if "recall" not in measures:
-                if name == _COMPARED[-1]:  # the oracle is dear
-                    break
-                continue
-            records.append(self._recall(name, index, looks))
-            if name in ("slices, raster", "semfov"):
-                records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)]))
+        if {"objects", "recall"} & {*measures}:
+            records += self._finding(index, glances)
         watch.lap("recall")
         if self.config.mosaics and "hit" in measures:
             records += self._first_hits(index, glances)
@@ -141,29 +133,47 @@ class ZoomRun(WindowLooking, SceneRun):
         glances.save()
         return records, watch.seconds
 
-    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[WindowStep[Any]]]]:
-        """Every way of looking for all objects, with its name in tables."""
+    def _finding(self, index: int, glances: Glances) -> Iterator[ResultRecord]:
+        """Look for all objects in every way; compare the objects of slices and of the agent, and the recall of all."""
         cut, lattice = self.slices(index, glances.lattice), glances.lattice
-        annotation, target = self.annotation(index), self.target
-        targets = [] if target is None else [target]
+        annotation, target, config = self.annotation(index), self.target, self.config
+        targets = () if target is None else (target,)
+
+        def looked(turns: Iterator[WindowStep[Any]]) -> list[Glance]:
+            return [turn.glance for turn in islice(turns, config.passes)]
+
         orders = {
-            "slices, raster": in_order(cut),
-            "slices, random": shuffled(cut, [self.config.seed, index]),
-            "slices, sparse": sparse(cut, targets, self.config.sparse),
+            RASTER: in_order(cut),
+            "slices, sparse": sparse(cut, targets, config.sparse),
             "slices as in ASAHI": in_order(adaptive_slices(lattice)),
             "slices, ranked by the overview": ranked(cut, targets),
             "quad-tree, best first": quad_tree(lattice, target, most=False),
         }
-        for name, order in orders.items():
-            yield name, look_by_look(glances, order, None)
-        yield "semfov", find_everything(glances, self.evidence, target)
-        yield "semfov, four at a time", find_everything(glances, self.evidence, target, batch=4)
+        seen = {name: looked(look_by_look(glances, order, None)) for name, order in orders.items()}
+        episode = WindowEpisode(("background", *self.scenes.classes), self.evidence, None, targets, worth=0.0)
+        episode.open(glances)
+        paths: dict[int, ZoomPath] = {}
+        while episode.passes < config.passes and episode.look() is not None:
+            if episode.passes in self.numbers:
+                paths[episode.passes] = episode.record()
+        seen[SEMFOV] = episode.glances
+        if "objects" in config.measures:
+            paths = {number: paths.get(number) or episode.record() for number in self.numbers}
+            yield from self._objects(index, seen, paths)
+        if "recall" not in config.measures:
+            return
+        seen["slices, random"] = looked(look_by_look(glances, shuffled(cut, [config.seed, index]), None))
+        seen["semfov, four at a time"] = looked(find_everything(glances, self.evidence, target, batch=4))
         if self.observation is not None:
-            observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
-            yield "by the observation model", find_everything(glances, observed, target)
+            observed = ObservedRates(self.observation, lattice, foresight=self.evidence.foresight)
+            seen["by the observation model"] = looked(find_everything(glances, observed, target))
         finds: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
         every = [*half_steps(lattice)][1:]
-        yield "oracle", look_by_look(glances, oracle(glances, [*every, *cut], finds, self.config.passes), None)
+        seen["oracle"] = looked(look_by_look(glances, oracle(glances, [*every, *cut], finds, config.passes), None))
+        for name, looks in seen.items():
+            yield self._recall(name, index, looks)
+            if name in (RASTER, SEMFOV):
+                yield self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)])
 
     def _decisions(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Search for classes that are present and for classes that are absent."""
@@ -199,20 +209,23 @@ class ZoomRun(WindowLooking, SceneRun):
         )
 
     def _objects(
-        self, name: str, index: int, looks: list[Glance], ahead: list[tuple[tuple[float, float], float]]
+        self, index: int, seen: Mapping[str, list[Glance]], paths: Mapping[int, ZoomPath]
     ) -> Iterator[ResultRecord]:
-        """Compare the objects of semfov, with probabilities and with scores, and of slices with the annotated ones."""
-        if name not in _COMPARED:
-            return
-        lattice = Lattice.over(self.scenes.annotation(index).size, self.eye.detector.input_size, finest=self.eye.finest)
-        shared = looks, lattice, self.target, self.annotation(index), self.config.passes
-        ways = (
-            {name: None}
-            if name != "semfov"
-            else {"semfov": self.evidence.certainty, "semfov, scores of the detector": None}
-        )
-        for way, certainty in ways.items():
-            yield object_record(way, *shared, certainty, ahead) | {"scene": self.scenes.ids[index]}
+        """Compare the objects of slices and of the agent with the annotated ones, and with those of a plain pass."""
+        annotation = self.annotation(index)
+        with torch.inference_mode():
+            plain = sure_boxes(self.eye.detector(self.scenes[index].image[None]), self.target)
+        ways = {
+            name: {number: merged(looks[:number], self.target) for number in self.numbers}
+            for name, looks in seen.items()
+        }
+        ways[f"{RASTER}, plain suppression"] = {
+            number: suppressed(seen[RASTER][:number], self.target) for number in self.numbers
+        }
+        ways[f"{SEMFOV}, scores of the detector"] = ways[SEMFOV]
+        ways[SEMFOV] = {number: Returned(path.candidates, path.objects, path.unseen) for number, path in paths.items()}
+        for way, returned in ways.items():
+            yield object_record(way, returned, annotation, plain) | {"scene": self.scenes.ids[index]}
 
     def _recall(self, name: str, index: int, looks: list[Glance]) -> ResultRecord:
         annotation = self.annotation(index)
@@ -266,27 +279,6 @@ class ZoomRun(WindowLooking, SceneRun):
                     }
                 )
         return records
-
-
-def looked(turns: Iterator[WindowStep[Any]]) -> tuple[list[Glance], list[tuple[tuple[float, float], float]]]:
-    """The looks of turns; and after each, with a belief, the objects that looks are expected to find, and were so far.
-
-    Args:
-        turns: the turns.
-
-    Returns:
-        The looks; and for `semfov.zoom.objects.probable_objects` what remains and what was promised, none without a
-        belief.
-    """
-    looks: list[Glance] = []
-    ahead: list[tuple[tuple[float, float], float]] = []
-    promised = 0.0
-    for turn in turns:
-        promised += turn.worth if looks else 0.0
-        looks.append(turn.glance)
-        if turn.belief is not None:
-            ahead.append((turn.belief.remaining(), promised))
-    return looks, ahead
 
 
 def without_cut(glance: Glance) -> Glance:

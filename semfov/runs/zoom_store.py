@@ -82,7 +82,9 @@ class StoredGlances(Glances):
             glances = LiveGlances(eye, eye.open(scenes[index].image))
             return lambda window: glances.see([window])[0]
 
-        self.looks = RememberedLooks(open_picture, store, lambda: scenes.digest(index))
+        # Files of looks have no hints of photographs.
+        kept = store if self.lattice.levels > 1 else None
+        self.looks = RememberedLooks(open_picture, kept, lambda: scenes.digest(index))
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """The looks at windows, read from the store or computed."""

@@ -5,19 +5,30 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchvision.ops import batched_nms
 
 from eval.zoom import report as zoom_report
 from eval.zoom.decisions import decision_tables
-from eval.zoom.objects import average_precision, in_all_table, object_figures
+from eval.zoom.objects import (
+    Returned,
+    average_precision,
+    class_mean,
+    in_all_table,
+    object_figures,
+    object_record,
+    suppressed,
+)
 from eval.zoom.orders import in_order, quad_tree, shuffled
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
+from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.runs.config import DataConfig
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.episode import look_by_look
+from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles
@@ -47,7 +58,7 @@ def test_results_do_not_depend_on_the_store(config):
     fresh = ZoomRun(replace(config, store=False)).outcomes(0)[0]
     written = ZoomRun(config).outcomes(0)[0]
     run = ZoomRun(config)
-    run.eye.detector.propose = None  # any new look would fail
+    run.eye.glance = None  # any new look would fail
     assert run.outcomes(0)[0] == written == fresh
 
 
@@ -89,29 +100,68 @@ def test_measures_can_be_left_out(config, capsys):
 
 def test_the_number_in_all_is_compared_with_the_annotated_one():
     """5 and 3 are expected where there are 4 each after a pass, 4 and 2 after more."""
-    numbers = [(5.0, 4.0), (3.0, 2.0)]
-    ours = [{"objects": 4, "after": {"1": {"in all": first}, "4": {"in all": last}}} for first, last in numbers]
+    numbers = [((5.0, 0.5), (4.0, 1.0)), ((3.0, 0.4), (2.0, 1.0))]
+    ours = [
+        {
+            "objects": 4,
+            "after": {n: {"in all": mean, "error": error} for n, (mean, error) in zip("14", each, strict=True)},
+        }
+        for each in numbers
+    ]
     others = [{"objects": 4, "after": {"1": {"in all": None}, "4": {"in all": None}}}]
     text = in_all_table([*others, *ours], ["1", "4"])
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text if line.startswith("|")]
-    assert rows[-2:] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
+    assert rows[-4:-2] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
+    assert rows[-2:] == [["its error", "0.5", "1.0"], ["within two errors", "0.50", "1.00"]]
     assert "There are 4.0 in the mean." in text[0]
     assert in_all_table(others, ["1", "4"]) == []
 
 
 def test_figures_of_objects_match_hand_calculations():
-    """Two pictures with two objects each: three right boxes and one wrong one, of which three are from 0.5 on."""
-    found = [([0.9, 0.6], [1, 0]), ([0.8, 0.1], [1, 1])]
+    """Two pictures with two objects each: three right boxes and one wrong one, of which three are listed."""
+    none = {"scores": [], "right": [], "labels": [], "listed": 0, "listed right": 0, "kept": 0}
+    found = [([0.9, 0.6], [1, 0], [1, 2], 2, 1), ([0.8, 0.1], [1, 1], [1, 1], 1, 1)]
     records = [
-        {"objects": 2, "after": {"1": {"scores": [], "right": []}, "4": {"scores": scores, "right": right}}}
-        for scores, right in found
+        {"objects": 2, "by class": counts, "plain": 2, "after": {"1": none, "4": dict(zip(none, after, strict=False))}}
+        for after, counts in zip(found, ({"1": 1, "2": 1}, {"1": 2}), strict=True)
     ]
+    assert class_mean([(record, record["after"]["4"]) for record in records]) == pytest.approx((1 + 0) / 2)
     none, precision, *figures = object_figures({"semfov": records}, ["1", "4"], torch.arange(2))[0].tolist()
     assert none == 0
     # Precision 1 up to a recall of 2 / 4, 3 / 4 up to 3 / 4, and 0 beyond it.
     assert precision == pytest.approx((51 + 25 * 0.75) / 101)
     ece = (abs(0.9 - 1) + abs(0.6 - 0) + abs(0.8 - 1) + abs(0.1 - 1)) / 4
     assert figures == pytest.approx([2 / 3, 2 / 4, 3 / 4, (0 + 1) / 2, (0.5 + 1.1) / 2, ece])
+
+
+def test_plain_suppression_equals_that_of_torchvision():
+    """Of the boxes of two looks that no border cuts, class by class."""
+    generator = torch.Generator().manual_seed(0)
+    corners = 60 * torch.rand(2, 1, 40, 2, generator=generator)
+    boxes = torch.cat([corners, corners + 5 + 20 * torch.rand(2, 1, 40, 2, generator=generator)], -1)
+    scores, cut = torch.rand(2, 1, 40, 3, generator=generator), torch.rand(2, 40, generator=generator) < 0.3
+    looks = [
+        Glance(None, Detections(*each[:2], torch.ones(1, 40).bool()), each[2], None, None)
+        for each in zip(boxes, scores, cut, strict=True)
+    ]
+    whole, value = boxes.flatten(0, 2)[~cut.flatten()], scores.flatten(0, 2)[~cut.flatten()]
+    for target, (best, label) in {None: value[:, 1:].max(-1), 2: (value[:, 2], torch.ones(len(value)))}.items():
+        kept = batched_nms(whole, best, label, 0.5)
+        found = suppressed(looks, target).objects
+        torch.testing.assert_close(found.boxes, whole[kept])
+        torch.testing.assert_close(found.labels, label[kept].long() + 1)
+
+
+def test_boxes_of_a_plain_pass_are_kept_where_one_of_their_class_is_listed():
+    boxes, nothing = torch.tensor([[0.0, 0, 9, 9], [20, 20, 30, 30], [50, 0, 60, 9]]), torch.zeros(3).long()
+    plain = Objects(boxes, torch.full((3,), 0.6), torch.tensor([1, 2, 1]), nothing)
+    listed = Objects(boxes + 1, torch.full((3,), 0.9), torch.tensor([1, 1, 1]), nothing)
+    truth = Annotation(boxes, torch.tensor([1, 2, 2]), torch.tensor([False, False, True]), (80, 60))
+    record = object_record("semfov", {4: Returned(listed, listed[:2], (1.0, 0.25))}, truth, plain)
+    after = record["after"]["4"]
+    assert (record["objects"], record["by class"], record["plain"]) == (2, {"1": 1, "2": 1}, 3)
+    assert (after["listed"], after["listed right"], after["kept"]) == (2, 1, 1)
+    assert (after["in all"], after["error"]) == pytest.approx((3 * 0.9 + 1, (3 * 0.09 + 0.25) ** 0.5))
 
 
 def test_average_precision_equals_that_of_coco():
