@@ -47,13 +47,15 @@ def merged(looks: Sequence[Glance], target: int | None) -> Returned:
 
 def suppressed(looks: Sequence[Glance], target: int | None) -> Returned:
     """The objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
-    every = [look.detections.boxes[0, ~look.cut] for look in looks]
-    scores = torch.cat([look.detections.scores[0, ~look.cut] for look in looks])
-    value, label = scores[:, 1:].max(-1) if target is None else (scores[:, target], torch.full((len(scores),), target))
-    label = label + 1 if target is None else label
-    numbers = torch.arange(len(every)).repeat_interleave(torch.tensor([len(each) for each in every]))
-    kept = suppress(torch.cat(every), value, label, Selection(threshold=0.0, iou=0.5, limit=10_000, per_class=True))
-    objects = Objects(*(each[kept] for each in (torch.cat(every), value, label, numbers)))
+    boxes, scores = (
+        torch.cat([each[0, ~look.cut] for look, each in zip(looks, column, strict=True)])
+        for column in zip(*((look.detections.boxes, look.detections.scores) for look in looks), strict=True)
+    )
+    value, label = scores[:, 1:].max(-1)
+    if target is not None:
+        value, label = scores[:, target], torch.full_like(label, target - 1)
+    kept = suppress(boxes, value, label, Selection(threshold=0.0, iou=0.5, limit=10_000, per_class=True))
+    objects = Objects(boxes[kept], value[kept], label[kept] + 1, torch.zeros_like(kept))
     return Returned(objects, objects.above(LIKELY))
 
 
