@@ -31,6 +31,8 @@ class LookTester(GraphTester):
 
 
 class TestTargetEvidence(LookTester):
+    test_compile = test_export = None  # traced as a part of AnyOf
+
     def make(self):
         return evidence()
 
@@ -40,6 +42,8 @@ class TestTargetEvidence(LookTester):
 
 
 class TestMapEvidence(LookTester):
+    test_compile = test_export = None  # traced as a part of AnyOfOneMap
+
     def make(self):
         return mapping()
 
@@ -63,14 +67,21 @@ class ObserverTester(LookTester):
         return self.host(partial(self.call, looks=1))
 
 
+class PartTester(ObserverTester):
+    """An observer that is traced as a part of another one."""
+
+    test_compile = test_export = None
+
+
+globals().update(
+    make_testers(PartTester, {"Target": lambda: Target(evidence()), "LearnedMap": lambda: LearnedMap(mapping())})
+)
 globals().update(
     make_testers(
         ObserverTester,
         {
             "Semantic": observing,
             "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
-            "Target": lambda: Target(evidence()),
-            "LearnedMap": lambda: LearnedMap(mapping()),
             "AnyOf": lambda: AnyOf(Target(evidence()), {1: 0.3, 2: 1.0}),
             "AnyOfOneMap": lambda: AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0}),
         },

@@ -611,7 +611,7 @@ ONE = ("--draw", "scanpath")
     [
         ("search", "--target", "Cups"),
         ("find", "--target", "cup"),
-        ("explore", "--shifts", 1),
+        ("explore", "--shifts", 1, *ONE),
         ("search", "--target", "cup", "--agent", "published", "--sensor", "published-narrow", "--shifts", 1, *ONE),
         ("explore", "--agent", "raw", "--sensor", "gradual", "--shifts", 1, *ONE),
     ],

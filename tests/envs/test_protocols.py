@@ -14,12 +14,10 @@ pytestmark = [pytest.mark.weights, pytest.mark.slow, pytest.mark.lab]
 SEARCHES = [
     "recommended",
     "random",
-    "non-predictive-raw",
-    "predictive-calibrated",
     "vocus2",
     PolicyConfig("non-predictive", "calibrated", tempering=0.25, memory="closest", footprint="soft", misses=True),
 ]
-EXPLORATIONS = ["recommended", "random-raw", "kl-calibrated"]
+EXPLORATIONS = ["recommended", "kl-calibrated"]
 
 
 def settings(kind, world, policy="recommended"):

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.fuzz import TARGETS
 from benchmarks.fuzz.runner import run
 
-CASES = 40
+CASES = 25
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -120,7 +120,6 @@ def test_workers_end_when_the_process_that_started_them_ends(tmp_path, number, c
     [
         ("eval.search", 0.25),
         *(pytest.param("eval.search", seconds, marks=pytest.mark.long) for seconds in (0.8, 1.6)),
-        pytest.param("train.fit_tempering", 2.4, marks=pytest.mark.lab),
     ],
 )
 def test_an_early_interrupt_prints_no_traceback(tmp_path, module, seconds):
