@@ -1,6 +1,7 @@
 """Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,6 +37,32 @@ def draw(*shape: int, dtype: torch.dtype = torch.float64, device: torch.device |
 def close(a: Tensor, b: Tensor, tolerance: float = 1e-12) -> None:
     """Check that numbers differ by no more than a tolerance."""
     torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
+
+
+def area(box: Sequence[float]) -> float:
+    """Area of a box (x1, y1, x2, y2)."""
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def shared(a: Sequence[float], b: Sequence[float]) -> float:
+    """Area that two boxes share."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
+
+
+def iou(a: Sequence[float], b: Sequence[float]) -> float:
+    """Intersection over union of two boxes."""
+    return shared(a, b) / (area(a) + area(b) - shared(a, b))
+
+
+def kaplan(beta: Any, likelihood: Any) -> Any:
+    """Equation 7 of Luzio, Bernardino and Moreno (2024), of NumPy's arrays."""
+    expected = (beta * likelihood).sum()
+    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
+
+
+def cells_of(text: str) -> list[list[str]]:
+    """The cells of all rows of the tables in a text of Markdown, with their heads and rules."""
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
 
 
 def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections:

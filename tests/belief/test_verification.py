@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from semfov import Detections
 from semfov.belief import TargetEvidence, Verification
 from semfov.belief.verification import closer_features
+from tests.small import iou
 
 
 def seen(count, seed):
@@ -19,14 +20,6 @@ def seen(count, seed):
     boxes = torch.cat([corner, corner + 5 + torch.rand(1, count, 2, generator=generator) * 60], -1)
     scores = (2 * torch.randn(1, count, 4, generator=generator)).softmax(-1)
     return Detections(boxes, scores, torch.rand(1, count, generator=generator) < 0.8)
-
-
-def overlap(one, other):
-    width = min(one[2], other[2]) - max(one[0], other[0])
-    height = min(one[3], other[3]) - max(one[1], other[1])
-    shared = max(0.0, width) * max(0.0, height)
-    areas = [(x2 - x1) * (y2 - y1) for x1, y1, x2, y2 in (one, other)]
-    return shared / (sum(areas) - shared)
 
 
 def logit(chance):
@@ -42,7 +35,7 @@ def test_features_equal_a_loop(count, seed, presence, cell, evidence):
     for number in range(count):
         if not closer.mask[0, number]:
             continue
-        shared = overlap(closer.boxes[0, number].tolist(), box.tolist())
+        shared = iou(closer.boxes[0, number].tolist(), box.tolist())
         scores = closer.scores[0, number].tolist()
         highest = max(highest, scores[target])
         other = max(other, shared * max(scores[1], scores[3]))

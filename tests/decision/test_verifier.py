@@ -10,8 +10,8 @@ from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from semfov.errors import InputError
-from tests.belief.test_verification import overlap
 from tests.decision.test_rule import Known, random_looks
+from tests.small import iou
 
 GRID = Grid(4, 3, (160, 120))
 AT = Thresholds(confirm=0.7, give_up=0.1, place=0.3)
@@ -179,7 +179,7 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
             for one in range(2 + (turn > 0)):
                 for other in range(5):
                     box = looks.boxes[one, other]
-                    same = any(overlap(box.tolist(), each.tolist()) >= 0.5 for each in examined)
+                    same = any(iou(box.tolist(), each.tolist()) >= 0.5 for each in examined)
                     if same or not looks.mask[one, other]:
                         continue
                     evidence = float(weight[one, other, cell] * looks.scores[one, other, 2])

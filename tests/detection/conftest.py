@@ -84,17 +84,15 @@ def make_small(small_cfg: Path, small_weights: Path) -> Callable[..., YoloV3]:
 
 
 @pytest.fixture
-def threads() -> Iterator[Callable[[], Iterator[int]]]:
-    """Yield 1 and 2 after setting that number of threads, and restore the number at the end."""
-    before = torch.get_num_threads()
+def threads() -> Callable[[], Iterator[int]]:
+    """Yields 1 and 2 after setting that number of threads."""
 
     def numbers() -> Iterator[int]:
         for number in (1, 2):
             torch.set_num_threads(number)
             yield number
 
-    yield numbers
-    torch.set_num_threads(before)
+    return numbers
 
 
 @pytest.fixture(scope="session")

@@ -4,18 +4,11 @@ import re
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.interleave import main
 
 
-@pytest.fixture(autouse=True)
-def same_threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
+@pytest.mark.lab
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time", "--keep-memory"]])
 def test_benchmark_prints_its_tables(make_onnx, monkeypatch, capsys, options):

@@ -6,17 +6,9 @@ import torch
 
 from semfov import InputError, Objects, merge_boxes
 from semfov.detection.objects import _survivors, merge_looks
+from tests.small import area, shared
 
 SIZE = (1000, 800)
-
-
-def shared(a, b):
-    """Area that two boxes share."""
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
-
-
-def area(box):
-    return (box[2] - box[0]) * (box[3] - box[1])
 
 
 def plain(rows, turn=None):

@@ -7,14 +7,7 @@ from torchvision.ops import batched_nms, nms
 from semfov.detection import Candidates, Selection, letterbox
 from semfov.detection.selection import select, suppress
 from semfov.errors import InputError
-from tests.small import Fixed
-
-
-def overlap(a, b) -> float:
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    common = max(width, 0) * max(height, 0)
-    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
+from tests.small import Fixed, iou
 
 
 def brute_force(boxes, confidence, labels, selection) -> list[int]:
@@ -23,7 +16,7 @@ def brute_force(boxes, confidence, labels, selection) -> list[int]:
         if boxes[i][2] <= boxes[i][0] or boxes[i][3] <= boxes[i][1]:
             continue
         rivals = [j for j in kept if not selection.per_class or labels[i] == labels[j]]
-        if all(overlap(boxes[i], boxes[j]) <= selection.iou for j in rivals):
+        if all(iou(boxes[i], boxes[j]) <= selection.iou for j in rivals):
             kept.append(i)
     return kept[: selection.limit]
 

@@ -62,10 +62,8 @@ MODELS = {
     ),
 }
 NAMED = {
-    "fasterrcnn_resnet50_fpn": SMALL | {"box_score_thresh": 0.2},
     "fasterrcnn_mobilenet_v3_large_320_fpn": SMALL | {"box_score_thresh": 0.2},
     "retinanet_resnet50_fpn_v2": SMALL | {"score_thresh": 0.1},
-    "fcos_resnet50_fpn": SMALL | {"score_thresh": 0.1},
     LITE: {"score_thresh": 0.25},
 }
 

@@ -5,6 +5,7 @@ import csv
 import pytest
 
 from tests.lab.commands.table import small_run
+from tests.small import cells_of
 
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
@@ -29,7 +30,7 @@ def test_run_writes_tables_sums_and_figures(finished):
     assert "6 searches" in text
     assert "4 of them for a class that is present" in text
     assert "half of the target classes are present" in text
-    by_looks = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
+    by_looks = cells_of(text)
     for row in whole:
         figures = [f"{float(row[name]):.4f}" for name in ("nll", "brier", "ece", "mean_probability", "rate")]
         shown = next(line for line in by_looks if line[:2] == [row["looks"], row["belief"]])

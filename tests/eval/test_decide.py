@@ -12,6 +12,7 @@ from semfov.decision import OUTCOMES
 from semfov.metrics.presence import area_under_roc
 from semfov.runs.tables import mean_or_dash, share
 from tests.lab.commands.table import small_run
+from tests.small import cells_of
 
 POLICIES = ["target-evidence", "random gaze", "published belief", "published belief, a detection at the gaze"]
 SCORES = ["one unfoveated pass, highest score", "unfoveated pass and its quarters, highest score"]
@@ -20,9 +21,7 @@ REFERENCES = [*SCORES, *PLAIN, "class frequency"]
 
 def rows_of(text):
     """The cells of all tables without their heads and rules."""
-    lines = [line for line in text.splitlines() if line[:1] == "|"]
-    tables = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    return [row for row in tables if not set("".join(row)) <= set("-:") and row[0]]
+    return [row for row in cells_of(text) if not set("".join(row)) <= set("-:") and row[0]]
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from eval.semba import _search_scene, _SembaConfig
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
 from tests.colours import write_home
+from tests.small import cells_of
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_sensors_are_compared_with_models_of_their_own(home, monkeypatch, capsys
     arguments = given(home, "sensors", *fit, *small, "--data.limit", "3")
     assert sensors.main(arguments) == 0
     text = (home / "sensors/summary.md").read_text(encoding="utf-8")
-    head, _, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines())
+    head, _, row = cells_of(text)
     assert row[:2] == ["crops", f"{3 * 64 * 64:,}"]
     # All 16 cells have been visited after 15 shifts.
     assert all(each.startswith("100.0") for name, each in zip(head, row, strict=True) if name.endswith("CP@15"))

@@ -24,7 +24,7 @@ from semfov.fit.map import (
 )
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Given
-from tests.small import looking
+from tests.small import cells_of, looking
 
 GRID = Grid(4, 4, (640, 480))
 CELLS = 16
@@ -163,7 +163,7 @@ def test_a_map_is_evaluated_after_each_number_of_looks_and_reported(examples):
     assert all(math.isfinite(value) for row in judged for value in row.values())
     report = _map_report(judged, 3, 2)
     assert "Trained on 3 photographs and evaluated on 2 held-out" in report
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
+    rows = cells_of(report)[2:]
     for row, cells in zip(judged, rows, strict=True):
         shares = [f"{100 * row[name]:.1f}" for name in ("all", "objects", "objects_without_background")]
         errors = [f"{row[name]:.4f}" for name in ("nll", "ece", "ece_background")]

@@ -30,7 +30,7 @@ from semfov.fit.examples import _ExampleLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.search_protocol import choose_classes
-from tests.small import looking
+from tests.small import cells_of, looking
 
 GRID = Grid(4, 4, (640, 480))
 CELLS = 16
@@ -293,7 +293,7 @@ def test_the_report_has_the_measures_and_the_thresholds():
     report = _evidence_report(judged, Thresholds(0.7, 0.05, 0.4), 8, 3)
     assert "presence is at least 0.700 and that of a fixated cell at least 0.40" in report
     assert "no other cell has a probability of at least 0.05" in report
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
+    rows = cells_of(report)[2:]
     assert rows == [
         [str(row["looks"]), f"{100 * row['found']:.1f}", *(f"{row[name]:.4f}" for name in names[1:])] for row in judged
     ]

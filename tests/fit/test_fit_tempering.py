@@ -6,6 +6,7 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief.observers import Semantic
 from semfov.fit.tempering import hit_rate
+from tests.small import cells_of
 from train.fit_tempering import _tempering_report
 
 
@@ -54,5 +55,5 @@ def test_the_report_has_a_row_for_every_exponent_and_names_the_best():
     """The best one is that of the photographs to choose by."""
     report = _tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
     assert "choose by: 0.25." in report
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
+    rows = cells_of(report)[2:]
     assert rows == [["0.25", "50.00", "10.00"], ["1", "40.00", "30.00"]]

@@ -16,17 +16,12 @@ import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition
 from semfov.gaze.policies import Means, named_policy
+from tests.small import kaplan
 
 LEVELS = 8
 SHAPES = {"wide": (4, 3, (640, 480)), "tall": (2, 5, (300, 500)), "row": (6, 1, (60, 10))}
 # All seeds with few components, one with many.
 CASES = [(shape, components, seed) for shape in SHAPES for components, seed in ((5, 0), (5, 1), (5, 2), (81, 0))]
-
-
-def kaplan(beta, likelihood):
-    """eq:kaplanrule."""
-    expected = (beta * likelihood).sum()
-    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
 
 
 def posterior(beta):

@@ -7,6 +7,7 @@ import torch
 from eval.explore.run import FUSED, PAINTED, _sharp_maps
 from semfov import Detections, Grid
 from semfov.runs.exploration_protocol import counts_of
+from tests.small import kaplan
 
 GRID = Grid(5, 4, (100, 60))
 
@@ -28,12 +29,6 @@ def covers(box, cell):
 def valid_detections(sharp):
     rows = zip(sharp.boxes[0].tolist(), sharp.scores[0].tolist(), sharp.mask[0].tolist(), strict=True)
     return [(box, scores) for box, scores, real in rows if real]
-
-
-def kaplan(beta, likelihood):
-    """Equation 7 of Luzio, Bernardino and Moreno (2024)."""
-    expected = (beta * likelihood).sum()
-    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -12,6 +12,7 @@ from eval.explore import report as explore_report
 from eval.search import report as search_report
 from semfov.metrics.exploration import success_rate
 from semfov.runs.tables import percent
+from tests.small import cells_of
 
 # Gaze shift at which each search found its target (-1: not found), by image and repetition.
 FOUND = {"one": [0, 1, -1], "two": [1, 1, 2], "three": [-1, 2, 0]}
@@ -80,10 +81,6 @@ def test_the_last_column_is_the_largest_error_over_repetitions():
 
 def first_and_last(curve):
     return [(curve.mean[shift], curve.over_images[shift]) for shift in (0, 2)]
-
-
-def cells_of(text):
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
 
 
 def test_search_tables_have_a_row_for_each_policy_and_no_durations():

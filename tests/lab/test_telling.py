@@ -9,6 +9,7 @@ from eval.comparison.telling import Telling, _tells, calibrated, class_frequenci
 from eval.presence import hits_at
 from semfov import EmbeddedScenes
 from semfov.metrics.presence import area_under_roc
+from tests.small import cells_of
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def test_differences_are_those_of_the_rows_with_smaller_errors_than_unpaired(sea
     told, there, scenes, right = searches
     nearly = told["sharp"] + 1e-3 * there
     telling = Telling({**told, "nearly sharp": nearly}, there, scenes, right)
-    heads, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in telling.differences("sharp")]
+    heads, _, *rows = cells_of("\n".join(telling.differences("sharp")))
     assert heads[0] == "difference to sharp"
     assert [row[0] for row in rows] == ["blunt", "nearly sharp"]
     apart, error = numbers(rows[0][1])

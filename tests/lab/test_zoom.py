@@ -31,7 +31,7 @@ from semfov.zoom.episode import look_by_look
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import ranked, slices
-from tests.small import Tiles
+from tests.small import Tiles, cells_of
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_the_number_in_all_is_compared_with_the_annotated_one():
     ]
     others = [{"objects": 4, "after": {"1": {"in all": None}, "4": {"in all": None}}}]
     text = in_all_table([*others, *ours], ["1", "4"])
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text if line.startswith("|")]
+    rows = cells_of("\n".join(text))
     assert rows[-4:-2] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
     assert rows[-2:] == [["its error", "0.5", "1.0"], ["within two errors", "0.50", "1.00"]]
     assert "There are 4.0 in the mean." in text[0]

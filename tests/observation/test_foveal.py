@@ -4,7 +4,6 @@ Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of t
 """
 
 import json
-import math
 import struct
 import warnings
 
@@ -70,34 +69,8 @@ def test_likelihoods_match_dirichlets_of_scipy(dtype, tolerance):
             assert float(got[i, j, k]) == pytest.approx(expected, rel=tolerance, abs=tolerance)
 
 
-def test_large_parameters_stay_accurate_in_single_precision():
-    alpha = torch.tensor([9e3, 1e3, 10.0])[None, None].repeat(3, 2, 1)
-    alpha[1, :, 0] += 30
-    scores, distance = torch.tensor([0.9, 0.099, 0.001]), torch.tensor(0.0)
-    exact = FovealObservationModel(alpha.double(), [0.1], ["a", "b"]).log_likelihood(scores.double(), distance)
-    got = FovealObservationModel(alpha, [0.1], ["a", "b"]).log_likelihood(scores, distance)
-    torch.testing.assert_close(got.double(), exact, rtol=0, atol=0.02)
-
-
-def density_by_the_formula(scores, alpha):
-    """Equation 9 (eq:dirichlet) in scalars."""
-    powers = math.prod(s ** (a - 1) for s, a in zip(scores, alpha, strict=True))
-    return math.gamma(sum(alpha)) / math.prod(math.gamma(a) for a in alpha) * powers
-
-
-def test_calibrated_scores_match_equation_11():
-    """eq:corrected_scores: the densities of all classes at the box's distance, divided by their sum D."""
-    model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
-    got = model.calibrate(scores, distance).detach()
-    for i, j in np.ndindex(5, 7):
-        level = sum(float(distance[i, j]) > edge for edge in EDGES)
-        densities = [density_by_the_formula(scores[i, j].tolist(), table()[k, level].tolist()) for k in range(4)]
-        expected = [density / sum(densities) for density in densities]
-        np.testing.assert_allclose(got[i, j], expected, rtol=1e-9, atol=0)
-
-
 def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
-    """Beyond the paper, in which the prior is uniform and τ is 1."""
+    """Equation 11 (eq:corrected_scores), in which the prior is uniform and τ is 1, and beyond."""
     alpha, scores, distance = table(), *looks()
     log_prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     model = FovealObservationModel(alpha, EDGES, CLASSES, log_prior=log_prior, tempering=0.3)
@@ -186,21 +159,6 @@ def test_fit_recovers_the_dirichlets_from_many_samples(method):
     assert float(model.log_prior.abs().max()) == 0
     reference = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics)
     torch.testing.assert_close(model.alpha, reference.alpha, rtol=2e-6, atol=0)
-
-
-def test_a_fit_without_shrinkage_maximises_the_likelihood():
-    """Section III-C, the fit of the paper, against scipy's maximum of the logarithm of equation 9."""
-    rows = np.random.default_rng(6).dirichlet([2.0, 0.7, 4.0, 1.5], 60)
-    statistics = DirichletStatistics((4, 3), 4)
-    here = torch.ones(60, dtype=torch.int64)
-    statistics.update(torch.from_numpy(rows), (here * 2, here))
-    alpha, _ = _fit_table(statistics, shrinkage=1e-9, minimum=0)
-
-    def loss(x):
-        return -scipy.stats.dirichlet(np.exp(x)).logpdf(rows.T).mean()
-
-    best = scipy.optimize.minimize(loss, np.zeros(4), options={"gtol": 1e-9})
-    np.testing.assert_allclose(alpha[2, 1], np.exp(best.x), rtol=1e-4)
 
 
 def test_cells_with_few_samples_follow_their_class():

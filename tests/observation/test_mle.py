@@ -122,14 +122,6 @@ def test_a_bound_on_the_precision_gives_the_constrained_maximum():
     np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_constant_component_is_fitted_like_any_other(method):
-    rest = torch.from_numpy(np.random.default_rng(3).dirichlet([2.0, 3.0, 1.0], 40)) * 0.7
-    mean_log = torch.cat([torch.full((40, 1), 0.3, dtype=torch.float64), rest], 1).log().mean(0)
-    alpha = mle(mean_log, method=method)
-    torch.testing.assert_close(expected_logs(alpha), mean_log, rtol=0, atol=1e-8)
-
-
 def test_zeros_are_refused_unless_they_are_floored():
     scores = torch.tensor([[0.0, 0.4, 0.6], [0.0, 0.7, 0.3]], dtype=torch.float64)
     with pytest.raises(InputError, match=r"mean_log.*finite"):
@@ -169,19 +161,6 @@ def test_gradients_of_the_optimum_are_correct():
     assert torch.autograd.gradcheck(mle, (mean_log,), rtol=1e-4)
     bounded = torch.tensor([[0.7, 0.2, 0.1]], dtype=torch.float64).log().requires_grad_()
     assert torch.autograd.gradcheck(lambda g: mle(g - 1e-3, max_precision=50.0), (bounded,), rtol=1e-4)
-
-
-def test_fixed_point_equals_the_limit_of_minkas_iteration():
-    """ψ(α_k) = ψ(Σ α_old) + mean ln s_k (Minka, 2000, equation 9), round by round with scipy's ψ and a root finder."""
-
-    def inverse(y):
-        return scipy.optimize.brentq(lambda x: scipy.special.digamma(x) - y, 1e-6, 1e3)
-
-    mean_log = np.log(np.random.default_rng(7).dirichlet([1.5, 0.6, 2.5], 80)).mean(0)
-    alpha = np.ones(3)
-    for _ in range(400):
-        alpha = np.array([inverse(y) for y in scipy.special.digamma(alpha.sum()) + mean_log])
-    np.testing.assert_allclose(mle(torch.from_numpy(mean_log), method="fixed_point"), alpha, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

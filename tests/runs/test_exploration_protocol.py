@@ -15,7 +15,7 @@ from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise, run_explorations
 from semfov.strategy import Strategy
-from tests.small import FixedLook
+from tests.small import FixedLook, kaplan
 
 GRID = Grid(4, 3, (80, 60))
 NOTHING = Detections.empty(12, 3)
@@ -57,12 +57,6 @@ def explored(explorer, *, starts, shifts, batch=100, index=0, looks=None):
     looks = StoredLooks(NOTHING, GRID) if looks is None else looks
     options = {"shifts": shifts, "batch": batch}
     return episodes, noise, run_explorations(episodes, explorer, looks, ANSWERS, noise, **options)
-
-
-def kaplan(beta, likelihood):
-    """Equation 7 of Luzio, Bernardino and Moreno (2024)."""
-    expected = (beta * likelihood).sum()
-    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
 
 
 def from_prior(beta):

@@ -22,6 +22,7 @@ from semfov.zoom.certainty import FACTS, Certainty, object_facts
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, merge_with_facts
+from tests.small import area, iou, shared
 
 SCALES = torch.tensor([0.25, 0.5, 1.0, 0.5])
 WINDOWS = torch.tensor([[0.0, 0, 400, 300], [0, 0, 200, 200], [50, 50, 150, 150], [100, 100, 300, 300]])
@@ -31,19 +32,6 @@ SIZE = (400, 300)
 def logit(score):
     score = min(max(score, 0.01), 0.999)
     return math.log(score / (1 - score))
-
-
-def shared(a, b):
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
-
-
-def area(box):
-    return (box[2] - box[0]) * (box[3] - box[1])
-
-
-def iou(a, b):
-    both = shared(a, b)
-    return both / (area(a) + area(b) - both)
 
 
 def visible(box, look):
