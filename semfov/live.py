@@ -3,15 +3,21 @@
 from typing import Any, get_args
 
 from semfov.agents.episode import Episode, without_none
-from semfov.agents.fovea import RATE, FoveaAgent, FoveaEpisode
+from semfov.agents.fovea import FoveaAgent, FoveaEpisode
 from semfov.agents.picture import open_picture
-from semfov.agents.windows import WINDOW_RATE, ZoomAgent
+from semfov.agents.windows import ZoomAgent
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.tone import White, check_white
 from semfov.errors import check, lookup
 from semfov.paths import Moment
 
 __all__ = ["LivePerception"]
+
+_FOVEA_RATE = 0.1
+"""Default rate at which the belief of a fovea fades, per frame."""
+
+_WINDOW_RATE = 0.03
+"""Default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames."""
 
 
 class LivePerception:
@@ -82,9 +88,9 @@ class LivePerception:
         }
         self._episodes: dict[str, Episode[Any]] = {
             "fovea": FoveaEpisode(
-                fovea, target, rate=RATE if rate is None else rate, start=start, seed=seed, **settings
+                fovea, target, rate=_FOVEA_RATE if rate is None else rate, start=start, seed=seed, **settings
             ),
-            "windows": windows.episode(target, targets, rate=WINDOW_RATE if rate is None else rate, **settings),
+            "windows": windows.episode(target, targets, rate=_WINDOW_RATE if rate is None else rate, **settings),
         }
         self._check_start()
 

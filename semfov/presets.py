@@ -13,10 +13,10 @@ from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
-from semfov.errors import check, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
-from semfov.io.compatibility import check_shipped_sensor, learned_for
+from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
@@ -27,12 +27,31 @@ from semfov.zoom import GlimpseEvidence
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
+_FIT = "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
+
+_SHIPPED_SIGMA = 100.0
+"""Width σ of the fovea that learned models are shipped for, in pixels of an image whose longer side is 640."""
+
+_SHIPPED_GROWTHS = (1.0, 2.0)
+"""Growths of the fovea that learned models are shipped for."""
+
+
+def _check_shipped_sensor(sigma: float, growth: float) -> None:
+    """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
+    if growth not in _SHIPPED_GROWTHS:
+        growths = " and ".join(f"{value:g}" for value in _SHIPPED_GROWTHS)
+        raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
+    if sigma != _SHIPPED_SIGMA:
+        raise InputError(
+            f"sigma: models are shipped for {_SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
+        )
+
 
 def recommended_arguments(
     name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
 ) -> dict[str, Any]:
     """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
-    check_shipped_sensor(sigma, growth)
+    _check_shipped_sensor(sigma, growth)
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(Foveation(sigma, growth=growth), detector)

@@ -6,10 +6,21 @@ from typing import Any
 from torch import nn
 
 from semfov.belief.observers import AnyOf, Observer
-from semfov.belief.observers.any_of import TargetLike, weights_by_class
+from semfov.belief.observers.any_of import TargetLike
 from semfov.data.classes import class_index
 from semfov.errors import check
 from semfov.gaze.policies import NonPredictive, Policy, Random
+
+
+def _weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
+    """Weights by class index for a target that is any of several classes."""
+    check(len(target) > 0, "target", "a class, or several classes with weights", "none")
+    weights: dict[int, float] = {}
+    for name, weight in target.items():
+        index = class_index(name, classes, "target")
+        check(index not in weights, "target", "each class once", f"{classes[index - 1]!r} twice")
+        weights[index] = weight
+    return weights
 
 
 class Strategy(nn.Module):
@@ -29,7 +40,7 @@ class Strategy(nn.Module):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
         by_target: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
-        weights, policy = weights_by_class(by_target, classes[1:]), self.policy
+        weights, policy = _weights_by_class(by_target, classes[1:]), self.policy
         suits = isinstance(policy, NonPredictive | Random) or policy.by_place
         check(
             suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(by_target)

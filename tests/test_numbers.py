@@ -19,15 +19,15 @@ import torch
 
 from examples.look_graph import OPSET
 from semfov import FovealObservationModel
-from semfov.agents.fovea import RATE
 from semfov.agents.head import _CONFIRM
-from semfov.agents.windows import LIKELY, WINDOW_RATE
+from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.decision import MOST_CLOSER
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
+from semfov.live import _FOVEA_RATE, _WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.closer import PART, PhotographPlaces
@@ -188,8 +188,8 @@ KNOWN = {
     "docs/guides/live.md": {
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
-        f"{log(2) / WINDOW_RATE:.0f} by default": "code",
-        f"rate, {RATE}": "code",
+        f"{log(2) / _WINDOW_RATE:.0f} by default": "code",
+        f"rate, {_FOVEA_RATE}": "code",
         "40 of the fitting": "videos of the table",
         "20 frames": "videos of the table",
     },
@@ -201,7 +201,6 @@ KNOWN = {
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
 }
 """Numbers that no table has, each with the reason; those that are settings are written here by the code."""
-
 
 _SMALL = "(?:one|two|three|four|five|six|seven|eight|nine|ten)"
 IN_WORDS = re.compile(

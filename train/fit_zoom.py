@@ -21,6 +21,7 @@ import torch
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.windows import (
+    PICTURE_KINDS,
     FitZoomConfig,
     RefitPart,
     _figures_of,
@@ -38,7 +39,6 @@ from semfov.fit.windows import (
     training_looks,
 )
 from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
-from semfov.fit.windows_kinds import PICTURE_KINDS
 from semfov.io.files import inside
 from semfov.runs.command import command
 from semfov.runs.setup import make_scenes

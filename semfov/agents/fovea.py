@@ -33,14 +33,11 @@ from semfov.episode import LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Choice, Greedy, drawn_by, first_cell
+from semfov.gaze.choice import Choice, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath, Stimulus, Trace
 from semfov.paths.stimulus import in_bytes
 from semfov.strategy import Strategy
-
-RATE = 0.1
-"""Default rate at which the belief of a fovea fades, per frame."""
 
 _WORTH = 0.1
 """Default least gain of a look in an exploration by a learned map: the expected increase in the number of correctly
@@ -137,6 +134,16 @@ class FoveaAgent:
         return model if closer and model is not None and model.thresholds is not None else None
 
 
+def _first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
+    """The first cell of an episode, and the generator that breaks its ties."""
+    check_whole(seed, "seed", 0, 2**63 - 1)
+    generator = torch.Generator().manual_seed(int(seed))
+    if start is None:
+        return int(torch.randint(cells, (1,), generator=generator)), generator
+    check_whole(start, "start", 0, cells - 1)
+    return int(start), generator
+
+
 class FoveaEpisode(Episode[Scanpath]):
     r"""Looks of a fovea, with one gaze shift or one closer look for each pass of the detector.
 
@@ -206,7 +213,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self.to_goal = False
         self._most = sys.maxsize if shifts is None else shifts + 1
         columns, rows = agent.cells
-        self._first = first_cell(cell_at(start, agent.cells), seed, columns * rows)
+        self._first = _first_cell(cell_at(start, agent.cells), seed, columns * rows)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None
         self._outcome, self._faded, self._frame = 0, 0.0, 0.0

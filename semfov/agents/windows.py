@@ -43,9 +43,6 @@ LIKELY = 0.5
 _NEW_OBJECTS = 0.01
 """Default for the least number of new objects that a look must be expected to find."""
 
-WINDOW_RATE = 0.03
-"""Default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames."""
-
 _Picture = LargePicture | ImageLike
 
 

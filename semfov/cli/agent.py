@@ -95,10 +95,3 @@ def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str
     names = [name.strip() for name in text.split(",") if name.strip()]
     check(bool(names), "target", "a class, or several with commas", repr(text))
     return names if classes is None else [classes[class_index(name, classes, "target") - 1] for name in names]
-
-
-def one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
-    """The class that a text names, None for none; without names of classes it is not checked."""
-    if text is None or classes is None:
-        return text
-    return classes[class_index(text, classes, "target") - 1]

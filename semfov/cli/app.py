@@ -6,8 +6,9 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from html import escape
 from itertools import cycle
 from typing import Any
@@ -17,12 +18,16 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from semfov.agent import ActivePerception
+from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
-from semfov.cli.own_looks import OwnLooks, grid_of, look_at_cells
+from semfov.data.classes import class_index
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
+from semfov.episode import LiveLooks, rollout
 from semfov.errors import DataError, InputError, SemfovError
+from semfov.gaze.choice import Given
+from semfov.paths import GazeRecord, Scanpath, Stimulus, Trace, detections_in_words
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
@@ -86,6 +91,29 @@ def launched(page: Any, host: str, port: int | None) -> str:
     return str(address)
 
 
+def _grid_of(agent: ActivePerception, image: Tensor) -> Grid:
+    """The agent's cells over a picture `(3, H, W)`."""
+    return Grid(agent.columns, agent.rows, (image.shape[-1], image.shape[-2]))
+
+
+def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
+    """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
+    fovea, grid, index = agent.fovea, _grid_of(agent, image), class_index(target, agent.classes[1:], "target")
+    strategy, mapper = fovea.searching, fovea.exploring.observer
+    with torch.inference_mode():
+        looks = LiveLooks(agent.eye, agent.eye.open(image[None]), grid, index)
+        beside = None if mapper is strategy.observer else mapper
+        trace = Trace(grid, agent.classes, index, beside, agent.eye.detector.least)
+        policy, order = strategy.policy(index, grid), torch.tensor([[*cells]])
+        for step in rollout(looks, strategy.observer, policy, order[:, 0], Given(order), most=len(cells)):
+            trace.add(step)
+        step = trace.steps[-1]
+        left = step.values[0].masked_fill(step.visited[0], -torch.inf)
+        record = trace.scanpath(stimulus=Stimulus.of(agent.eye, image[None]))
+        own = agent.search(image, target, how="fovea", start=cells[0], shifts=len(cells) - 1, closer=0)
+    return _OwnLooks(record, int(left.argmax()), own)
+
+
 class _Calls:
     """What the page calls; refusals are shown on it."""
 
@@ -113,8 +141,8 @@ class _Calls:
             image = as_image(_given(picture), argument="picture")
             scale = image.shape[-1] / _reduced(image).width
             point = torch.tensor([[side * scale for side in event.index]])
-            cells = [*cells, int(grid_of(self.agent, image).cell_of(point)[0])]
-            looked = look_at_cells(self.agent, image, _one(target, self.classes), cells)
+            cells = [*cells, int(_grid_of(self.agent, image).cell_of(point)[0])]
+            looked = _look_at_cells(self.agent, image, _one(target, self.classes), cells)
             return cells, _clicked(image, looked), _seen(looked), _believed(looked), looked.describe()
 
     def fresh(self, picture: Any) -> tuple[Any, ...]:
@@ -220,7 +248,37 @@ def _reduced(image: Tensor) -> Image.Image:
     return picture
 
 
-def _clicked(image: Tensor, looked: OwnLooks) -> Image.Image:
+@dataclass(frozen=True)
+class _OwnLooks:
+    """The looks of a person, the cell that the agent would look at next, and its own looks from the same start."""
+
+    record: Scanpath
+    advice: int
+    agent: GazeRecord
+
+    @property
+    def point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, where the agent would look next."""
+        x, y = self.record.grid.centres[self.advice].tolist()
+        return x, y
+
+    def describe(self) -> str:
+        """What the last look showed, what the belief is, and what the agent did, in lines of Markdown."""
+        record, target = self.record, self.record.target_name
+        seen = detections_in_words(record.looks[-1].detections, record.classes)
+        assert record.presence is not None
+        chances, (x, y) = record.presence.tolist(), self.point
+        before = f", {chances[-2]:.2f} before it" if len(chances) > 1 else ""
+        lines = [
+            f"**Look {len(record)}** shows {seen}.",
+            f"The probability that the picture holds “{target}” is {chances[-1]:.2f} after it{before}.",
+            f"The agent would look next at ({x:.0f}, {y:.0f}): the orange ring.",
+            f"The agent itself, from your first look and in as many looks: {self.agent.describe()}.",
+        ]
+        return "\n\n".join(lines)
+
+
+def _clicked(image: Tensor, looked: _OwnLooks) -> Image.Image:
     """The picture with numbered looks, and a ring where the agent would look next."""
     picture = _reduced(image)
     draw, scale = ImageDraw.Draw(picture), picture.width / image.shape[-1]
@@ -237,7 +295,7 @@ def _clicked(image: Tensor, looked: OwnLooks) -> Image.Image:
     return picture
 
 
-def _seen(looked: OwnLooks) -> Image.Image:
+def _seen(looked: _OwnLooks) -> Image.Image:
     """The foveated picture of the last look, with its detections of at least 0.1."""
     record = looked.record
     view = record.views()[-1]
@@ -254,6 +312,6 @@ def _seen(looked: OwnLooks) -> Image.Image:
     return picture
 
 
-def _believed(looked: OwnLooks) -> Any:
+def _believed(looked: _OwnLooks) -> Any:
     """The probability of the target in each cell after the last look."""
     return render([plot_belief(looked.record, -1)], dpi=110)[0]

@@ -9,8 +9,8 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import closing, redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import closing, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -22,7 +22,7 @@ from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
-from semfov.cli.results import STDOUT, ResultsFile, check_places, kind_of
+from semfov.cli.results import STDOUT, ResultsFile, kind_of
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.cli.truth import read_truth
@@ -34,12 +34,13 @@ from semfov.io.files import sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord
+from semfov.paths.georeference import georeference
 from semfov.report import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
 from semfov.runs.setup import prepare_worker
-from semfov.runs.workers import run_tasks, worth_starting
+from semfov.runs.workers import available_cores, run_tasks
 
 
 class PictureJob(ABC):
@@ -141,6 +142,16 @@ def _outcome(number: int) -> PictureOutcome | SemfovError:
     return _process["job"].outcome(number)
 
 
+def _check_places(files: Sequence[Path | None]) -> None:
+    """Raise `InputError` where only some of the pictures have a place on earth, as one collection has one unit."""
+    kinds: dict[bool, Path | None] = {}
+    for file in files:
+        with suppress(DataError):  # it is skipped when it is opened
+            kinds.setdefault(file is not None and georeference(str(file)) is not None, file)
+    got = f"{kinds.get(True)} with one and {kinds.get(False)} without; look at them apart, or write .json"
+    check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
+
+
 @dataclass
 class _PictureFiles:
     """Files that a command writes about its pictures: results, figures and a page."""
@@ -161,7 +172,7 @@ class _PictureFiles:
             return
         kind = kind_of(out)
         if kind == ".geojson":
-            check_places([source.file for source in self.job.sources])
+            _check_places([source.file for source in self.job.sources])
         file = out if kind is not None else out / "results.json"
         searched = self.job.title.startswith("search")
         self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream, truth=self.job.truth)
@@ -279,6 +290,16 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     return [outputs.rows[number] for number in range(len(sources))]
 
 
+def _worth_starting(processes: int | None, tasks: int, seconds: float, start: float) -> int:
+    """The number of processes for tasks of some seconds; 1 where starting them would take longer than they save.
+
+    >>> worth_starting(2, 7, 0.5, 4.0), worth_starting(2, 99, 0.5, 4.0)
+    (1, 2)
+    """
+    most = min(available_cores() if processes is None else processes, tasks)
+    return most if most > 1 and tasks * seconds * (1 - 1 / most) > start else 1
+
+
 def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tuple[int, PictureOutcome | SemfovError]]:
     """The outcomes of all pictures with their numbers, first those that are there, then the others as they are made."""
     yield from before.items()
@@ -292,7 +313,7 @@ def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tu
         start = time.process_time()
         first = left.pop(0)
         yield first, job.outcome(first)
-        where = worth_starting(where, len(left), time.process_time() - start, start)
+        where = _worth_starting(where, len(left), time.process_time() - start, start)
     done = run_tasks(
         _outcome,
         left,

@@ -9,8 +9,9 @@ from pathlib import Path
 from time import perf_counter
 
 from semfov.agents.fovea import cell_at
-from semfov.cli.agent import detector_classes, make_agent, one_class, several_classes
+from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, start_of, white_of
+from semfov.data.classes import class_index
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.live import LivePerception
@@ -48,9 +49,16 @@ def look_live(options: LiveOptions) -> int:
     return 0
 
 
+def _one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
+    """The class that a text names, None for none; without names of classes it is not checked."""
+    if text is None or classes is None:
+        return text
+    return classes[class_index(text, classes, "target") - 1]
+
+
 def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:
     """The class that is searched for, or the list of those whose objects are all to be found."""
-    return one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
+    return _one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
 
 
 def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from semfov.agents.picture import PictureLike
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
-from semfov.cli.results import kind_of, result_row
+from semfov.cli.results import kind_of
 from semfov.cli.sources import PictureSource
 from semfov.cli.text import looks_text, outcome_text, plain_name
-from semfov.cli.truth import read_truth
+from semfov.cli.truth import Truth, read_truth
+from semfov.data.classes import canonical_name
 from semfov.paths import GazeRecord, Scanpath
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief_bars, plot_belief_strip
@@ -44,6 +45,41 @@ class PictureOutcome:
         return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
 
 
+def _result_row(
+    record: GazeRecord,
+    name: str,
+    seconds: float,
+    kind: str | None,
+    file: Path | None = None,
+    truth: Truth | None = None,
+) -> dict[str, Any]:
+    """Make the entry of a picture in a file of results."""
+    picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+    row: dict[str, Any] = {"picture": {key: value for key, value in picture.items() if key not in ("looks", "summary")}}
+    if kind == ".geojson":
+        collection = record.to_geojson(source=file)
+        row["coordinates"] = collection["coordinates"]
+        row["parts"] = [
+            {**each, "properties": {"picture": name, **each["properties"]}} for each in collection["features"]
+        ]
+    elif truth is not None:
+        sought = picture["targets"] or record.classes[1:]
+        row["image_id"] = truth.image_id(name, (picture["width"], picture["height"]))
+        row["categories"] = truth.categories(sought)
+        ids = {canonical_name(each["name"]): each["id"] for each in row["categories"]}
+        # Objects of other classes cannot be judged; their number is not that of a category.
+        numbers = [ids.get(canonical_name(each), -1) for each in record.classes[1:]]
+        results = record.to_coco(row["image_id"], numbers)
+        row["parts"] = [each for each in results if each["category_id"] != -1]
+    elif kind == ".coco.json":
+        row["categories"] = _categories(record.classes[1:])
+        row["parts"] = [
+            {**each, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
+            for each in record.to_coco(0, row["categories"])
+        ]
+    return row
+
+
 def picture_outcome(
     record: GazeRecord,
     opened: PictureLike,
@@ -59,7 +95,7 @@ def picture_outcome(
     episode = None
     kind = None if options.out is None else kind_of(options.out)
     truth = None if options.annotations is None else read_truth(options.annotations)
-    row = result_row(record, source.name, seconds, kind, source.file, truth)
+    row = _result_row(record, source.name, seconds, kind, source.file, truth)
     if options.report is not None:
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.
@@ -105,3 +141,13 @@ def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[D
             film: Any = record.animate(boxes=boxes)
             drawn += film.save(Path(folder) / "animation.gif")
         return {path.name: path.read_bytes() for path in drawn}
+
+
+def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Categories of the classes: COCO's own, or numbers from 1 if COCO has not all of them."""
+    from semfov.paths.conversion import coco_categories
+
+    categories = coco_categories()
+    if {canonical_name(name) for name in classes} <= {canonical_name(each["name"]) for each in categories}:
+        return categories
+    return [{"id": number, "name": name} for number, name in enumerate(classes, 1)]

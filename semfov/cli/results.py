@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli.truth import Truth
-from semfov.data.classes import canonical_name
-from semfov.errors import DataError, check
+from semfov.errors import check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
-from semfov.paths import GazeRecord
 from semfov.paths.conversion import COLUMNS
-from semfov.paths.georeference import georeference
 
 _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
 """Ends of the names of files of results."""
@@ -45,51 +40,6 @@ def kind_of(path: Path) -> str | None:
     fits = kind is not None or not path.suffix or path.is_dir()
     check(fits, "out", f"a folder, or a file that ends in {', '.join(_RESULT_KINDS)}", path)
     return kind
-
-
-def check_places(files: Sequence[Path | None]) -> None:
-    """Raise `InputError` where only some of the pictures have a place on earth, as one collection has one unit."""
-    kinds: dict[bool, Path | None] = {}
-    for file in files:
-        with suppress(DataError):  # it is skipped when it is opened
-            kinds.setdefault(file is not None and georeference(str(file)) is not None, file)
-    got = f"{kinds.get(True)} with one and {kinds.get(False)} without; look at them apart, or write .json"
-    check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
-
-
-def result_row(
-    record: GazeRecord,
-    name: str,
-    seconds: float,
-    kind: str | None,
-    file: Path | None = None,
-    truth: Truth | None = None,
-) -> dict[str, Any]:
-    """Make the entry of a picture in a file of results."""
-    picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
-    row: dict[str, Any] = {"picture": {key: value for key, value in picture.items() if key not in ("looks", "summary")}}
-    if kind == ".geojson":
-        collection = record.to_geojson(source=file)
-        row["coordinates"] = collection["coordinates"]
-        row["parts"] = [
-            {**each, "properties": {"picture": name, **each["properties"]}} for each in collection["features"]
-        ]
-    elif truth is not None:
-        sought = picture["targets"] or record.classes[1:]
-        row["image_id"] = truth.image_id(name, (picture["width"], picture["height"]))
-        row["categories"] = truth.categories(sought)
-        ids = {canonical_name(each["name"]): each["id"] for each in row["categories"]}
-        # Objects of other classes cannot be judged; their number is not that of a category.
-        numbers = [ids.get(canonical_name(each), -1) for each in record.classes[1:]]
-        results = record.to_coco(row["image_id"], numbers)
-        row["parts"] = [each for each in results if each["category_id"] != -1]
-    elif kind == ".coco.json":
-        row["categories"] = _categories(record.classes[1:])
-        row["parts"] = [
-            {**each, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
-            for each in record.to_coco(0, row["categories"])
-        ]
-    return row
 
 
 class ResultsFile:
@@ -192,13 +142,3 @@ def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
         {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
         for row in [*rows, *({"class": name} for name in missing)]
     ]
-
-
-def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Categories of the classes: COCO's own, or numbers from 1 if COCO has not all of them."""
-    from semfov.paths.conversion import coco_categories
-
-    categories = coco_categories()
-    if {canonical_name(name) for name in classes} <= {canonical_name(each["name"]) for each in categories}:
-        return categories
-    return [{"id": number, "name": name} for number, name in enumerate(classes, 1)]

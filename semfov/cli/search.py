@@ -12,19 +12,32 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TextIO, get_args, get_type_hints
 
+import torch
+
 from semfov.agent import ActivePerception
 from semfov.agents.picture import PictureLike
+from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.episodes import PictureJob, look_at_pictures
 from semfov.cli.options import Drawing, ExploreOptions, FindOptions, PictureOptions, SearchOptions, start_of
 from semfov.cli.results import STDOUT, kind_of
-from semfov.cli.sources import PictureSource, start_beside
+from semfov.cli.sources import PictureSource
 from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check, check_options, lookup
 from semfov.io.files import check_writable
 from semfov.paths import GazeRecord
 from semfov.report.page import page_path
+
+
+def _start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
+    """A random first cell off the target of an embedded scene; None for other pictures."""
+    if source.scene is None or source.boxes is None:
+        return None
+    grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))
+    free = (~grid.footprint(source.boxes).any(0)).nonzero()[:, 0]
+    generator = torch.Generator().manual_seed(seed)
+    return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
 
 
 class _SearchJob(PictureJob):
@@ -60,7 +73,7 @@ class _SearchJob(PictureJob):
                   file=sys.stderr)  # fmt: skip
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         beside = self.start is None and kind == "fovea"
-        start = start_beside(agent, source, options.seed) if beside else self.start
+        start = _start_beside(agent, source, options.seed) if beside else self.start
         return agent.search(picture, aim, start=start, **settings, **shared)
 
 
@@ -113,7 +126,6 @@ _JOBS: dict[type[PictureOptions], Callable[..., PictureJob]] = {
 }
 
 _TASKS: dict[str, type[PictureOptions]] = {"search": SearchOptions, "find": FindOptions, "explore": ExploreOptions}
-
 
 _turn = threading.Lock()
 """Calls of several threads take turns: a process has one job, and one standard output."""

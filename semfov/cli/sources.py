@@ -9,17 +9,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
-from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
-from semfov.belief.grid import Grid
 from semfov.cli.options import GazeOptions, PictureOptions, shown_by
 from semfov.data.large import open_large, picture_size
-from semfov.data.sources import Picture, is_video, picture_files
+from semfov.data.sources import Picture, picture_files
 from semfov.errors import check, printable
 from semfov.head import Flat, Panorama
+
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 class PictureSource(NamedTuple):
@@ -57,6 +56,11 @@ class PictureSource(NamedTuple):
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
 
+def _is_video(source: Path) -> bool:
+    """Tell by its name whether a file is a video."""
+    return source.suffix.lower() in _VIDEOS and not source.is_dir()
+
+
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: list[PictureSource] = []
@@ -70,18 +74,8 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
         there = path.exists() or bool(path.suffix) or len(path.parts) > 1
         expected = f"a file or folder (a class is given by --target {name})"
         check(there, "picture", expected, f"{name}, which does not exist")
-        check(not is_video(path), "picture", "photographs; `semfov live` takes videos", name)
+        check(not _is_video(path), "picture", "photographs; `semfov live` takes videos", name)
         for each in picture_files(path, recursive=options.recursive):
             place = each.relative_to(path) if path.is_dir() else Path(each.name)
             sources.append(PictureSource(printable(str(each)), each, place=place, shown=shown))
     return sources
-
-
-def start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
-    """A random first cell off the target of an embedded scene; None for other pictures."""
-    if source.scene is None or source.boxes is None:
-        return None
-    grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))
-    free = (~grid.footprint(source.boxes).any(0)).nonzero()[:, 0]
-    generator = torch.Generator().manual_seed(seed)
-    return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None

@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
-from semfov.data.images import read_sized
+from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Coverage, Scene, legal_targets
 from semfov.errors import DataError, check
 from semfov.io.files import check_regular, json_sha256, sha256
@@ -157,6 +158,26 @@ def _show(entry: dict[str, Any], key: str) -> str:
 _log = logging.getLogger(__name__)
 
 
+def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
+    """Read an image file in the orientation in which it was annotated.
+
+    That is upright, or as stored where only the stored pixels have the recorded size.
+
+    Shapes: size `(width, height)` → `(3, height, width)`.
+    """
+    image = read_image(path)
+    if image.shape[-2:] == size[::-1]:
+        return image
+    height, width = image.shape[-2:]
+    image = read_image(path, oriented=False)
+    if image.shape[-2:] != size[::-1]:
+        raise DataError(
+            f"image {path}: expected {size[0]} × {size[1]} pixels as annotated, got {width} × {height}; "
+            f"use the image that the annotations were made for"
+        )
+    return image
+
+
 class CocoScenes:
     """Photographs with COCO annotations, selected by the criteria of the published experiments.
 
@@ -260,7 +281,7 @@ class CocoScenes:
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
         annotation = self.annotation(index)
-        image = read_sized(self._files[index], annotation.size)
+        image = _read_sized(self._files[index], annotation.size)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 

@@ -208,26 +208,6 @@ def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
 
 
-def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
-    """Read an image file in the orientation in which it was annotated.
-
-    That is upright, or as stored where only the stored pixels have the recorded size.
-
-    Shapes: size `(width, height)` → `(3, height, width)`.
-    """
-    image = read_image(path)
-    if image.shape[-2:] == size[::-1]:
-        return image
-    height, width = image.shape[-2:]
-    image = read_image(path, oriented=False)
-    if image.shape[-2:] != size[::-1]:
-        raise DataError(
-            f"image {path}: expected {size[0]} × {size[1]} pixels as annotated, got {width} × {height}; "
-            f"use the image that the annotations were made for"
-        )
-    return image
-
-
 def _check_pixels(size: tuple[int, int], name: str) -> None:
     width, height = size
     if not 0 < width * height <= MAX_PIXELS:

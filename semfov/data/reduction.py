@@ -11,9 +11,6 @@ from torch.utils.dlpack import from_dlpack
 
 PixelBox = tuple[int, int, int, int]
 
-LARGE = 1 << 24
-"""Pictures with more pixels have copies."""
-
 _STRIP = 1 << 23
 """Pixels that are read at once for a copy."""
 

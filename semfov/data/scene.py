@@ -1,6 +1,5 @@
 """Scenes (images with the boxes of their objects), the interface of their sets, and composed and chosen sets."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape
-from semfov.io.files import json_sha256
 
 Coverage = Literal["sum", "union"]
 
@@ -251,14 +249,3 @@ class ChosenScenes:
         """Compute a sha256 of everything that the pixels of a scene depend on."""
         scenes, place = self._chosen[index]
         return scenes.digest(place)
-
-
-def crowded(scenes: Scenes, share: float) -> ChosenScenes:
-    """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
-    check(0 < share <= 1, "share", "above 0 and at most 1", share)
-    check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
-    counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
-    order = sorted(range(len(scenes)), key=lambda index: -counts[index])
-    chosen = sorted(order[: math.ceil(share * len(scenes))])
-    ids: list[int] | list[str] = [scenes.ids[index] for index in chosen]  # type: ignore[assignment]
-    return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))

@@ -41,7 +41,6 @@ _WIDE = {int.from_bytes(code, "little") for code in (b"Y1\0\x10", b"Y16 ")}
 """Codes of frames of 16 bits, grey, of FFmpeg and of a camera."""
 
 _PLAYLIST = b"#EXTM3U"
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 class Picture(NamedTuple):
@@ -80,11 +79,6 @@ def _check_there(source: Path) -> None:
     """Raise `DataError` where a file or folder does not exist; a link to nothing is one that cannot be read."""
     if not source.exists() and not source.is_symlink():
         raise DataError(f"picture: no such file or folder: {source}; check the path")
-
-
-def is_video(source: Path) -> bool:
-    """Tell by its name whether a file is a video."""
-    return source.suffix.lower() in _VIDEOS and not source.is_dir()
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:

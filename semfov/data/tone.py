@@ -82,11 +82,3 @@ def sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]
         for column in range(_ACROSS):
             x, y = (length * (1 + 2 * n) // (2 * _ACROSS) for length, n in zip(size, (column, row), strict=True))
             yield x, y, min(x + _SIDE, width), min(y + _SIDE, height)
-
-
-def check_bands(bands: int | Sequence[int] | None) -> None:
-    """Raise `InputError` for what are no numbers of one band or of three."""
-    if bands is not None:
-        numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
-        fits = len(numbers) in (1, 3) and all(type(each) is int and each >= 1 for each in numbers)
-        check(fits, "bands", "the number of a band, or three for red, green and blue, from 1", bands)

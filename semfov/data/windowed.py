@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import MAX_PIXELS, UNKNOWN, quiet_decoders, warn_of_range
-from semfov.data.reduction import LARGE, OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
+from semfov.data.reduction import OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
 from semfov.data.tone import White, black_and_white, sample_windows
 from semfov.errors import DataError, SemfovError, check
 from semfov.io.files import check_regular
@@ -27,6 +27,9 @@ ChosenBands = int | Sequence[int] | None
 TILED = (".tif", ".tiff")
 BY_WINDOWS = (*TILED, *RASTERS)
 """Ends of the names of files that may be read by windows, and whose bands can be chosen."""
+
+_LARGE = 1 << 24
+"""Pictures with more pixels have copies."""
 
 
 class LargePicture(ABC):
@@ -43,7 +46,7 @@ class LargePicture(ABC):
 
     def reduction(self, ratio: float, oversampling: float = OVERSAMPLING) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
-        many = self.size[0] * self.size[1] > LARGE
+        many = self.size[0] * self.size[1] > _LARGE
         reduction = reduction_for(ratio, oversampling) if many else 1
         return reduction if reduction >= self._first else 1
 
@@ -57,7 +60,7 @@ class LargePicture(ABC):
         Shapes: → `(3, h, w)`.
         """
         self._inside(box)
-        if reduction < self._first or self.size[0] * self.size[1] <= LARGE:
+        if reduction < self._first or self.size[0] * self.size[1] <= _LARGE:
             return bytes_of(self.pixels(box))
         return self._copies.window(box, reduction)
 

@@ -22,8 +22,6 @@ from semfov.io.files import sha256, write_bytes
 
 Runtime = Literal["auto", "torch", "onnxruntime"]
 
-RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
-
 _VERSION = 1
 """Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
 

@@ -9,11 +9,30 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from semfov.detection.exchange import SCORES, category_ids, coco_results, named_detections, vectors_of
-from semfov.errors import InputError, check, check_shape
+from semfov.detection.exchange import category_ids, coco_results, named_detections
+from semfov.errors import InputError, check, check_shape, check_whole
 
 if TYPE_CHECKING:
     import supervision
+
+
+_SCORES = "scores"
+"""Name of the full score vectors in a library that can store further data with its boxes."""
+
+
+def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
+    """Score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1) each; the rest is background."""
+    check_whole(classes, "classes", 1, 10**6)
+    scores = torch.ones(len(labels), device=labels.device) if scores is None else scores
+    scores = scores if scores.is_floating_point() else scores.float()
+    check_shape(scores, "scores", len(labels))
+    inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
+    check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
+    # The comparison also refuses NaN.
+    check(bool(((scores >= 0) & (scores <= 1)).all()), "scores", "numbers from 0 to 1", scores.tolist()[:3])
+    vectors = scores.new_zeros(len(labels), classes + 1)
+    vectors[:, 0] = 1 - scores
+    return vectors.scatter(1, labels[:, None], scores[:, None])
 
 
 @dataclass(frozen=True)
@@ -159,7 +178,7 @@ class Detections:
         if classes is not None:
             count = vectors.shape[-1] - 1
             check(len(classes) == count, "classes", f"{count} names, without background", len(classes))
-        return named_detections(boxes, labels, scores, classes, {SCORES: vectors.numpy()})
+        return named_detections(boxes, labels, scores, classes, {_SCORES: vectors.numpy()})
 
     @classmethod
     def from_supervision(cls, detections: supervision.Detections, classes: int) -> Self:
@@ -180,7 +199,7 @@ class Detections:
         """
         boxes = torch.as_tensor(detections.xyxy).reshape(-1, 4)
         boxes = boxes if boxes.is_floating_point() else boxes.float()
-        full = detections.data.get(SCORES)
+        full = detections.data.get(_SCORES)
         if full is not None:
             vectors = torch.as_tensor(full)
             shape = (len(boxes), classes + 1)
@@ -191,7 +210,7 @@ class Detections:
         labels = torch.as_tensor([] if detections.class_id is None else detections.class_id).long() + 1
         confidence = detections.confidence
         return cls._one_image(
-            boxes, vectors_of(labels, None if confidence is None else torch.as_tensor(confidence), classes)
+            boxes, _vectors_of(labels, None if confidence is None else torch.as_tensor(confidence), classes)
         )
 
     def to_torchvision(self) -> dict[str, Tensor]:
@@ -225,7 +244,7 @@ class Detections:
         for name in ("boxes", "labels"):
             check(name in detections, "detections", f"the key {name!r}", f"the keys {sorted(detections)}")
         labels = detections["labels"]
-        return cls._one_image(detections["boxes"], vectors_of(labels.long(), detections.get("scores"), classes))
+        return cls._one_image(detections["boxes"], _vectors_of(labels.long(), detections.get("scores"), classes))
 
     def to_coco(
         self,

@@ -11,13 +11,10 @@ import torch
 from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
-from semfov.errors import InputError, check, check_shape, check_whole
+from semfov.errors import InputError, check
 
 if TYPE_CHECKING:
     import supervision
-
-SCORES = "scores"
-"""Name of the full score vectors in a library that can store further data with its boxes."""
 
 
 def named_detections(
@@ -45,21 +42,6 @@ def coco_results(
         {"image_id": image_id, "category_id": ids[label], "bbox": box, "score": score}
         for label, box, score in zip(labels.tolist(), placed, scores.double().tolist(), strict=True)
     ]
-
-
-def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
-    """Score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1) each; the rest is background."""
-    check_whole(classes, "classes", 1, 10**6)
-    scores = torch.ones(len(labels), device=labels.device) if scores is None else scores
-    scores = scores if scores.is_floating_point() else scores.float()
-    check_shape(scores, "scores", len(labels))
-    inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
-    check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
-    # The comparison also refuses NaN.
-    check(bool(((scores >= 0) & (scores <= 1)).all()), "scores", "numbers from 0 to 1", scores.tolist()[:3])
-    vectors = scores.new_zeros(len(labels), classes + 1)
-    vectors[:, 0] = 1 - scores
-    return vectors.scatter(1, labels[:, None], scores[:, None])
 
 
 def category_ids(

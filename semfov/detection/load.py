@@ -14,7 +14,6 @@ from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
 from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.detector import Detector
-from semfov.detection.modules import comes_from
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
@@ -99,17 +98,26 @@ def _loader(name: str) -> Callable[..., Detector]:
     return load_yolo
 
 
+def _comes_from(module: object, package: str) -> bool:
+    """Tell whether the class of an object, or a class that it inherits from, is defined in a package.
+
+    >>> comes_from(nn.Linear(1, 1), "torch.nn"), comes_from(nn.Linear(1, 1), "torchvision")
+    (True, False)
+    """
+    return any(f"{kind.__module__}.".startswith(f"{package}.") for kind in type(module).__mro__)
+
+
 def _wrapper(model: nn.Module) -> Callable[..., Detector]:
     """The function that makes a detector of a module (in memory, not a copy), which is known by its class."""
-    if comes_from(model, "torchvision.models.detection"):
+    if _comes_from(model, "torchvision.models.detection"):
         from semfov.detection.torchvision import wrap_torchvision
 
         return wrap_torchvision
-    if comes_from(model, "transformers.models"):
+    if _comes_from(model, "transformers.models"):
         from semfov.detection.transformers import wrap_transformers
 
         return wrap_transformers
-    if comes_from(model, "ultralytics"):
+    if _comes_from(model, "ultralytics"):
         from semfov.detection.ultralytics import wrap_ultralytics
 
         return wrap_ultralytics

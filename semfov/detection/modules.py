@@ -92,12 +92,3 @@ def module_digest(module: nn.Module) -> str:
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
             digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def comes_from(module: object, package: str) -> bool:
-    """Tell whether the class of an object, or a class that it inherits from, is defined in a package.
-
-    >>> comes_from(nn.Linear(1, 1), "torch.nn"), comes_from(nn.Linear(1, 1), "torchvision")
-    (True, False)
-    """
-    return any(f"{kind.__module__}.".startswith(f"{package}.") for kind in type(module).__mro__)

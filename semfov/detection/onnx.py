@@ -14,14 +14,7 @@ from torch import Tensor
 from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
-from semfov.detection.onnx_file import (
-    check_canvas,
-    check_elements,
-    model_digest,
-    network_steps,
-    read_settings,
-    with_input_size,
-)
+from semfov.detection.onnx_file import check_canvas, check_elements, network_steps, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, misplaced, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
@@ -30,7 +23,7 @@ from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
 from semfov.io.compatibility import NETWORKS
-from semfov.io.files import sha256
+from semfov.io.files import inside, json_sha256, sha256
 from semfov.io.schema import excerpt
 
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
@@ -187,6 +180,16 @@ class OnnxDetector(Detector):
         return super().settings() | own | ({} if providers is None else {"providers": list(providers)})
 
 
+def _model_digest(path: Path) -> str:
+    """sha256 of a model's file; with weights in other files, of all of them."""
+    import onnx
+
+    stored = onnx.load(path, load_external_data=False).graph.initializer
+    others = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
+    digests = [sha256(path), *(sha256(inside(path.parent, name)) for name in sorted(others))]
+    return digests[0] if len(digests) == 1 else json_sha256(digests)
+
+
 def load_onnx(
     name_or_path: str | PathLike[str],
     *,
@@ -273,7 +276,7 @@ def load_onnx(
         logits=chosen.get("logits", False),
         background=chosen.get("background"),
         selection=Selection(threshold, iou, limit, per_class),
-        digest=model_digest(file),
+        digest=_model_digest(file),
     )
 
 

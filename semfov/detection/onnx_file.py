@@ -12,15 +12,13 @@ from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_heads import cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, inside, json_sha256, sha256, write_bytes
+from semfov.io.files import check_regular, inside, sha256, write_bytes
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _MOST_ELEMENTS = 2**28
 """Largest number of elements of a tensor in a model; 1 GiB as float32."""
 _MOST_METADATA = 2**20
 """Largest number of characters of a model's metadata."""
-MOST_BATCH = 1024
-"""Largest fixed batch size of a model."""
 _MOST_PIXELS = 89_478_485
 """Largest number of pixels of a canvas, the same as for pictures that are read."""
 _USUAL_SIDE = 640
@@ -83,16 +81,6 @@ def check_file(path: Path) -> bool:
     steps = {node.op_type for node in model.graph.node}
     made = {name for node in model.graph.node for name in node.output if name}
     return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
-
-
-def model_digest(path: Path) -> str:
-    """sha256 of a model's file; with weights in other files, of all of them."""
-    import onnx
-
-    stored = onnx.load(path, load_external_data=False).graph.initializer
-    others = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
-    digests = [sha256(path), *(sha256(inside(path.parent, name)) for name in sorted(others))]
-    return digests[0] if len(digests) == 1 else json_sha256(digests)
 
 
 def check_elements(name: str, sizes: Iterable[int]) -> None:
@@ -246,16 +234,6 @@ def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int], strides:
     for output in graph.output:
         for side in output.type.tensor_type.shape.dim[1:2]:
             side.Clear()
-
-
-def with_outputs(path: Path, names: Iterable[str]) -> bytes:
-    """The content of a model with further tensors among its outputs; weights in other files stay there."""
-    import onnx
-
-    model = onnx.load(path, load_external_data=False)
-    have = {output.name for output in model.graph.output}
-    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names if name not in have)
-    return model.SerializeToString()
 
 
 def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[NetworkStep]:

@@ -2,7 +2,7 @@
 
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from os import PathLike, fspath
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.onnx_file import MOST_BATCH, check_file, with_outputs
+from semfov.detection.onnx_file import check_file
 from semfov.errors import DataError, InputError, check
 
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -23,7 +23,6 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
 }
 
-
 _MOST_MEMORY = 2**29
 """Bytes for the tensors of models whose sizes depend on values, all together."""
 _MOST_SECONDS = 10.0
@@ -33,6 +32,19 @@ _MOST_REASON = 400
 
 Provider = str | tuple[str, Mapping[str, Any]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
+
+_MOST_BATCH = 1024
+"""Largest fixed batch size of a model."""
+
+
+def _with_outputs(path: Path, names: Iterable[str]) -> bytes:
+    """The content of a model with further tensors among its outputs; weights in other files stay there."""
+    import onnx
+
+    model = onnx.load(path, load_external_data=False)
+    have = {output.name for output in model.graph.output}
+    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names if name not in have)
+    return model.SerializeToString()
 
 
 class OnnxSession:
@@ -77,7 +89,7 @@ class OnnxSession:
             # onnxruntime's fallback would print messages and try the same again.
             model: str | bytes = fspath(path)
             if further:
-                model = with_outputs(self.path, further)
+                model = _with_outputs(self.path, further)
                 folder = "session.model_external_initializers_file_folder_path"
                 options.add_session_config_entry(folder, fspath(self.path.parent))
             self._session = ort.InferenceSession(model, options, providers=chosen, disable_fallback=1)
@@ -97,7 +109,7 @@ class OnnxSession:
             self.image, self.shape, self._dtype, self._extra = self._inputs()
         except UnicodeDecodeError as error:
             raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are not text ({error})") from None
-        check((self.shape[0] or 1) <= MOST_BATCH, "batch", f"at most {MOST_BATCH} images at once", self.shape[0])
+        check((self.shape[0] or 1) <= _MOST_BATCH, "batch", f"at most {_MOST_BATCH} images at once", self.shape[0])
 
     def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
         """Name, shape and dtype of the image input, and the names of the other inputs."""

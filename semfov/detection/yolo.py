@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_onnx import RUNTIMES, OnnxTwin, Runtime, network_digest
+from semfov.detection.darknet_onnx import OnnxTwin, Runtime, network_digest
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, recorded
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
@@ -41,6 +41,9 @@ def decode_yolo(
     return Candidates(boxes.reshape(batch, -1, 4), scores[..., 1:].flatten(1, 3), scores[..., 0].flatten(1))
 
 
+_RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
+
+
 class YoloV3(Detector):
     """A Darknet network with YOLOv3 heads as a `Detector`.
 
@@ -69,7 +72,7 @@ class YoloV3(Detector):
         digest: str = "",
         runtime: Runtime = "torch",
     ) -> None:
-        check(runtime in RUNTIMES, "runtime", " or ".join(map(repr, RUNTIMES)), repr(runtime))
+        check(runtime in _RUNTIMES, "runtime", " or ".join(map(repr, _RUNTIMES)), repr(runtime))
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
         whole = all(n > 0 and n % network.stride == 0 for n in size)

@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from dataclasses import asdict, fields, replace
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from semfov.agent import ActivePerception
 from semfov.data.coco import category_names
 from semfov.detection.class_names import UnnamedClasses
 from semfov.errors import DataError, InputError
-from semfov.fit.detector_report import class_counts, detector_report, next_commands
 from semfov.fit.evidence import EvidenceFit
 from semfov.fit.map import MapFit
 from semfov.fit.observation import ObservationFit
@@ -35,7 +34,22 @@ from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import digest_of, finish
 from semfov.runs.settings import plain
 from semfov.runs.setup import check_sources, detector_options, make_detector
+from semfov.runs.tables import table
 from semfov.runs.workers import available_cores
+
+_TITLES = {
+    "observation": "Observation model",
+    "tempering": "Tempering",
+    "evidence": "Target evidence (searches)",
+    "verification": "Verification (closer looks)",
+    "map": "Learned map (explorations)",
+    "windows": "Evidence by magnification (large pictures)",
+}
+"""Titles of the parts in reports."""
+
+_UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
+"""What the agent does without a part that it does not use, other than to use raw scores."""
+
 
 _MOST_FAULTS = 5
 """Largest number of photographs that a message names."""
@@ -113,6 +127,81 @@ def fit_detector(
     return ActivePerception.from_pretrained(out)
 
 
+def _class_counts(run: Looking, scenes: Any) -> dict[str, int]:
+    """Count the objects of each class in the photographs with the given indices."""
+    count = torch.zeros(len(run.scenes.classes) + 1, dtype=torch.int64)
+    for index in scenes:
+        count += torch.bincount(run.scenes.annotation(index).labels, minlength=len(count))
+    return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
+
+
+def _thin_classes(counts: dict[str, int], thin: int) -> list[str]:
+    """Write warnings, as lines of Markdown, about classes with fewer than `thin` objects to learn from."""
+    none = [name for name, count in counts.items() if count == 0]
+    few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
+    lines = []
+    if none:
+        lines += [f"**No object to learn from** ({len(none)} classes): {', '.join(none)}.", ""]
+    if few:
+        lines += [f"**Fewer than {thin} objects to learn from** ({len(few)} classes): {', '.join(few)}.", ""]
+    if lines:
+        lines += [
+            "The target evidence and the map process the scores of all classes with one network; only one number per "
+            "class, its frequency, is separate. The observation model changes the scores of a class without examples "
+            "very little.",
+            "",
+        ]
+    return lines
+
+
+def _detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, PartResult], seconds: float) -> str:
+    """Write the report as Markdown."""
+    photographs = len(run.scenes)
+    holdout = config.holdout or 5
+    held_out = [index for index in range(photographs) if index % holdout == 0]
+    counts = _class_counts(run, (index for index in range(photographs) if index % holdout))
+    rows = [["part", "used", "result on held-out photographs"]]
+    rows += [
+        [_TITLES[name], "yes" if each.part.used else _UNUSED.get(name, "no, raw"), each.part.why]
+        for name, each in results.items()
+    ]
+    lines = [
+        f"# Models of {run.eye.detector.name}",
+        "",
+        f"{photographs} photographs, {len(held_out)} of them held out (one in {holdout}); "
+        f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
+        f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
+        "",
+        "The agent uses a part only if it is better than raw scores by more than one standard error of the paired "
+        "difference over the held-out photographs. The verification is compared with the same agent without closer "
+        "looks, and the evidence by magnification with looks at slices of large pictures in the order of raw scores.",
+        "",
+        *table(rows),
+        "",
+        *_thin_classes(counts, config.thin),
+    ]
+    if len(held_out) < 10:
+        number = "only 1 photograph" if len(held_out) == 1 else f"only {len(held_out)} photographs"
+        lines += [f"The figures are rough, because {number} could be held out.", ""]
+    for name, fitted in results.items():
+        lines += [f"## {_TITLES[name]}", "", fitted.report, ""]
+        lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
+    return "\n".join(lines)
+
+
+def _next_commands(config: FitDetectorConfig, run: Looking) -> str:
+    """Return example commands that use the model folder."""
+    out = fspath(config.out)
+    target = max(_class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]
+    quoted = f'"{target}"' if " " in target else target
+    return "\n".join(
+        [
+            f"  semfov search PHOTO.jpg --target {quoted} --models {out}",
+            f"  semfov find PHOTOS --target {quoted} --models {out} --out found.csv",
+        ]
+    )
+
+
 def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = _with_classes(config.named())
@@ -122,7 +211,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     _check_photographs(run)
     folder = _FolderFit(config, run)
     config, results = folder.inputs.config, folder.inputs.results
-    counts = class_counts(run, range(len(run.scenes)))
+    counts = _class_counts(run, range(len(run.scenes)))
     missing = [name for name, count in counts.items() if not count]
     if missing:
         some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
@@ -149,14 +238,14 @@ def fit_folder(config: FitDetectorConfig) -> None:
             with whole.stage(part):
                 folder.fit(part)
     path = _manifest_of(folder).write(config.out)
-    text = detector_report(config, run, results, time.monotonic() - started)
+    text = _detector_report(config, run, results, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
     figures = [figure for fitted in results.values() for figure in fitted.figures]
     models = [fitted.part.file for fitted in results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
-    print(f"\nnext:\n{next_commands(config, run)}")
+    print(f"\nnext:\n{_next_commands(config, run)}")
 
 
 def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:

@@ -2,19 +2,22 @@
 
 import json
 import logging
+import math
 import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Scenes, crowded
+from semfov.data.scattered import Scattered
+from semfov.data.scene import ChosenScenes, Scenes
+from semfov.errors import check
 from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again
@@ -30,9 +33,9 @@ from semfov.fit.windows_evidence import (
     rate_loss,
     windows_of,
 )
-from semfov.fit.windows_kinds import PICTURE_KINDS, PictureKind, compose_pictures
 from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
 from semfov.fit.windows_verification import fit_closer
+from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
@@ -46,6 +49,24 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
 
 RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "photograph"]
+
+
+def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
+    """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
+    check(0 < share <= 1, "share", "above 0 and at most 1", share)
+    check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
+    counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
+    order = sorted(range(len(scenes)), key=lambda index: -counts[index])
+    chosen = sorted(order[: math.ceil(share * len(scenes))])
+    ids: list[int] | list[str] = [scenes.ids[index] for index in chosen]  # type: ignore[assignment]
+    return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
+
+
+PictureKind = Literal["few", "many", "one class", "photographs", "objects"]
+"""Mosaics of 3 × 3 photographs; of 12 × 12 of half the size; of 8 × 6 that share a class; photographs, and single
+objects of few classes, scattered over one ground."""
+
+PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)
 
 
 @dataclass(frozen=True)
@@ -64,7 +85,7 @@ class FitZoomConfig(FitConfig):
         judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
             search and thresholds; and of the third of them that hold most objects.
         judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
-        kinds: kinds of pictures to fit on beside these mosaics (`semfov.fit.windows_kinds`): `few`, `many`,
+        kinds: kinds of pictures to fit on beside these mosaics (`PictureKind`): `few`, `many`,
             `one class`, `photographs` and `objects`.
         each: number of training pictures of each of these kinds.
         judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
@@ -128,7 +149,6 @@ class FitZoomConfig(FitConfig):
 _OTHER = ("kinds", "each", "judged_each", "tile", "seed")
 """Settings of the pictures that are no mosaics."""
 
-
 _DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
 """Settings that the thresholds and the probability of presence depend on."""
 
@@ -138,10 +158,8 @@ _VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms",
 _COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
 """Settings that the certainty depends on."""
 
-
 _SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
-
 
 _log = logging.getLogger(__name__)
 
@@ -162,9 +180,29 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
         "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
-        "crowded": Mosaics(crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
-        "judged crowded": Mosaics(crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
+        "crowded": Mosaics(_crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
+        "judged crowded": Mosaics(
+            _crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6
+        ),
     }
+
+
+def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
+    """Compose pictures of a kind."""
+    seed += 10 + PICTURE_KINDS.index(kind)
+    half, ground = (tile // 2, tile * 3 // 8), (8 * tile, 9 * tile // 2)
+    match kind:
+        case "few":
+            return Mosaics(scenes, 3, 3, tile=(tile, tile * 3 // 4), count=count, seed=seed)
+        case "many":
+            return Mosaics(scenes, 12, 12, tile=half, count=count, seed=seed)
+        case "one class":
+            return Mosaics(scenes, 8, 6, tile=half, alike=True, count=count, seed=seed)
+        case "photographs":
+            sides = tile // 5, tile
+            return Scattered(scenes, whole=True, size=ground, sides=sides, most=8, count=count, seed=seed)
+        case "objects":
+            return Scattered(scenes, size=ground, sides=(tile // 15, tile // 3), count=count, seed=seed)
 
 
 def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
@@ -172,8 +210,10 @@ def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Sce
     training, held_out = split_photographs(config.data, classes, config.holdout)
     pictures: dict[str, Scenes] = {}
     for kind in PICTURE_KINDS:
-        pictures[kind] = compose_pictures(kind, training, config.each, config.seed, config.tile)
-        pictures[f"judged {kind}"] = compose_pictures(kind, held_out, config.judged_each, config.seed + 20, config.tile)
+        pictures[kind] = _compose_pictures(kind, training, config.each, config.seed, config.tile)
+        pictures[f"judged {kind}"] = _compose_pictures(
+            kind, held_out, config.judged_each, config.seed + 20, config.tile
+        )
     return pictures
 
 

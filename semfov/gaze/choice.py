@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape, check_whole, values_known
+from semfov.errors import check, check_shape, values_known
 
 _Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
@@ -237,16 +237,6 @@ def soft_fixation(
     cell = weights.argmax(-1)
     soft = weights @ centres.to(weights)
     return (centres.to(weights)[cell] + (soft - soft.detach()) if hard else soft), cell
-
-
-def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
-    """The first cell of an episode, and the generator that breaks its ties."""
-    check_whole(seed, "seed", 0, 2**63 - 1)
-    generator = torch.Generator().manual_seed(int(seed))
-    if start is None:
-        return int(torch.randint(cells, (1,), generator=generator)), generator
-    check_whole(start, "start", 0, cells - 1)
-    return int(start), generator
 
 
 def drawn_from(noise: Tensor) -> _Noise:

@@ -10,12 +10,19 @@ from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.head.world import FIELDS, World, check_fields
-from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
+from semfov.sensor.sphere import Camera, Regions, panorama_directions, panorama_points
 
 AROUND = (-180.0, 180.0)
 """Limits of pan of a head that turns all the way round."""
 
 BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
+
+
+def _angle_between(one: Tensor, other: Tensor) -> Tensor:
+    r"""Angle between directions `(..., 3)` of any length in degrees, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
+    one, other = torch.broadcast_tensors(one, other)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
+    return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
 
 
 class Sphere(World):
@@ -103,13 +110,13 @@ class Sphere(World):
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Angle between the optical axes of two cameras."""
         middle = torch.tensor([[0.0, 0.0]])
-        return angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
+        return _angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
         """Angle between the directions of two pixels."""
         camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
         rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
-        return angle_between(*rays)
+        return _angle_between(*rays)
 
     def poses(self, field: float) -> list[list[Tensor]]:
         """Rings of poses around the viewer, or arcs of them between the limits of pan."""

@@ -18,12 +18,6 @@ Files listed under one name are conversions of one checkpoint. YOLOX-nano's were
 NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 """
 
-_SHIPPED_SIGMA = 100.0
-"""Width σ of the fovea that learned models are shipped for, in pixels of an image whose longer side is 640."""
-_SHIPPED_GROWTHS = (1.0, 2.0)
-"""Growths of the fovea that learned models are shipped for."""
-
-_FIT = "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
 
 # Keys that other checks compare, and keys of how a network is computed, which changes its numbers only by rounding.
 # (Models that were fitted before the key `runtime` existed have `winograd`.)
@@ -111,17 +105,6 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
             f"grid: the {what} was fitted on {cells[0]} × {cells[1]} cells and is valid for half to twice as many "
             f"along each side, got {grid[0]} × {grid[1]}; use grid={cells}, or fit models on such a grid (python -m "
             f"train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
-        )
-
-
-def check_shipped_sensor(sigma: float, growth: float) -> None:
-    """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
-    if growth not in _SHIPPED_GROWTHS:
-        growths = " and ".join(f"{value:g}" for value in _SHIPPED_GROWTHS)
-        raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
-    if sigma != _SHIPPED_SIGMA:
-        raise InputError(
-            f"sigma: models are shipped for {_SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
         )
 
 

@@ -8,15 +8,27 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from semfov.errors import DataError, InputError, check
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
-from semfov.io.schema import METADATA, Schema, Text
+from semfov.io.schema import Anything, Object, Schema, Text
 from semfov.io.state import StatedModule, without_settings
-from semfov.io.storage import checksum, find, read, write_file
+from semfov.io.storage import checksum, read, write_file
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")
-_ENVELOPE = Schema({}, {"version": Text(), "metadata": METADATA})
+_METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(others=Anything())}, Anything())
+"""Metadata of a model, which people and `semfov.io.compatibility` read."""
+
+_ENVELOPE = Schema({}, {"version": Text(), "metadata": _METADATA})
+
+
+def _find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
+    """Path of a model: a path (with a folder or `.safetensors`) as it is, else that of the shipped model by name."""
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors" or len(path.parts) > 1:
+        return path
+    names = sorted(file.stem for file in shipped.glob("*.safetensors"))
+    return shipped / f"{lookup(str(name_or_path), names, kind)}.safetensors"
 
 
 class Pretrained(StatedModule):
@@ -76,7 +88,7 @@ class Pretrained(StatedModule):
             InputError: no model of that name is shipped.
             DataError: the file is missing, damaged or of another kind.
         """
-        path = find(name_or_path, cls.shipped, cls.title)
+        path = _find(name_or_path, cls.shipped, cls.title)
         tensors, record = read(path, cls.kind)
         try:
             own = {name: value for name, value in record.items() if name not in _COMMON}

@@ -189,9 +189,6 @@ class Anything(Json):
 CLASSES = Array(Text(), "K", least=1, distinct=True)
 """Names of the K classes of a detector."""
 
-METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(others=Anything())}, Anything())
-"""Metadata of a model, which people and `semfov.io.compatibility` read."""
-
 
 @dataclass(frozen=True)
 class Schema:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.errors import DataError, lookup
+from semfov.errors import DataError
 from semfov.io.files import check_regular, write_bytes
 from semfov.io.schema import Schema
 
@@ -60,15 +60,6 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
-
-
-def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
-    """Path of a model: a path (with a folder or `.safetensors`) as it is, else that of the shipped model by name."""
-    path = Path(name_or_path)
-    if path.suffix == ".safetensors" or len(path.parts) > 1:
-        return path
-    names = sorted(file.stem for file in shipped.glob("*.safetensors"))
-    return shipped / f"{lookup(str(name_or_path), names, kind)}.safetensors"
 
 
 def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> str:

@@ -57,7 +57,6 @@ VALUES: dict[str, Json] = {
 }
 """JSON values of the files of looks at windows."""
 
-
 _NUMBER = (
     "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
     "looks would then show. "

@@ -17,7 +17,6 @@ from semfov.io.files import write_text
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
 from semfov.report.page import colour_steps, filled, json_script, page_path
-from semfov.viz.gaze import MASSES
 from semfov.viz.style import COLOURS, overlay_colours
 
 _FOLDER = Path(__file__).parent
@@ -78,6 +77,10 @@ def _quantised(cells: Tensor) -> str:
     return base64.b64encode(values.tobytes()).decode()
 
 
+_MASSES = (0.8, 0.5, 0.25)
+"""Shares of all fixations that the smallest regions inside the contours hold."""
+
+
 def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
     """SVG paths around the smallest regions that hold given shares of all fixations, in pixels of the picture."""
     from contourpy import contour_generator
@@ -89,7 +92,7 @@ def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
     # An edge of zeros closes the contours at the border of the picture.
     made = contour_generator(x.clip(0, size[0]), y.clip(0, size[1]), np.pad(values, 1))
     ordered = np.sort(values.reshape(-1))[::-1]
-    levels = [ordered[min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)] for mass in MASSES]
+    levels = [ordered[min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)] for mass in _MASSES]
     lines: list[list[NDArray[np.float64]]] = [made.lines(level) for level in levels]  # type: ignore[misc]
     return [
         "".join("M" + "L".join(f"{px:.0f},{py:.0f}" for px, py in line.tolist()) + "Z" for line in several)

@@ -22,7 +22,6 @@ _FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
 _MAPS = _MOST_CHARACTERS // 4
 """Largest number of bytes of the probability maps."""
 
-
 _WIDTH = 640
 """Width of the drawing in pixels of the screen."""
 

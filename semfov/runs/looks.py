@@ -30,20 +30,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
-    """Look at an image from each of several fixations.
-
-    The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
-    share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`): a
-    session of onnxruntime keeps the number of threads that it was opened with.
-
-    Shapes: image `(3, H, W)`, points `(F, 2)`.
-    """
-    with one_thread(), torch.inference_mode():
-        view = eye.open(image[None])
-        return Detections.stack([eye.look(view, point[None]) for point in points])
-
-
 def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | BoxKey], Detections]:
     """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
 

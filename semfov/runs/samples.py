@@ -20,7 +20,7 @@ from semfov.errors import DataError
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import match
-from semfov.runs.looks import look_from
+from semfov.runs.looks import one_thread
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import SceneStore, looks_digest
@@ -100,7 +100,6 @@ _NAMES = (*_DETECTIONS, "scenes", "fixations")
 _SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")
 """Modules that samples depend on, in addition to those of a look."""
 
-
 _Cells = tuple[Grid, Tensor, Tensor]
 CellsOfLook = Callable[[tuple[int, int], Tensor], _Cells]
 """Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
@@ -111,6 +110,20 @@ def all_cells(size: tuple[int, int], fixation: Tensor, cells: tuple[int, int] = 
     """A grid over a whole photograph: every look shows all cells, at their distances from the fixation."""
     grid = Grid(*cells, size)
     return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
+
+
+def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
+    """Look at an image from each of several fixations.
+
+    The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
+    share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`): a
+    session of onnxruntime keeps the number of threads that it was opened with.
+
+    Shapes: image `(3, H, W)`, points `(F, 2)`.
+    """
+    with one_thread(), torch.inference_mode():
+        view = eye.open(image[None])
+        return Detections.stack([eye.look(view, point[None]) for point in points])
 
 
 class Sampler:
@@ -212,5 +225,5 @@ class Sampler:
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", config.seed, scene.id)
         points = torch.rand(config.fixations, 2, generator=generator) * grid.extent - 0.5
-        detections = look_from(cast(Eye, self.eye), scene.image, points)
+        detections = _look_from(cast(Eye, self.eye), scene.image, points)
         return Samples.of(detections, points, self.scenes.annotation(index), index, config.iou)

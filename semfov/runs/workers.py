@@ -100,16 +100,6 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def worth_starting(processes: int | None, tasks: int, seconds: float, start: float) -> int:
-    """The number of processes for tasks of some seconds; 1 where starting them would take longer than they save.
-
-    >>> worth_starting(2, 7, 0.5, 4.0), worth_starting(2, 99, 0.5, 4.0)
-    (1, 2)
-    """
-    most = min(available_cores() if processes is None else processes, tasks)
-    return most if most > 1 and tasks * seconds * (1 - 1 / most) > start else 1
-
-
 def run_tasks(
     function: Callable[[_Task], _Result],
     tasks: Sequence[_Task],

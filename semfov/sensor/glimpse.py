@@ -108,17 +108,6 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     return torch.cat([start, start + side])
 
 
-def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """Magnifications one octave apart, from the one that shows the whole picture up to a finest one."""
-    check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
-    check(finest > 0, "finest", "a positive magnification", finest)
-    whole = min(size[0] / picture[0], size[1] / picture[1])
-    steps = [whole]
-    while steps[-1] * 2 <= finest * (1 + 1e-9):
-        steps.append(steps[-1] * 2)
-    return tuple(steps)
-
-
 class Glimpse(StatedModule):
     """A sensor that shows a window of the picture at a magnification, the module form of `glimpse`.
 

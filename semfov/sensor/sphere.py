@@ -44,13 +44,6 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.stack([column, (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5], -1)
 
 
-def angle_between(one: Tensor, other: Tensor) -> Tensor:
-    r"""Angle between directions `(..., 3)` of any length in degrees, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
-    one, other = torch.broadcast_tensors(one, other)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
-    return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
-
-
 @dataclass(frozen=True)
 class Camera:
     r"""Perspective cameras at the centre of a sphere, which turn and zoom.

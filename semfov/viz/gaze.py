@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MASSES = (0.8, 0.5, 0.25)
-"""Shares of all fixations that the smallest regions inside the contours hold."""
-
 
 @styled
 def plot_gaze(

@@ -25,20 +25,6 @@ _LABELLED = 60  # largest number of objects that have labels
 _SMALL = 5.0  # font size of the labels of many objects
 
 
-def object_entries(record: Record) -> list[LegendEntry]:
-    """Entries of a legend for the objects of a record, and for its closer looks that confirmed none."""
-    sure = record.confirmed
-    name = record.target_name or "objects"
-    count, others = int(sure.sum()), int((~sure).sum())
-    entries = [(FOUND, "-", f"confirmed: {name} ({count})")] if count else []
-    if others:
-        rest = "not confirmed: " if count or record.decision is not None else ""
-        entries.append((TARGET, "-", f"{rest}{name} from {record.threshold_in_words} ({others})"))
-    if record.refuted:
-        entries.append((FOUND, ":", "not confirmed by a closer look"))
-    return entries
-
-
 def draw_objects(
     axes: Axes,
     record: Record,

@@ -23,10 +23,10 @@ from semfov.viz.drawing import (
     draw_view,
     photograph_of,
 )
-from semfov.viz.objects import LegendEntry, draw_legend, draw_objects, object_entries
+from semfov.viz.objects import LegendEntry, draw_legend, draw_objects
 from semfov.viz.path import GazePath, LookPath
 from semfov.viz.semantic import draw_semantic_map, write_names
-from semfov.viz.style import GAZE, TRUTH, lay_out, make_figure, only, root, styled
+from semfov.viz.style import FOUND, GAZE, TARGET, TRUTH, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +34,20 @@ if TYPE_CHECKING:
 
 _MOST_BOXES = 6
 """Largest number of detections of a look that are drawn."""
+
+
+def _object_entries(record: Record) -> list[LegendEntry]:
+    """Entries of a legend for the objects of a record, and for its closer looks that confirmed none."""
+    sure = record.confirmed
+    name = record.target_name or "objects"
+    count, others = int(sure.sum()), int((~sure).sum())
+    entries = [(FOUND, "-", f"confirmed: {name} ({count})")] if count else []
+    if others:
+        rest = "not confirmed: " if count or record.decision is not None else ""
+        entries.append((TARGET, "-", f"{rest}{name} from {record.threshold_in_words} ({others})"))
+    if record.refuted:
+        entries.append((FOUND, ":", "not confirmed by a closer look"))
+    return entries
 
 
 @styled
@@ -87,7 +101,7 @@ def plot_scanpath(
     draw_place(axes, scanpath, image, boxes)
     axes.set_title(scanpath.describe(), parse_math=False)
     outlined = any(scanpath.outline(look) is not None for look in scanpath)
-    entries = [*annotation_entries(scanpath, boxes), *(object_entries(scanpath) if objects else [])]
+    entries = [*annotation_entries(scanpath, boxes), *(_object_entries(scanpath) if objects else [])]
     draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
     lay_out(figure)
     path = LookPath(axes, scanpath)

@@ -10,8 +10,8 @@ from types import ModuleType
 import pytest
 import torch
 
+from semfov.cli.app import _look_at_cells
 from semfov.cli.main import main
-from semfov.cli.own_looks import look_at_cells
 from semfov.data import read_image
 
 NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
@@ -25,7 +25,7 @@ def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, phot
     assert len(own) == 4
     cells = own.cells.tolist()
     for count in (1, 2, 3):
-        looked = look_at_cells(agent, image, "wine glass", cells[:count])
+        looked = _look_at_cells(agent, image, "wine glass", cells[:count])
         assert looked.record.cells.tolist() == cells[:count]
         torch.testing.assert_close(looked.record.presence, own.presence[:count])
         values = own.values[count - 1]
@@ -33,7 +33,7 @@ def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, phot
         assert looked.advice not in cells[:count]
         assert looked.agent.cells.tolist() == cells[:count]
     assert "before it" in looked.describe()
-    assert "before it" not in look_at_cells(agent, image, "wine glass", [3]).describe()
+    assert "before it" not in _look_at_cells(agent, image, "wine glass", [3]).describe()
 
 
 def test_without_gradio_it_is_said_how_to_install_it(monkeypatch, capsys):

@@ -26,7 +26,7 @@ def pixels(height=150, width=230, seed=0):
 @pytest.mark.parametrize("large", [1 << 24, 1 << 15])  # pictures with more pixels are read from reduced copies
 def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch, large):
     tifffile = pytest.importorskip("tifffile")
-    monkeypatch.setattr("semfov.data.windowed.LARGE", large)
+    monkeypatch.setattr("semfov.data.windowed._LARGE", large)
     smooth = Image.fromarray(pixels(8, 8)).resize((450, 330), Image.Resampling.BICUBIC)
     smooth.save(tmp_path / "a.jpg", quality=90)
     with Image.open(tmp_path / "a.jpg") as image:

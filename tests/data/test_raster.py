@@ -23,7 +23,7 @@ def rasterio():
 @pytest.fixture
 def large(monkeypatch):
     """Small pictures are large."""
-    monkeypatch.setattr("semfov.data.windowed.LARGE", 4700)
+    monkeypatch.setattr("semfov.data.windowed._LARGE", 4700)
 
 
 def write(rasterio, path, array, overviews=(), **options):

@@ -16,7 +16,7 @@ from tests.data.test_large import pixels
 def strips(monkeypatch):
     """Small pictures are large, and are read in strips of 20 or 24 rows."""
     monkeypatch.setattr("semfov.data.reduction._STRIP", 4700)
-    monkeypatch.setattr("semfov.data.windowed.LARGE", 4700)
+    monkeypatch.setattr("semfov.data.windowed._LARGE", 4700)
 
 
 def ramps(height, width):

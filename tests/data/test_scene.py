@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data import Annotation, EmbeddedScenes, Scene, box_coverage, legal_targets
-from semfov.data.scene import crowded
 from semfov.errors import InputError
+from semfov.fit.windows import _crowded
 
 
 @st.composite
@@ -54,7 +54,7 @@ def test_size_is_width_and_height():
 
 def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
     scenes = EmbeddedScenes(("person", "cat", "dog"), count=9, seed=3)
-    most = crowded(scenes, 0.4)
+    most = _crowded(scenes, 0.4)
     counts = {name: len(scenes.annotation(index).boxes) for index, name in enumerate(scenes.ids)}
     assert len(most) == len(most.ids) == 4  # 3.6 rounded up
     assert len(set(counts.values())) > 1
@@ -65,7 +65,7 @@ def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
 
 def test_a_scene_is_that_of_the_set():
     scenes = EmbeddedScenes(("person", "cat", "dog"), count=6, seed=3)
-    most = crowded(scenes, 0.5)
+    most = _crowded(scenes, 0.5)
     for index, name in enumerate(most.ids):
         place = scenes.ids.index(name)
         assert torch.equal(most[index].image, scenes[place].image)
@@ -73,10 +73,10 @@ def test_a_scene_is_that_of_the_set():
         assert most.targets(index) == scenes.targets(place)
         assert most.digest(index) == scenes.digest(place)
     assert most.classes == scenes.classes
-    assert len({most.fingerprint, scenes.fingerprint, crowded(scenes, 0.3).fingerprint}) == 3
+    assert len({most.fingerprint, scenes.fingerprint, _crowded(scenes, 0.3).fingerprint}) == 3
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.5, float("nan")])
 def test_a_share_outside_its_range_is_refused(share):
     with pytest.raises(InputError, match="share: expected above 0"):
-        crowded(EmbeddedScenes(("person",), count=2), share)
+        _crowded(EmbeddedScenes(("person",), count=2), share)

@@ -4,9 +4,9 @@ from torch import nn
 
 from semfov import ActivePerception
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.darknet_onnx import RUNTIMES
 from semfov.detection.load import check_detector, detector_name, load_detector
 from semfov.detection.placement import resize
+from semfov.detection.yolo import _RUNTIMES
 from semfov.errors import DataError, InputError
 
 
@@ -24,7 +24,7 @@ def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
     image = torch.rand(1, 3, 64, 96)
     exact = load_detector(small_cfg, **options, dtype=torch.float64).propose(image)
     assert exact.boxes.dtype == torch.float64
-    for runtime in RUNTIMES:
+    for runtime in _RUNTIMES:
         proposed = load_detector(small_cfg, **options, runtime=runtime).propose(image)
         torch.testing.assert_close(proposed.boxes.double(), exact.boxes, atol=1e-3, rtol=1e-4)
 

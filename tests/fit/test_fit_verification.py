@@ -30,7 +30,7 @@ from semfov.fit.verification import (
 )
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.io.storage import read
-from semfov.runs.looks import look_from
+from semfov.runs.samples import _look_from
 from semfov.runs.store import cell_store
 from tests.small import CLASSES, Blobs
 
@@ -174,7 +174,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
 
     def stored(index):
         calls.append(index)
-        return look_from(eye, scenes[index].image, live[index].grid.centres)
+        return _look_from(eye, scenes[index].image, live[index].grid.centres)
 
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
     found = open_photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)

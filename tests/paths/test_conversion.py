@@ -17,7 +17,7 @@ from pycocotools.cocoeval import COCOeval
 from torchvision.utils import draw_bounding_boxes
 
 from semfov import Detections, Grid, InputError
-from semfov.cli.results import check_places
+from semfov.cli.episodes import _check_places
 from semfov.data.large import open_large
 from semfov.errors import DataError
 from tests import small
@@ -202,8 +202,8 @@ def test_a_system_without_a_place_gives_pixels_and_control_points_a_place(record
     ring = points["features"][1]["geometry"]["coordinates"][0]
     np.testing.assert_allclose(ring[0], [11.0, 46.0], atol=1e-8)
     with pytest.raises(InputError, match=r"out: expected pictures that all have .*points\.tif with one"):
-        check_places([*names, None])
-    check_places([names[0], None])
+        _check_places([*names, None])
+    _check_places([names[0], None])
 
 
 def test_a_georeference_needs_rasterio(record, tmp_path, monkeypatch):

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from semfov.errors import InputError
-from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
+from semfov.head.sphere import _angle_between
+from semfov.sensor.sphere import Camera, Regions, panorama_directions, panorama_points
 
 yaws = st.floats(-720, 720)
 pitches = st.floats(-90, 90)
@@ -62,7 +63,7 @@ def test_the_centre_of_a_view_has_the_direction_of_yaw_and_pitch():
     expected = [math.cos(lat) * math.sin(lon), -math.sin(lat), math.cos(lat) * math.cos(lon)]
     np.testing.assert_allclose(middle, expected, atol=1e-12)
     edge = seen.directions(torch.tensor([[-0.5, 25.0]], dtype=torch.float64))[0]
-    np.testing.assert_allclose(angle_between(middle, edge), 40, atol=1e-9)
+    np.testing.assert_allclose(_angle_between(middle, edge), 40, atol=1e-9)
 
 
 @given(pitches, pitches)
@@ -70,7 +71,7 @@ def test_angles_between_directions_equal_scipy(one, other):
     a, b = (Rotation.from_euler("X", angle, degrees=True) for angle in (one, other))
     ahead = np.array([0.0, 0.0, 1.0])
     expected = math.degrees((a.inv() * b).magnitude())
-    found = angle_between(*(torch.from_numpy(turned.apply(ahead)) for turned in (a, b)))
+    found = _angle_between(*(torch.from_numpy(turned.apply(ahead)) for turned in (a, b)))
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

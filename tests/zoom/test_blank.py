@@ -27,7 +27,7 @@ def scan(height=600, width=900, colour=(255, 255, 255), seed=0):
 @pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (12, 200, 90)])
 @pytest.mark.parametrize("large", [1 << 24, 1 << 15])  # pictures with more pixels are read from reduced copies
 def test_blank_cells_are_those_whose_pixels_are_all_blank(monkeypatch, colour, large):
-    monkeypatch.setattr("semfov.data.windowed.LARGE", large)
+    monkeypatch.setattr("semfov.data.windowed._LARGE", large)
     array, blank = scan(colour=colour)
     lattice = Lattice.over((900, 600), CANVAS)
     cells = blank_cells(open_large(array), lattice)

@@ -10,7 +10,6 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer, own
 from semfov.belief.target_evidence import Thresholds
-from semfov.data.classes import class_index
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_number
 
@@ -144,14 +143,3 @@ class AnyOf(Observer):
 def class_meant(belief: Belief, target: int) -> int:
     """The class that a search is about: the likeliest one of several (`AnyBelief.likeliest`), otherwise the target."""
     return int(belief.likeliest()) if isinstance(belief, AnyBelief) else target
-
-
-def weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
-    """Weights by class index for a target that is any of several classes."""
-    check(len(target) > 0, "target", "a class, or several classes with weights", "none")
-    weights: dict[int, float] = {}
-    for name, weight in target.items():
-        index = class_index(name, classes, "target")
-        check(index not in weights, "target", "each class once", f"{classes[index - 1]!r} twice")
-        weights[index] = weight
-    return weights

@@ -16,13 +16,13 @@ from semfov.data.fixations.suspicions import warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.conditional import auc, nss
+from semfov.metrics.scanpath.density import _people_density
 from semfov.metrics.scanpath.multimatch import multimatch
 from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
 from semfov.paths import GazeRecord
 
 _CELLS = 8
-_BLUR = 0.03
 _LONGEST = 64
 _STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 
@@ -165,7 +165,7 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
     def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
         def whole(points: FixationValues, others: Sequence[FixationValues]) -> float:
             columns, rows = (max(1, round(side * _LONGEST / max(size))) for side in size)
-            density = people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
+            density = _people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
             x, y = ((inside(points) + 0.5) * (np.array([columns, rows]) / np.array(size)) - 0.5).T
             return _mean(score(density, x, y).tolist())
 
@@ -183,16 +183,6 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
         "NSS": mapped(nss),
         "AUC": mapped(auc),
     }
-
-
-def people_density(points: FixationValues, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """A map of `(rows, columns)`, a Gaussian of 3 % of its longer side around each point; points `(n, 2)`."""
-    rows, columns = (np.arange(side) for side in shape)
-    x, y = ((points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5).T
-    width = 2 * (_BLUR * max(shape)) ** 2
-    across = np.exp(-((columns[:, None] - x) ** 2) / width)
-    down = np.exp(-((rows[:, None] - y) ** 2) / width)
-    return np.asarray(down @ across.T)
 
 
 def _mean(values: Sequence[float]) -> float:

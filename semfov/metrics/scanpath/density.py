@@ -5,14 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semfov.data.fixations.record import Fixations
+from semfov.data.fixations.record import Fixations, FixationValues
 from semfov.data.fixations.suspicions import warn_outside
 from semfov.errors import check
-from semfov.metrics.scanpath.beside import people_density
 from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
 from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity
 from semfov.paths.gaze import GazePrediction
+
+_BLUR = 0.03
+
+
+def _people_density(points: FixationValues, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """A map of `(rows, columns)`, a Gaussian of 3 % of its longer side around each point; points `(n, 2)`."""
+    rows, columns = (np.arange(side) for side in shape)
+    x, y = ((points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5).T
+    width = 2 * (_BLUR * max(shape)) ** 2
+    across = np.exp(-((columns[:, None] - x) ** 2) / width)
+    down = np.exp(-((rows[:, None] - y) ** 2) / width)
+    return np.asarray(down @ across.T)
 
 
 def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> dict[str, float]:
@@ -26,7 +38,7 @@ def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> 
     cells = prediction.cells.double().numpy()
     ratio = np.array(cells.shape[::-1]) / np.array(prediction.size)
     x, y = ((points + 0.5) * ratio - 0.5).T
-    theirs = people_density(points, prediction.size, cells.shape)
+    theirs = _people_density(points, prediction.size, cells.shape)
     return {
         "NSS": float(nss(cells, x, y).mean()),
         "AUC": float(auc(cells, x, y).mean()),

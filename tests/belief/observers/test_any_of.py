@@ -6,9 +6,9 @@ import torch
 from semfov import Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import AnyOf, Semantic, Target
-from semfov.belief.observers.any_of import weights_by_class
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import InputError
+from semfov.strategy import _weights_by_class
 
 GRID = Grid(5, 4, (100, 60))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
@@ -90,7 +90,7 @@ def test_bad_input(inner):
         with pytest.raises(InputError, match="weights"):
             AnyOf(inner, weights)
     classes = ("cup", "wine glass")
-    assert weights_by_class({"Cups": 1, 2: 0.5}, classes) == {1: 1, 2: 0.5}
+    assert _weights_by_class({"Cups": 1, 2: 0.5}, classes) == {1: 1, 2: 0.5}
     for target, message in (
         ({}, "several"),
         ({"cup": 1, 1: 1}, "twice"),
@@ -98,4 +98,4 @@ def test_bad_input(inner):
         ({99: 1.0}, "^target:"),
     ):
         with pytest.raises(InputError, match=message):
-            weights_by_class(target, classes)
+            _weights_by_class(target, classes)
