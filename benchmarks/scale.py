@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.tables import begin, command, number, page, table, write
+from eval.comparison.records import gather
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import SceneRun, finish, gather
+from semfov.runs.scene_run import SceneRun, finish
 
 TEXT = """\
 Written by `python -m benchmarks.scale`. Each scene has 5 episodes of each of 12 policies, whose records are made

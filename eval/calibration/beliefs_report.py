@@ -12,13 +12,13 @@ from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
 from eval.calibration.cell_figure import plot_cell_reliability
+from eval.comparison.records import gather
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from eval.comparison.records import gather
 from semfov.io.files import inside, replacing, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
@@ -20,7 +21,6 @@ from semfov.io.tables import csv_text
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import gather
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import percent
 from semfov.version import __version__
@@ -138,7 +138,6 @@ def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str
 
 LAST_COLUMN = "max. SEM over repetitions"
 """Heading of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
-
 
 MANIFEST = "manifest.json"
 """Name of the file that says where the results of a run come from; it is written when the run has ended."""

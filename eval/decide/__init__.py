@@ -12,13 +12,14 @@ what needs them, which takes a tenth of the looks.
 """
 
 from eval.comparison.model_folder import with_models
+from eval.comparison.records import gather
 from eval.comparison.summary import announce, sensing, write_files
 from eval.decide.report import decision_summary, probabilities
 from eval.decide.roc import plot_roc
 from eval.decide.run import DecideConfig, DecisionRun
 from semfov.errors import DataError
 from semfov.runs.command import command
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import finish
 from semfov.viz.style import save_figure
 
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eval.comparison.records import gather
 from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
 from semfov.metrics.averages import standard_error
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import finish
 from semfov.runs.tables import percent, plus_minus, table
 from semfov.viz.style import line_style, save_figure
 

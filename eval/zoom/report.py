@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
+from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import finish
 from semfov.runs.tables import table
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure

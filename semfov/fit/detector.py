@@ -50,7 +50,6 @@ _TITLES = {
 _UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
 """What the agent does without a part that it does not use, other than to use raw scores."""
 
-
 _MOST_FAULTS = 5
 """Largest number of photographs that a message names."""
 

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
-from semfov.fit.comparison import Difference
+import numpy as np
+
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import FloatArray, standard_error
 from semfov.runs.tables import percent, plus_minus, table
+
+
+class Difference(NamedTuple):
+    """The difference between a measure with fitted models and with raw scores, paired over photographs."""
+
+    mean: float
+    error: float
+    photographs: int
+
+    @classmethod
+    def of(cls, fitted: FloatArray, raw: FloatArray) -> Difference:
+        """Compute the paired difference of two measures `(P,)`, with one value for each photograph."""
+        paired = np.asarray(fitted, dtype=np.float64) - np.asarray(raw, dtype=np.float64)
+        return cls(float(paired.mean()), float(standard_error(paired)), len(paired))
+
+    @property
+    def better(self) -> bool:
+        """Whether the mean is positive and greater than its standard error."""
+        return math.isfinite(self.error) and self.mean > 0 and self.mean > self.error
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:

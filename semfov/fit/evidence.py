@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -18,23 +20,35 @@ from semfov.belief.observers import Observer, Semantic, TargetBelief
 from semfov.belief.observers.base import own
 from semfov.belief.observers.target import Target, TargetLook
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.decision import decide, place_known
-from semfov.episode import Step
+from semfov.data.scene import legal_targets
+from semfov.decision import OUTCOMES, confirms, decide, place_known
+from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
-from semfov.fit.comparison import Difference, Rule, by_detection, decisions, search_curves
 from semfov.fit.descent import descend
-from semfov.fit.detector_report import curves_figure, in_words, mean_percent, percent_of, section
+from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, percent_of, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import NonPredictive
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
+from semfov.metrics.search import cumulative_performance
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import choose_classes
+from semfov.runs.search_protocol import (
+    choose_classes,
+    choose_searches,
+    episodes_of,
+    looks_of,
+    run_episodes,
+    search_steps,
+    tie_noise,
+)
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import table
 from semfov.strategy import Strategy
@@ -330,6 +344,85 @@ def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, tra
     )
 
 
+def _search_curves(
+    run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig, max_area: float
+) -> dict[str, FloatArray]:
+    """Measure the cumulative performance of search strategies on every photograph with a target; → `(P, shifts+1)`."""
+    curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
+    for index in track(scenes, "searching", "scene"):
+        targets = legal_targets(run.scenes.annotation(index), max_area)
+        episodes = episodes_of(run.scenes, index, *run.config.cells, protocol, targets)
+        if not episodes:
+            continue
+        grid = run.grid(index)
+        looks = looks_of(episodes, run.detections(index), grid)
+        noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        for name, way in ways.items():
+            with torch.inference_mode():
+                outcomes = run_episodes(
+                    episodes, Candidate(way), looks, noise, shifts=protocol.shifts, batch=protocol.batch
+                )
+            shifts = np.array([found_at for _, found_at in outcomes])
+            curves[name].append(cumulative_performance(shifts, protocol.shifts))
+    return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
+
+
+_DecisionRates = tuple[float, float, float, float, int]
+"""Shares of searches that find a present class, find an absent one, and decide nothing; mean looks; searches."""
+
+
+def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
+    def share(outcome: str, which: Sequence[bool]) -> float:
+        chosen = [each[1] == outcome for each in searches if each[0] in which]
+        return sum(chosen) / len(chosen) if chosen else math.nan
+
+    return (
+        share("found", [True]),
+        share("found", [False]),
+        share("undecided", [True, False]),
+        sum(each[2] for each in searches) / max(len(searches), 1),
+        len(searches),
+    )
+
+
+_Rule = Callable[..., Tensor]
+"""Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
+
+
+def _decisions(
+    run: Looking,
+    scenes: Sequence[int],
+    ways: Mapping[str, tuple[Strategy, _Rule]],
+    protocol: ProtocolConfig,
+    classes: int,
+    max_area: float,
+) -> dict[str, _DecisionRates]:
+    """Evaluate the decisions of search strategies."""
+    results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
+    for index in track(scenes, "deciding", "scene"):
+        annotation, grid = run.scenes.annotation(index), run.grid(index)
+        searches = choose_searches(run.scenes, index, grid, protocol, classes, max_area, classes)
+        if not searches:
+            continue
+        detections = run.detections(index)
+        for search in searches:
+            target = search.target
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            there = bool((annotation.labels == target).any())
+            for name, (way, rule) in ways.items():
+                ends = partial(rule, target=search.target, grid=grid)
+                with torch.inference_mode():
+                    steps = search_steps(looks, way, target, search.start, search.noise, ends)
+                    outcome = OUTCOMES[int(ends(steps[-1]))]
+                results[name].append((there, outcome, len(steps)))
+    return {name: _rates(each) for name, each in results.items()}
+
+
+def _by_detection(step: Step, target: int, grid: Grid) -> Tensor:
+    """Decide as agents without fitted models: the target is found by a detection with score 0.5 in the fixated cell."""
+    return confirms(step.detections, grid, step.cell, target, 0.5).long()
+
+
 class EvidenceFit(PartFit):
     """Train the target evidence, and choose its thresholds."""
 
@@ -373,7 +466,7 @@ class EvidenceFit(PartFit):
             "fused": strategy(inputs.semantic, NonPredictive()),
         }
         protocol, judged = inputs.protocol, inputs.judged
-        curves = search_curves(run, judged, ways, protocol, config.max_target_area)
+        curves = _search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         at = min(MAP_SHIFTS, protocol.shifts)
@@ -382,11 +475,11 @@ class EvidenceFit(PartFit):
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
             f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
-        rules: dict[str, tuple[Strategy, Rule]] = {
+        rules: dict[str, tuple[Strategy, _Rule]] = {
             "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
-            "raw": (ways["raw"], by_detection),
+            "raw": (ways["raw"], _by_detection),
         }
-        decided = decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
+        decided = _decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
         shifts = (1, at, protocol.shifts)
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -16,24 +17,28 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Observer, Semantic
 from semfov.belief.observers.base import own
-from semfov.episode import Step
+from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError, InputError
-from semfov.fit.comparison import Difference, explore_curves
 from semfov.fit.descent import descend
-from semfov.fit.detector_report import curves_figure, in_words, mean_percent, section
+from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Closer, Random
+from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.exploration import answers_of
+from semfov.metrics.exploration import answers_of, success_rate
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import ProtocolConfig
+from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.tables import table
+from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
 _JUDGED = (1, 2, 3, 5, 10, 15)
@@ -298,6 +303,46 @@ def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> 
     )
 
 
+def _explore_curves(
+    run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig
+) -> dict[str, dict[str, FloatArray]]:
+    """Measure the share of cells that exploration strategies classify correctly.
+
+    The answer for a cell may be background, which is correct if the cell contains no object.
+
+    Shapes: → `(P, shifts+1)`.
+    """
+    curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
+    for index in track(scenes, "exploring", "scene"):
+        grid = run.grid(index)
+        answers = answers_of(run.scenes.annotation(index), grid, len(run.scenes.classes) + 1)
+        if not answers.any():
+            continue
+        looks = StoredLooks(run.detections(index), grid)
+        episodes = explorations_of(run.scenes, index, len(grid), protocol)
+        noise = torch.stack([explore_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        cells = int(answers.any(-1).sum())
+        for name, way in ways.items():
+            with torch.inference_mode():
+                progress = run_explorations(
+                    episodes,
+                    Candidate(way),
+                    looks,
+                    answers,
+                    noise,
+                    shifts=protocol.shifts,
+                    batch=protocol.batch,
+                )
+            rates = [success_rate(counts["right"], cells) for _, counts in progress]
+            curves["objects"][name].append(np.mean(rates, axis=0))
+            rates = [success_rate(counts["right_everywhere"], len(grid)) for _, counts in progress]
+            curves["all"][name].append(np.mean(rates, axis=0))
+    return {
+        what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}
+        for what, ways_of in curves.items()
+    }
+
+
 class MapFit(PartFit):
     """Train the map of all classes."""
 
@@ -332,7 +377,7 @@ class MapFit(PartFit):
             "fused": strategy(inputs.semantic, Closer(fovea)),
         }
         protocol = inputs.protocol
-        curves = explore_curves(run, inputs.judged, ways, protocol)
+        curves = _explore_curves(run, inputs.judged, ways, protocol)
         at = min(MAP_SHIFTS, protocol.shifts)
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):

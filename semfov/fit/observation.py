@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
-from semfov.fit.comparison import Difference
-from semfov.fit.detector_report import in_words, section
+from semfov.fit.detector_report import Difference, in_words, section
 from semfov.fit.outputs import split
 from semfov.fit.parts.base import IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig

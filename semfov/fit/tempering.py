@@ -14,8 +14,7 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.fit.comparison import Difference
-from semfov.fit.detector_report import in_words, percent_of, section
+from semfov.fit.detector_report import Difference, in_words, percent_of, section
 from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part

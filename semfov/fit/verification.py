@@ -16,8 +16,7 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
-from semfov.fit.comparison import Difference
-from semfov.fit.detector_report import in_words
+from semfov.fit.detector_report import Difference, in_words
 from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import training_of
 from semfov.fit.parts.base import PartFit, PartResult

@@ -21,20 +21,21 @@ from semfov.errors import check
 from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again
-from semfov.fit.windows_decision import Searches, fit_judge, judge_searches, picture_searches
+from semfov.fit.windows_decision import Searches, fit_closer, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
+    SurveyExample,
     ZoomExample,
     example_of,
     fit_presence,
     fit_rates,
+    fit_survey,
+    judge_survey,
     pair_windows,
     presence_log_odds,
     presence_loss,
     rate_loss,
     windows_of,
 )
-from semfov.fit.windows_survey import SurveyExample, fit_survey, judge_survey
-from semfov.fit.windows_verification import fit_closer
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig

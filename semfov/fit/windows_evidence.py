@@ -1,7 +1,8 @@
-"""Fit evidence by magnification: what closer looks at a window will show, and how many new objects they will find."""
+"""Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find."""
 
 import logging
 import random
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,10 +20,10 @@ from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.networks import STEPS
+from semfov.zoom.networks import STEPS, Survey
 
 
-class WindowResult(NamedTuple):
+class _WindowResult(NamedTuple):
     """A look at a window and its results; show `(K,)`, found `(M,)`."""
 
     window: Window
@@ -36,13 +37,13 @@ class ZoomExample(NamedTuple):
 
     lattice: Lattice
     labels: Tensor
-    looks: tuple[WindowResult, ...]
+    looks: tuple[_WindowResult, ...]
     least: float = LEAST
 
 
-def closer_windows(
-    example: ZoomExample, looked_at: WindowResult
-) -> Iterator[tuple[WindowResult, int, tuple[int, ...]]]:
+def _closer_windows(
+    example: ZoomExample, looked_at: _WindowResult
+) -> Iterator[tuple[_WindowResult, int, tuple[int, ...]]]:
     """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them."""
     look = looked_at.gist
     assert look is not None
@@ -76,7 +77,7 @@ def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LE
     """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`."""
     annotation = pictures.annotation(index)
     looks = [
-        WindowResult(glance.window, glance.gist, glance.show, _found_by(glance, annotation))
+        _WindowResult(glance.window, glance.gist, glance.show, _found_by(glance, annotation))
         for glance in glances.see(windows_of(pictures, index, glances.lattice))
     ]
     return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
@@ -173,12 +174,12 @@ _log = logging.getLogger(__name__)
 def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
     """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window."""
     own = [*model.rate.parameters(), model.prior, model.border]
-    descend_examples(
+    _descend_examples(
         own, lambda example: rate_loss(model, example), examples, steps, batch, "expected number of objects"
     )
 
 
-def descend_examples(
+def _descend_examples(
     parameters: Iterable[nn.Parameter],
     loss_of: Callable[[E], Tensor],
     examples: Sequence[E],
@@ -223,7 +224,7 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     losses = [_likelihood_loss(model, example, overview, logs, targets, overview.found)]
     for closer in random.sample(others, min(2, len(others))):
         assert closer.gist is not None
-        before = rates_before(overview.gist, logs.detach(), closer.gist)
+        before = _rates_before(overview.gist, logs.detach(), closer.gist)
         earlier = overview.found | closer.found
         closer_logs = model.rates(closer.gist, targets, before)
         losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, earlier))
@@ -234,7 +235,7 @@ def _some(values: Tensor, most: int) -> Tensor:
     return values[torch.randperm(len(values))[:most]]
 
 
-def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
+def _rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
     """Convert the rates of the overview to the cells of a closer look, for windows one octave closer than that look.
 
     Shapes: logs `(T, 3, rows, columns)` → `(T, rows, columns)`.
@@ -248,7 +249,7 @@ def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
 def _likelihood_loss(
     model: GlimpseEvidence,
     example: ZoomExample,
-    looked_at: WindowResult,
+    looked_at: _WindowResult,
     logs: Tensor,
     targets: Tensor,
     earlier: Tensor,
@@ -256,7 +257,7 @@ def _likelihood_loss(
     """Compute the mean negative log likelihood over the closer windows inside a look."""
     rates = logs.exp()
     terms = []
-    for closer, steps, (x1, y1, x2, y2) in closer_windows(example, looked_at):
+    for closer, steps, (x1, y1, x2, y2) in _closer_windows(example, looked_at):
         weight = model.taper(x2 - x1)
         part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
         expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
@@ -264,3 +265,90 @@ def _likelihood_loss(
         count = (new == targets[:, None]).sum(-1)
         terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
     return torch.stack(terms).mean() if terms else logs.sum() * 0
+
+
+class _LookCounts(NamedTuple):
+    """A look, and how many new objects each of the closer looks inside it found; counts `(N,)`."""
+
+    gist: Gist
+    counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
+
+    @classmethod
+    def of(cls, example: ZoomExample, looked: _WindowResult, earlier: Tensor) -> "_LookCounts":
+        """Compare a look with all closer looks inside it; earlier `(M,)`."""
+        by_size = defaultdict(list)
+        for closer, steps, (x1, y1, x2, _) in _closer_windows(example, looked):
+            by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
+        assert looked.gist is not None
+        counts = {key: torch.tensor(rows).unbind(-1) for key, rows in by_size.items()}
+        return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
+
+    def loss(self, survey: Survey, logs: Tensor) -> Tensor:
+        """Mean Poisson negative log likelihood of the numbers, up to a constant; logs `(3, rows, columns)`."""
+        rates = logs.exp()
+        terms = []
+        for (steps, span), (rows, columns, new) in self.counts.items():
+            weight = survey.taper(span)
+            # Windows of an overview may reach beyond the picture.
+            low, left = min(int(rows.min()), 0), min(int(columns.min()), 0)
+            high, right = (
+                max(int(n.max()) + span - size, 0) for n, size in zip((rows, columns), rates.shape[1:], strict=True)
+            )
+            cells = F.pad(rates[None, steps - 1], (-left, right, -low, high))
+            sums = F.conv2d(F.conv2d(cells[None], weight[None, None, None]), weight[None, None, :, None])[0, 0]
+            expected = sums[rows - low, columns - left]
+            terms.append(expected - new * expected.clamp(min=1e-6).log())
+        return torch.cat(terms).mean() if terms else logs.sum() * 0
+
+
+class SurveyExample(NamedTuple):
+    """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found."""
+
+    overview: _LookCounts
+    closer: tuple[_LookCounts, ...]
+
+    @classmethod
+    def of(cls, example: ZoomExample) -> "SurveyExample":
+        """Prepare a mosaic for the fit."""
+        overview, *others = (look for look in example.looks if look.gist is not None)
+        first = overview.found
+        closer = (_LookCounts.of(example, look, first | look.found) for look in others)
+        return cls(_LookCounts.of(example, overview, first), tuple(closer))
+
+    def losses(self, survey: Survey, closer: Sequence[_LookCounts]) -> list[Tensor]:
+        """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
+        first = self.overview.gist
+        logs = survey.rates(first)
+        losses = [self.overview.loss(survey, logs[0])]
+        for counted in closer:
+            before = _rates_before(first, logs.detach(), counted.gist)
+            losses.append(counted.loss(survey, survey.rates(counted.gist, before=before)[0]))
+        return losses
+
+
+@torch.no_grad()
+def judge_survey(survey: Survey, examples: Sequence[SurveyExample]) -> dict[str, float]:
+    """Mean loss on mosaics that were held out, by the overview and by closer looks."""
+    first, later = [], []
+    for example in examples:
+        overview, *closer = example.losses(survey, example.closer)
+        first.append(overview)
+        later += closer
+    figures = {"objects of any class, mean negative log likelihood, overview": float(torch.stack(first).mean())}
+    if later:
+        figures["objects of any class, mean negative log likelihood, closer looks"] = float(torch.stack(later).mean())
+    return figures
+
+
+_LATER = 2
+"""Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
+
+
+def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:
+    """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood."""
+
+    def loss_of(example: SurveyExample) -> Tensor:
+        closer = random.sample(example.closer, min(_LATER, len(example.closer)))
+        return torch.stack(example.losses(survey, closer)).mean()
+
+    _descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey", rate=2e-3)

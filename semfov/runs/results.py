@@ -7,7 +7,6 @@ import json
 import math
 import sqlite3
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -140,31 +139,3 @@ class SceneResults:
     def _sha256(self, index: int, seconds: str, records: str) -> str:
         head = json.dumps([self.key, index, self.digest(index), seconds])
         return hashlib.sha256(f"{head}\n{records}".encode()).hexdigest()
-
-
-class StoredRecords:
-    """Records of all scenes in their order, read from the database whenever they are iterated over.
-
-    One scene is held at a time, so that memory does not grow with their number.
-    """
-
-    def __init__(self, results: SceneResults, scenes: int) -> None:
-        self._results, self._scenes = results, scenes
-        self._seconds: dict[str, float] | None = None
-
-    def __iter__(self) -> Iterator[ResultRecord]:
-        """The records."""
-        seconds: dict[str, float] = defaultdict(float)
-        for result in self._results.read(self._scenes):
-            yield from result["records"]
-            for stage, value in result["seconds"].items():
-                seconds[stage] += value
-        self._seconds = dict(seconds)
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Seconds that each stage took in all scenes."""
-        if self._seconds is None:
-            deque(self, maxlen=0)
-        assert self._seconds is not None
-        return self._seconds

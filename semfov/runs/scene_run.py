@@ -16,7 +16,7 @@ from semfov.data.scene import Scenes
 from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
-from semfov.runs.results import ResultRecord, SceneResults, StoredRecords
+from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import run_tasks
@@ -119,11 +119,6 @@ def finish(run: SceneRun, title: str) -> None:
                 results.save(index, records, seconds)
     finally:
         results.flush()
-
-
-def gather(run: SceneRun) -> StoredRecords:
-    """Records of all scenes in their order, read as they are asked for, and the seconds that each stage took."""
-    return StoredRecords(run.results, len(run.scenes))
 
 
 def digest_of(what: object) -> str:

@@ -28,8 +28,8 @@ from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
 from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.fit.comparison import Difference
 from semfov.fit.detector import _seconds_of_looks, _thin_classes, _with_classes
+from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.parts.base import PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig

@@ -18,8 +18,8 @@ from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import unverified, verify
 from semfov.fit.windows import FitZoomConfig
+from semfov.fit.windows_decision import _mosaic_searches, fit_closer
 from semfov.fit.windows_evidence import example_of
-from semfov.fit.windows_verification import _mosaic_searches, fit_closer
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig

@@ -12,14 +12,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from eval.comparison.records import StoredRecords, gather
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
-from semfov.runs.results import SceneResults, StoredRecords
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.results import SceneResults
+from semfov.runs.scene_run import finish
 from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]

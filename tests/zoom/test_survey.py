@@ -5,8 +5,7 @@ import torch
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.fit.windows_evidence import WindowResult, ZoomExample
-from semfov.fit.windows_survey import SurveyExample, _LookCounts, fit_survey, judge_survey
+from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import half_steps, on_lattice
@@ -34,13 +33,13 @@ def survey():
 def example(rule):
     """A mosaic in which a closer look finds as many objects as `rule` gives for its window."""
     objects = 12
-    looks = [WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
+    looks = [_WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
     for window in half_steps(LATTICE):
         if window.level == 0:
             continue
         seen = gist(window.level, window.cells[:2]) if window.level < LATTICE.levels - 1 else None
         looks.append(
-            WindowResult(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window))
+            _WindowResult(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window))
         )
     return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
 
@@ -81,7 +80,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
-    glance = WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    glance = _WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
     for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
         belief.add(glance)

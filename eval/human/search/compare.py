@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_texts
 from eval.human.search.run import PeopleSearchConfig, PeopleSearchRun
 from eval.human.search.scores import DIMENSIONS, Beside, People
@@ -21,7 +22,7 @@ from semfov.data.fixations import Fixations, by_picture, write_table
 from semfov.errors import DataError, check
 from semfov.io.files import clean, sha256
 from semfov.io.tables import csv_text
-from semfov.runs.scene_run import finish, gather
+from semfov.runs.scene_run import finish
 from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz.style import save_figure

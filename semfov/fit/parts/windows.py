@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.comparison import Difference
-from semfov.fit.detector_report import in_words, mean_percent, section
+from semfov.fit.detector_report import Difference, in_words, mean_percent, section
 from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of

@@ -1,0 +1,42 @@
+"""Records of all scenes of a run, in their order."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Iterator
+
+from semfov.runs.results import ResultRecord, SceneResults
+from semfov.runs.scene_run import SceneRun
+
+
+class StoredRecords:
+    """Records of all scenes in their order, read from the database whenever they are iterated over.
+
+    One scene is held at a time, so that memory does not grow with their number.
+    """
+
+    def __init__(self, results: SceneResults, scenes: int) -> None:
+        self._results, self._scenes = results, scenes
+        self._seconds: dict[str, float] | None = None
+
+    def __iter__(self) -> Iterator[ResultRecord]:
+        """The records."""
+        seconds: dict[str, float] = defaultdict(float)
+        for result in self._results.read(self._scenes):
+            yield from result["records"]
+            for stage, value in result["seconds"].items():
+                seconds[stage] += value
+        self._seconds = dict(seconds)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each stage took in all scenes."""
+        if self._seconds is None:
+            deque(self, maxlen=0)
+        assert self._seconds is not None
+        return self._seconds
+
+
+def gather(run: SceneRun) -> StoredRecords:
+    """Records of all scenes in their order, read as they are asked for, and the seconds that each stage took."""
+    return StoredRecords(run.results, len(run.scenes))
