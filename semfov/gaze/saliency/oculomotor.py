@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
 
@@ -62,37 +63,34 @@ class OculomotorBias(nn.Module):
         check_shape(path, "path", None, None, 2)
         check_shape(places, "places", None, 2)
         check(path.shape[1] > 0, "path", "at least one fixation", tuple(path.shape))
-        lengths, near = path.new_tensor(_LENGTHS), path.new_tensor(_NEAR)
-        last = path[:, -1]
+        if path.shape[1] == 1:
+            path = F.pad(path, (0, 0, 1, 0), value=torch.nan)
+        last, before = path[:, -1], path[:, -2]
         ahead = places - last[:, None]
         length = _norm(ahead)
         across, down = (ahead / length[..., None].clamp(min=1e-9)).unbind(-1)
         double = across.square() - down.square(), 2 * across * down
         quadruple = double[0].square() - double[1].square(), 2 * double[0] * double[1]
-        directions = torch.stack([torch.ones_like(across), across, down, *double, *quadruple], -2)
-        bias = (_interpolated(self.saccade, lengths, length) * directions).sum(-2)
-        if path.shape[1] == 1:
-            return bias
-        before = path[:, -2]
         step = torch.where(before.isnan(), 0.0, last - before)
         unit = step / _norm(step)[:, None].clamp(min=1e-9)
         along = across * unit[:, None, 0] + down * unit[:, None, 1]
-        turns = torch.stack([along, 2 * along.square() - 1, 4 * along**3 - 3 * along], -2)
-        known = (~before[:, :1].isnan()).to(bias)
-        bias = bias + known * (_interpolated(self.turn, lengths, length) * turns).sum(-2)
+        known = (~before[:, :1].isnan()).to(along)
+        turns = known * along, known * (2 * along.square() - 1), known * (4 * along**3 - 3 * along)
+        angles = torch.stack([torch.ones_like(across), across, down, *double, *quadruple, *turns], -2)
+        tables = torch.cat([self.saccade, self.turn])
+        bias = (tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)).mul(angles).sum(-2)
         earlier = path[:, :-1].flip(1)[:, :_MEMORY]
-        seen = ~earlier[..., 0].isnan()
+        seen = (~earlier[..., 0].isnan()).to(bias)
         distance = torch.cdist(
-            torch.where(seen[..., None], earlier, 0.0),
+            torch.where(seen[..., None] > 0, earlier, 0.0),
             places.expand(len(earlier), -1, -1),
             compute_mode="donot_use_mm_for_euclid_dist",
         )
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
-        tables = torch.cat([self.back, self.back.new_zeros(_AGES, 1)], 1)[ages]
-        low, share = _position(near, distance)
-        row = torch.arange(len(tables), device=tables.device)[:, None]
-        below = tables[row, low]
-        return bias + ((below + (tables[row, low + 1] - below) * share) * seen[..., None]).sum(1)
+        back = F.pad(self.back, (0, 1))[ages]
+        weights = back.diff(dim=1).flatten() * seen[..., None].expand(-1, -1, len(_NEAR) - 1).flatten(1)
+        returns = weights[:, None] @ _passed(_NEAR, distance).flatten(1, 2)
+        return bias + returns[:, 0] + (back[:, 0] * seen).sum(1)[:, None]
 
     def gains(self, number: Tensor) -> Tensor:
         """Gains of the map and of the centre bias.
@@ -113,14 +111,10 @@ def _norm(vectors: Tensor) -> Tensor:
     return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
 
 
-def _position(knots: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """The knot below each distance, and the share of the way to the next one."""
-    low = (torch.bucketize(distance.detach(), knots, right=True) - 1).clamp(0, len(knots) - 2)
-    return low, ((distance - knots[low]) / (knots[low + 1] - knots[low])).clamp(0, 1)
+def _passed(knots: tuple[float, ...], distance: Tensor) -> Tensor:
+    """The share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`.
 
-
-def _interpolated(tables: Tensor, knots: Tensor, distance: Tensor) -> Tensor:
-    """Values of tables `(T, K)` at distances `(B, N)`: `(B, T, N)`."""
-    low, share = _position(knots, distance)
-    values = tables.t()
-    return (values[low] + (values[low + 1] - values[low]) * share[..., None]).movedim(-1, -2)
+    A table over the knots, interpolated linearly, is its first value and the sum of its differences times these shares.
+    """
+    knot = distance.new_tensor(knots)
+    return ((distance[..., None, :] - knot[:-1, None]) / knot.diff()[:, None]).clamp(0, 1)
