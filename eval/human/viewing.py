@@ -12,22 +12,26 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from eval.page.origin import END, PLACE
+from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
 from semfov.errors import check
+from semfov.fit.gaze import GazeFit, maps_of
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
+from semfov.fit.viewing import MapSource, Viewed, ViewingData, covering, features_of, look
+from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
 from semfov.runs.config import DetectorConfig, SaliencyModel
+from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.settings import Count, Whole
 from semfov.runs.setup import detector_options, prepare_worker
 from semfov.runs.tables import plus_minus, table
-from train.gaze import GazeFit, maps_of
-from train.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
-from train.viewing import MapSource, Viewed, ViewingData, covering, features_of, look, saliency_of
 
 _Array = NDArray[np.float64]
 
@@ -65,7 +69,7 @@ def compare_viewing(config: ViewingConfig) -> None:
     check(config.studied < len(config.detectors), "studied", "the number of a detector", config.studied)
     prepare_worker()
     detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
-    made: dict[str, Callable[[], MapSource]] = {name: partial(saliency_of, name) for name in config.saliency}
+    made: dict[str, Callable[[], MapSource]] = {name: partial(_saliency, name) for name in config.saliency}
     made |= {each.name: partial(_features, each) for each in detectors}
     data, fit, numbers = config.fingerprint, config.fit, range(config.folds)
     rows: dict[str, Scores] = {}
@@ -78,12 +82,12 @@ def compare_viewing(config: ViewingConfig) -> None:
         rows[name] = joined([store.scores(name, fold, fit) for fold in _bar(folds, name)])
         if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
+            alone = GazeFit(**{**vars(fit), "saccade_epochs": 0})
             splits[f"{name}: half of the people, scored by the others"] = _by_people(
-                store, name, groups, fit, config.folds
+                store, name, groups, alone, config.folds
             )
             if len(config.fixations) > 1:
                 lone = [Fold(groups, number, config.folds, only=0) for number in numbers]
-                alone = GazeFit(**{**vars(fit), "saccade_epochs": 0})
                 scores = [store.scores(f"{name} first data set", fold, alone) for fold in _bar(lone, "first data set")]
                 splits[f"{name}: the first data set alone"] = joined(scores)
             if config.sequences:
@@ -116,6 +120,19 @@ def _bar(folds: Sequence[Fold], name: str) -> Iterator[Fold]:
 
 def _features(detector: DetectorConfig) -> MapSource:
     return features_of(load_detector(detector.name, **detector_options(detector)))
+
+
+def _saliency(name: SaliencyModel) -> MapSource:
+    """The saliency map of a model over the cells of pictures, as if it were a feature map."""
+    model = SALIENCY_CLASSES[name]()
+
+    def maps(image: Tensor) -> FeatureMaps:
+        height, width = image.shape[-2:]
+        rows, columns = cells_of((height, width))
+        cells = cell_saliency(model(image), columns, rows).unflatten(1, (1, rows, columns))
+        return covering({name: cells}, (height, width))
+
+    return MapSource((name,), maps, {"saliency": name})
 
 
 def _without_maps(group: Viewed) -> Viewed:

@@ -10,13 +10,14 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
+from semfov.data.fixations.reading import frame_of
 from semfov.errors import InputError, SemfovError, check, printable
 
 
 def check_fixations(options: CheckOptions) -> int:
     """Print what is in files of fixations, and what is suspicious; returns the exit code, 1 if anything is."""
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
-    given: dict[str, Any] = {} if options.size is None else {"size": _size(options.size)}
+    given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
     given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
     wrong = False
     for name in options.files:
@@ -37,14 +38,6 @@ def check_fixations(options: CheckOptions) -> int:
         print(*(f"  suspicious: {line}" for line in lines), sep="\n") if lines else print("  nothing is suspicious")
         wrong = wrong or bool(lines)
     return 1 if wrong else 0
-
-
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
-    except ValueError:
-        raise InputError(f"size: expected a width and a height, as 1920,1080, got {text!r}") from None
-    return width, height
 
 
 def _content(records: list[Fixations]) -> str:

@@ -141,7 +141,7 @@ usage: semfov gaze [PICTURE ...] [options]
   PICTURE              photographs, or folders of them (none: an embedded scene)
   --detector NAME      the detector whose features are read: yolov3-tiny (default), yolox-nano, nanodet-plus-m-1.5x
   --weights FILE       its weights, where they are not downloaded
-  --model FILE         model for your own detector, from semfov fit mine.onnx --gaze.fixations …
+  --model FILE         a model for your own detector or of your own fixations, from semfov fit
   --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
   --seconds S          time for which each views a picture (default 3)
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
@@ -183,6 +183,7 @@ semfov fit: fit all models to your own detector
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
   semfov search PHOTO.jpg --target cup --models mymodels
   semfov find BIG.jpg --models mymodels
+  semfov fit mine.onnx --gaze.fixations people.csv --gaze.pictures PHOTOS        where people look, for semfov gaze
 
 usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 
@@ -193,6 +194,8 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
   --detector.classes LIST  names of the detector's classes, "[cat,dog]", where its file does not hold them
   --out FOLDER             folder for the models (default mymodels)
   --holdout N              hold out one in N photographs, on which each part is compared with raw scores
+  --gaze.fixations FILES   what people fixated, in formats that semfov check reads; without photographs, nothing else is
+                           fitted. --gaze.pictures FOLDERS: the folder of the pictures of each file
   --windows false          no evidence for large pictures (it takes about 50 photographs, of which mosaics are made)
   --workers N              processes that look (default: one for each core)
 

@@ -19,6 +19,7 @@ from semfov.data.coco import category_names
 from semfov.detection.class_names import UnnamedClasses
 from semfov.errors import DataError, InputError
 from semfov.fit.evidence import EvidenceFit
+from semfov.fit.gaze_model import fit_gaze_model, gaze_report
 from semfov.fit.map import MapFit
 from semfov.fit.observation import ObservationFit
 from semfov.fit.parts.base import PartFit, PartInputs, PartResult
@@ -204,6 +205,10 @@ def _next_commands(config: FitDetectorConfig, run: Looking) -> str:
 def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = _with_classes(config.named())
+    if config.gaze.fixations:
+        _fit_gaze(config)
+        if config.data.root is None:
+            return
     started = time.monotonic()
     print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
@@ -245,6 +250,17 @@ def fit_folder(config: FitDetectorConfig) -> None:
     models = [fitted.part.file for fitted in results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
     print(f"\nnext:\n{_next_commands(config, run)}")
+
+
+def _fit_gaze(config: FitDetectorConfig) -> None:
+    """Fit where people look, and write the model and its report into the folder."""
+    gaze = replace(config.gaze, cache=config.gaze.cache or config.cache)
+    model, scored = fit_gaze_model(gaze, make_detector(config.detector), config.out / "progress" / "gaze")
+    path, report = config.out / "gaze.safetensors", gaze_report(scored)
+    model.save(path)
+    write_text(config.out / "gaze.md", report)
+    print(report, "written:", f"  {path}", f"  {config.out / 'gaze.md'}", sep="\n")
+    print(f"\nnext:\n  semfov gaze PHOTO.jpg --detector {config.model} --model {path}")
 
 
 def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from semfov.errors import InputError
+from semfov.fit.gaze_model import GazeModelFit
 from semfov.runs.config import DataConfig, DetectorConfig, EyeConfig
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Side, SingleName, Whole
 
@@ -85,6 +86,7 @@ class FitDetectorConfig(FitConfig):
         map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
         windows: also fit the evidence for pictures larger than the detector's input, if there are enough photographs.
         window_steps: training steps of that evidence.
+        gaze: pictures that people viewed, to fit where people look to. Without photographs, nothing else is fitted.
         thin: the report lists classes with fewer objects than this in the training photographs.
         out: folder to write the models to.
         cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
@@ -103,6 +105,7 @@ class FitDetectorConfig(FitConfig):
     map_steps: Count | None = None
     windows: bool = True
     window_steps: Count = 400
+    gaze: GazeModelFit = field(default_factory=GazeModelFit)
     thin: Whole = 20
     out: Path = Path("mymodels")
 

@@ -285,9 +285,9 @@ def _setting_types(config: type[Any]) -> dict[str, Any]:
 
 
 def _is_list(hint: Any) -> bool:
-    """Whether a type is a list of words of any length."""
+    """Whether a type is a list of words or paths of any length."""
     item, *more = get_args(hint) or (None,)
-    return get_origin(hint) is tuple and more == [Ellipsis] and (item is str or get_origin(item) is Literal)
+    return get_origin(hint) is tuple and more == [Ellipsis] and (item in (str, Path) or get_origin(item) is Literal)
 
 
 def _options_of(hint: Any) -> list[str]:

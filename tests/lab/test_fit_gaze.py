@@ -1,6 +1,5 @@
 """The fit of where people look, on fixations that were drawn from a known density."""
 
-import json
 import math
 
 import numpy as np
@@ -12,14 +11,14 @@ from torch.nn import functional as F
 
 from eval.human import main as compare
 from semfov import Detector, saliency
-from semfov.data.fixations import Fixations, write_osie
+from semfov.cli.main import main
+from semfov.data.fixations import Fixations, write_table
 from semfov.detection import Candidates
+from semfov.fit.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
+from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
+from semfov.fit.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
-from train.fit_gaze import main
-from train.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
-from train.gaze_folds import CENTRE, Fold, FoldStore
-from train.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
 
 SIZE = (60, 80)
 
@@ -132,8 +131,8 @@ def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monke
     fold = Fold([half], 1, 4)
     first = store.scores("halves", fold, fit, judges=[others])
     assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
-    monkeypatch.setattr("train.gaze_folds.fitted_density", None)
-    monkeypatch.setattr("train.gaze_folds.score", None)
+    monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
+    monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
     again = store.scores("halves", fold, fit, judges=[others])
     assert all(torch.equal(first[key], again[key]) for key in first)
 
@@ -173,51 +172,40 @@ def test_folds_hold_out_each_picture_once():
 
 
 @pytest.mark.slow
-def test_a_run_writes_a_model_and_a_report(tmp_path, monkeypatch, capsys):
-
+def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, capsys):
+    """Pictures of two sizes, and a table as eye trackers have it."""
     (tmp_path / "pictures").mkdir()
     everyone = []
     for seed in range(6):
         image, place = picture(seed)
         pixels = (image * 255).byte().permute(1, 2, 0).numpy()
-        Image.fromarray(np.kron(pixels, np.ones((2, 2, 1), np.uint8))).save(tmp_path / "pictures" / f"{seed}.png")
-        everyone += [each.resized((160, 120)) for each in people(seed, place, 2)]
-    write_osie(tmp_path / "fixations.json", everyone)
+        scale = 2 + seed % 2
+        Image.fromarray(np.kron(pixels, np.ones((scale, scale, 1), np.uint8))).save(tmp_path / f"pictures/{seed}.png")
+        everyone += [each.resized((80 * scale, 60 * scale)) for each in people(seed, place, 2)]
+    write_table(tmp_path / "people.csv", everyone)
     detector = Colours("colours", ("none",), (160, 120), stride=4).eval()
-    monkeypatch.setattr("train.fit_gaze.load_detector", lambda name, **options: detector)
-    run = ["--fixations", f"[{tmp_path / 'fixations.json'}]", "--pictures", f"[{tmp_path / 'pictures'}]"]
-    run += [
-        "--sizes",
-        "['160,120']",
-        "--folds",
-        "2",
-        "--epochs",
-        "2",
-        "--saccade_epochs",
-        "1",
-        "--units",
-        "4",
-        "--cache",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main(run) == 0, capsys.readouterr().err
-    model = saliency.FixationDensity.from_pretrained(tmp_path / "out/colours.safetensors")
+    monkeypatch.setattr("semfov.fit.detector.check_sources", lambda data, config: None)
+    monkeypatch.setattr("semfov.fit.detector.make_detector", lambda config: detector)
+    data = {"fixations": tmp_path / "people.csv", "pictures": tmp_path / "pictures", "cache": tmp_path, "folds": 2}
+    data |= {"epochs": 2, "saccade_epochs": 1, "units": 4}
+    words = [str(word) for name, value in data.items() for word in (f"--gaze.{name}", value)]
+    assert main(["fit", "colours", *words, "--out", str(tmp_path / "mymodels")]) == 0, capsys.readouterr().err
+    printed = capsys.readouterr().out
+    model = saliency.FixationDensity.from_pretrained(tmp_path / "mymodels/gaze.safetensors")
     assert model.layers == {"backbone8": 3}
     assert model.metadata["training"]["pictures"] == 6
     model.check_compatible(detector)
-    rows = json.loads((tmp_path / "out/folds.json").read_text())["1"]
-    report = (tmp_path / "out/report.md").read_text()
-    assert f"{rows['map']['NSS']:.3f}" in report
-    assert rows["all terms"]["pictures"] == 6
+    assert "6 pictures, each held out once" in (tmp_path / "mymodels/gaze.md").read_text()
+    assert f"--model {tmp_path / 'mymodels/gaze.safetensors'}" in printed
+    assert not (tmp_path / "mymodels/manifest.json").exists()
     monkeypatch.setattr("eval.human.viewing.load_detector", lambda name, **options: detector)
-    monkeypatch.setattr("eval.human.viewing.saliency_of", lambda name: features_of(detector))
+    monkeypatch.setattr("eval.human.viewing._saliency", lambda name: features_of(detector))
     page = tmp_path / "page.md"
     page.write_text("<!-- table viewing -->\n<!-- end -->\n")
-    run = [*run[: run.index("--out")], "--out", str(tmp_path / "viewing"), "--page", str(page)]
+    words = [word.replace("gaze.", "") for word in words]
     more = ["--detectors", "[colours]", "--saliency", "[vocus2]", "--studied", "0", "--sequences", "2"]
-    assert compare(["viewing", *run, *more]) == 0, capsys.readouterr().err
+    more += ["--out", str(tmp_path / "viewing"), "--page", str(page)]
+    assert compare(["viewing", *words, *more]) == 0, capsys.readouterr().err
     lines = page.read_text().splitlines()
     assert [line.split("|")[1].strip() for line in lines if line.startswith("| ")] == [
         "", "centre bias", "vocus2", "colours", "inter-observer", "vocus2, with oculomotor biases",

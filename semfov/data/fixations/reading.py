@@ -13,7 +13,7 @@ from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import of_source, read_table
-from semfov.errors import DataError
+from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
 
@@ -63,3 +63,16 @@ def _json_reader(path: Path) -> Callable[..., list[Fixations]]:
         return read_cocosearch
     people = isinstance(content, dict) and any(isinstance(each, list) for each in content.values())
     return read_osie if people else read_ruarte
+
+
+def frame_of(text: str) -> tuple[int, int]:
+    """Width and height of a frame that a command line gives.
+
+    >>> frame_of("1920,1080"), frame_of("800x600")
+    ((1920, 1080), (800, 600))
+    """
+    try:
+        width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
+    except ValueError:
+        raise InputError(f"size: expected a width and a height, as 1920,1080, got {text!r}") from None
+    return width, height

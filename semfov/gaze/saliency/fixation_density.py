@@ -38,7 +38,7 @@ class FixationDensity(Pretrained):
     Bethge and Wallis, 2022), with the features of a detector that runs anyway in place of a network of its own.
 
     The shipped models (`from_pretrained`) are fitted by maximum likelihood to fixations of 3 to 5 seconds of free
-    viewing of photographs by adults (`train.fit_gaze`). They are not for tasks, such as search.
+    viewing of photographs by adults (`semfov fit`). They are not for tasks, such as search.
 
     Args:
         layers: number of channels of each feature map, by the name that `Detector.features` gives it.
@@ -139,7 +139,7 @@ class FixationDensity(Pretrained):
             names = ", ".join(sorted(path.stem for path in cls.shipped.glob("*.safetensors")))
             raise InputError(
                 f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
-                f"fixations with `python -m train.fit_gaze --detector.name {detector.name}`"
+                f"fixations with `semfov fit {detector.name} --gaze.fixations FILE --gaze.pictures FOLDER`"
             )
         model.check_compatible(detector)
         return model

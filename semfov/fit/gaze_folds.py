@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from semfov.errors import SemfovError
+from semfov.fit.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
+from semfov.fit.viewing import Viewed, folds, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.code import modules_digest
 from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.scene_run import digest_of
-from train.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
-from train.viewing import Viewed, folds, log_centre, others_of
 
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
@@ -36,7 +36,12 @@ class Fold:
 
     def __init__(self, groups: Sequence[Viewed], number: int, count: int, only: int | None = None) -> None:
         self.groups, self.number, self.count, self.only = groups, number, count, only
-        split = [folds(len(group), count, number) for group in groups]
+        before: dict[int, int] = {}
+        split = []
+        for group in groups:
+            first = before.get(group.source, 0)
+            split.append(folds(len(group), count, number, first))
+            before[group.source] = first + len(group)
         self.held = [held for _, held in split]
         self.fitted = self._of(only, [fitted for fitted, _ in split])
         self.centres = {
@@ -94,7 +99,7 @@ class FoldStore:
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
-        self.folder, code = folder, modules_digest("train.gaze", "train.viewing", "semfov.gaze.saliency", __name__)
+        self.folder, code = folder, modules_digest("semfov.gaze.saliency", __name__)
         self.what = {**what, "code": code}
 
     def model(self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features") -> FixationDensity:

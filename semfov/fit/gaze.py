@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
+from semfov.fit.viewing import LONGEST, Events, Viewed, events_of, log_centre
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Whole
-from train.viewing import LONGEST, Events, Viewed, events_of, log_centre
 
 _EVENTS = 12
 """Fixations of a picture in a pass of the fit of oculomotor biases."""
@@ -288,7 +288,7 @@ def score(
             density = cell_saliency((log - log.flatten(1).logsumexp(1)[:, None, None]).exp(), *raster)
             density = (density / density.sum(1, keepdim=True)).expand(len(events.cell), -1)
             scored.append(_scores(density, events.cell))
-    return [torch.stack(scored) for scored in rows]
+    return [torch.stack(scored) if scored else torch.zeros(0, 3) for scored in rows]
 
 
 def _scores(density: Tensor, cell: Tensor) -> Tensor:

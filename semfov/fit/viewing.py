@@ -14,19 +14,17 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from semfov.data.fixations import Fixations, by_picture, read_osie, read_table
+from semfov.data.fixations import Fixations, by_picture, read_fixations
+from semfov.data.fixations.reading import frame_of
 from semfov.data.pictures import Pictures
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.placement import Placement
 from semfov.errors import check
-from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema
-from semfov.runs.config import SaliencyModel
-from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.scene_run import digest_of, store_folder
 from semfov.runs.settings import Count, Settings
 from semfov.runs.store import SceneStore, looks_digest
@@ -42,9 +40,9 @@ class ViewingData(Settings):
     """Pictures, and the fixations of people in them.
 
     Args:
-        fixations: files of fixations, a JSON file of OSIE's form or a table (`.csv`) for each data set.
+        fixations: a file of fixations for each data set, in any format that `semfov check` reads.
         pictures: folder of the pictures of each data set.
-        sizes: `width,height` of the frame of each JSON file (none: 800,600).
+        sizes: frame of each file that has none, as `800x600` (none: that of OSIE's files, 800x600).
         seconds: time in seconds for which people viewed a picture, for each data set (none: 3).
         limit: use only the first so many pictures of each data set (none: all).
         cache: folder for the maps of the pictures (None: the user's cache).
@@ -73,9 +71,8 @@ class ViewingData(Settings):
 
     def people(self, number: int) -> dict[str, list[Fixations]]:
         """The scanpaths of more than one fixation of a data set, by picture."""
-        file = self.fixations[number]
-        width, height = (int(side) for side in _at(self.sizes, number, "800,600").split(","))
-        everyone = read_table(file) if file.suffix == ".csv" else read_osie(file, size=(width, height))
+        size = _at(self.sizes, number, None)
+        everyone = read_fixations(self.fixations[number], **({} if size is None else {"size": frame_of(size)}))
         return dict([*by_picture(each for each in everyone if len(each) > 1).items()][: self.limit])
 
 
@@ -156,19 +153,6 @@ def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
         layers = tuple(name for name in _LAYERS if name in have) or tuple(have)
     what = {"detector": detector.settings(), "layers": list(layers)}
     return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
-
-
-def saliency_of(name: SaliencyModel) -> MapSource:
-    """The saliency map of a model over the cells of pictures, as if it were a feature map."""
-    model = SALIENCY_CLASSES[name]()
-
-    def maps(image: Tensor) -> FeatureMaps:
-        height, width = image.shape[-2:]
-        rows, columns = cells_of((height, width))
-        cells = cell_saliency(model(image), columns, rows).unflatten(1, (1, rows, columns))
-        return covering({name: cells}, (height, width))
-
-    return MapSource((name,), maps, {"saliency": name})
 
 
 def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
@@ -261,15 +245,13 @@ class Events(NamedTuple):
 
 def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Events:
     """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
-    before, cell, person = [torch.zeros(0, LONGEST - 1, 2)], [], []
-    for number, path in enumerate(paths):
-        before += [
-            F.pad(path[:last].t(), (LONGEST - 1 - last, 0), value=math.nan).t()[None] for last in range(1, len(path))
-        ]
-        cell.append(_numbers_of_cells(path[1:], size, cells))
-        person.append(torch.full((len(path) - 1,), number))
-    none = torch.zeros(0, dtype=torch.long)
-    return Events(torch.cat(before), torch.cat([none, *cell]), torch.cat([none, *person]))
+    before = [torch.zeros(0, LONGEST - 1, 2)]
+    for path in paths:
+        padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
+        before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
+    cell = _numbers_of_cells(torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)]), size, cells)
+    person = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(path) - 1 for path in paths]).long())
+    return Events(torch.cat(before), cell, person)
 
 
 def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3, share: float = 0.05) -> Tensor:
@@ -307,8 +289,11 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
     return ((1 - floor) * total / total.sum() + floor / total.numel()).log()
 
 
-def folds(number: int, count: int, fold: int) -> tuple[list[int], list[int]]:
-    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out."""
+def folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int], list[int]]:
+    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out.
+
+    `first` is the number of the first picture in its data set, of which a group has the pictures of one size.
+    """
     check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
-    held = [*range(fold, number, count)]
+    held = [*range((fold - first) % count, number, count)]
     return [each for each in range(number) if each not in set(held)], held

@@ -1,0 +1,73 @@
+"""A model of where people look for a detector: fitted to all pictures, and evaluated on folds of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from semfov.detection.detector import Detector
+from semfov.errors import check
+from semfov.fit.gaze import GazeFit, describe_viewing, fitted_density, summary_of
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
+from semfov.fit.viewing import ViewingData, features_of, look
+from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.runs.settings import Whole
+from semfov.runs.tables import table
+
+
+@dataclass(frozen=True)
+class GazeModelFit(ViewingData, GazeFit):
+    """Pictures that people viewed freely, and how a model of where they look is fitted to them and evaluated.
+
+    Args:
+        layers: names of the feature maps (none: those of the shipped model, or of backbone and head at
+            strides 8 to 32 that the detector has).
+        folds: number of folds for the evaluation (0: none).
+    """
+
+    layers: tuple[str, ...] = ()
+    folds: Whole = 5
+
+
+def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tuple[FixationDensity, Scores]:
+    """Look at all pictures, evaluate on folds, whose models and scores are kept in a folder, and fit to all."""
+    check(len(config.fixations) > 0, "fixations", "at least one file", "none")
+    source = features_of(detector, config.layers)
+    groups = look(config, source)
+    pictures = sum(map(len, groups))
+    check(pictures >= max(config.folds, 1), "fixations", f"pictures for {config.folds} folds", f"{pictures}")
+    kept = FoldStore(store, {**source.what, "data": config.fingerprint})
+    folds = [Fold(groups, number, config.folds) for number in range(config.folds)]
+    scored = joined([kept.scores(detector.name, fold, config.fit) for fold in folds])
+    model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
+    describe_viewing(model, groups)
+    scanpaths = sum(len(some) for group in groups for some in group.people)
+    known = {name: detector.settings()[name] for name in ("name", "digest", "input_size", "stretch")}
+    training = {**config.fit.plain(), "pictures": pictures, "scanpaths": scanpaths}
+    model.metadata |= {"detector": known, "data": config.fingerprint, "training": training}
+    return model, scored
+
+
+def summaries(scored: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
+    """Means over the held-out pictures, by number of the data set and row."""
+    return {
+        str(source + 1): {
+            row: {**summary_of(scored[row, source], scored[CENTRE, source]), "pictures": len(scored[row, source])}
+            for row in (CENTRE, *ROWS[False], *ROWS[True])
+            if (row, source) in scored
+        }
+        for source in sorted({source for _, source in scored})
+    }
+
+
+def gaze_report(scored: Scores) -> str:
+    """The means as Markdown."""
+    if not scored:
+        return "fitted to all pictures; no folds were held out\n"
+    lines = []
+    for source, rows in summaries(scored).items():
+        body = [[name, *(f"{row[figure]:.3f}" for figure in ("NSS", "AUC", "gain"))] for name, row in rows.items()]
+        lines += [f"Data set {source}: {rows[CENTRE]['pictures']} pictures, each held out once", ""]
+        lines += [*table([["", "NSS", "AUC", "gain over the centre bias, bit/fixation"], *body]), ""]
+    return "\n".join(lines)
