@@ -210,9 +210,9 @@ def check_finite(tensor: Tensor, argument: str) -> None:
     Traceback (most recent call last):
     semfov.errors.InputError: gaze: expected finite numbers, got 1 of 2 that are not finite
     """
-    if values_known(tensor):
-        bad = int((~torch.isfinite(tensor)).sum())
-        check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
+    if values_known(tensor) and not bool((finite := torch.isfinite(tensor)).all()):
+        bad = tensor.numel() - int(finite.sum())
+        check(False, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:

@@ -1,16 +1,30 @@
 """The grid of cells over an image: centres, cells that a box covers, and distances to the fixation."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, check_whole, lookup
+from semfov.sensor.lines import constant
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
+
+
+class _Layout(NamedTuple):
+    """Columns, then rows, of cells `(X+Y,)`, centres `(X·Y, 2)`, the size of a cell `(2,)`, the longer side `()`."""
+
+    axis: Tensor
+    start: Tensor
+    end: Tensor
+    middle: Tensor
+    half: Tensor
+    centres: Tensor
+    cell: Tensor
+    longest: Tensor
 
 
 @dataclass(frozen=True)
@@ -56,18 +70,25 @@ class Grid:
     @property
     def centres(self) -> Tensor:
         """Centre of every cell as a point, `(X·Y, 2)` or `(B, X·Y, 2)`."""
-        cell = torch.arange(len(self), device=self.extent.device)
-        steps = torch.stack([cell % self.columns, cell // self.columns], -1) + 0.5
-        return steps * self._cell_size()[..., None, :] - 0.5
+        return self._layout().centres.clone()
 
     @property
     def edges(self) -> Tensor:
         """Box `(x1, y1, x2, y2)` of every cell, `(X·Y, 4)` or `(B, X·Y, 4)`."""
-        middle, half = self.centres + 0.5, self._cell_size()[..., None, :] / 2
+        layout = self._layout()
+        middle, half = layout.centres + 0.5, layout.cell[..., None, :] / 2
         return torch.cat([middle - half, middle + half], -1)
 
-    def _cell_size(self) -> Tensor:
-        return self.extent / self.extent.new_tensor([self.columns, self.rows])
+    def _layout(self, like: Tensor | None = None) -> _Layout:
+        """The cells with the dtype and device of a tensor (None: those of the size); one size is laid out only once."""
+        dtype, device = (torch.get_default_dtype(), None) if like is None else (like.dtype, like.device)
+        if isinstance(self.size, Tensor):
+            made = _layout(self.columns, self.rows, self.extent)
+            return made if like is None else _Layout(made.axis.to(device), *(each.to(like) for each in made[1:]))
+        width, height = self.size
+        return _layout_of_size(
+            self.columns, self.rows, width, height, torch.get_default_dtype(), dtype, device or torch.device("cpu")
+        )
 
     def cell_of(self, points: Tensor) -> Tensor:
         """Cell that holds each point; for a point outside the image, the nearest cell.
@@ -87,7 +108,7 @@ class Grid:
         check_shape(points, "points", 2)
         check_finite(points, "points")
         points = as_positions(points)
-        step = ((points + 0.5) / self._align(self._cell_size(), points)).floor()
+        step = ((points + 0.5) / self._align(self._layout(points).cell, points)).floor()
         column = step[..., 0].clamp(0, self.columns - 1).long()
         row = step[..., 1].clamp(0, self.rows - 1).long()
         return row * self.columns + column
@@ -126,28 +147,27 @@ class Grid:
         check_finite(boxes, "boxes")
         lookup(rule, get_args(Footprint), "footprint rule")
         boxes = as_positions(boxes)
-        full = (boxes[..., 2] > boxes[..., 0]) & (boxes[..., 3] > boxes[..., 1])
-        low, high = boxes[..., None, :2], boxes[..., None, 2:]
-        if rule == "overlap":
-            shared = []
-            for axis, count in enumerate((self.columns, self.rows)):
-                extent = self.extent[..., axis, None] if self.extent.ndim == 1 else self.extent[:, None, axis, None]
-                borders = (torch.arange(count + 1, device=extent.device) * (extent / count)).to(boxes)
-                shared.append((borders[..., :-1] < high[..., axis]) & (borders[..., 1:] > low[..., axis]))
-            across, down = shared
-            return (down[..., :, None] & across[..., None, :] & full[..., None, None]).flatten(-2)
-        if rule == "soft":
-            half = self._align(self._cell_size(), boxes)[..., None, :] / 2
-            offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - (low + high) / 2
-            window = (-1.5 * (offset / torch.hypot((high - low) / 2, half)).square()).sum(-1).exp()
-            return window * self.footprint(boxes)
+        layout = self._layout(boxes)
+        # Both axes at once: for each line the sides of the boxes along its axis.
+        low, high = boxes.index_select(-1, layout.axis), boxes.index_select(-1, layout.axis + 2)
+        start, end, middle, half = (each if each.ndim == 1 else each[:, None] for each in layout[1:5])
+        if rule in ("overlap", "soft"):
+            shared = self._both((start < high) & (end > low) & (high > low), torch.logical_and)
+            if rule == "overlap":
+                return shared
+            offset = (middle - (low + high) / 2) / torch.hypot((high - low) / 2, half)
+            return self._both(-1.5 * offset.square(), torch.add).exp() * shared
         own = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
         central = own[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
-            middle = (self.centres + 0.5)[..., None, :, :].to(boxes)
-            inside = ((middle >= low) & (middle < high)).all(-1)
+            inside = self._both((middle >= low) & (middle < high), torch.logical_and)
             central = inside | (central & ~inside.any(-1, keepdim=True))
-        return central & full[..., None]
+        return central & self._both(high > low, torch.logical_and)
+
+    def _both(self, lines: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Join the values of the columns and rows `(..., X+Y)` in every cell, `(..., X·Y)`."""
+        across, down = lines.split([self.columns, self.rows], -1)
+        return join(across[..., None, :], down[..., :, None]).flatten(-2)
 
     def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
         """Distance from the centre of each box to the fixation.
@@ -175,7 +195,7 @@ class Grid:
         boxes, fixation = as_positions(boxes), as_positions(fixation)
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
-        return offset / self.extent.amax(-1)[..., None].to(offset)
+        return offset / self._layout(offset).longest[..., None]
 
     def distance(self, fixation: Tensor) -> Tensor:
         """Distance from each fixation to the centre of every cell.
@@ -194,8 +214,9 @@ class Grid:
         """
         check_shape(fixation, "fixation", 2)
         fixation = as_positions(fixation)
-        offset = self.centres.to(fixation) - fixation[..., None, :]
-        return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1).to(fixation)[..., None]
+        layout = self._layout(fixation)
+        offset = layout.centres - fixation[..., None, :]
+        return torch.linalg.vector_norm(offset, dim=-1) / layout.longest[..., None]
 
     @property
     def cell_distance(self) -> Tensor:
@@ -213,6 +234,28 @@ class Grid:
         extra = points.ndim - values.ndim
         aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
         return aligned.to(points)
+
+
+def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:
+    """The cells over images of an extent `(2,)` or `(B, 2)`."""
+    counts, device = (columns, rows), extent.device
+    axis = torch.cat([torch.full((count,), number, device=device) for number, count in enumerate(counts)])
+    place = torch.cat([torch.arange(count, device=device) for count in counts])
+    cell = extent / extent.new_tensor(counts)
+    step = cell.index_select(-1, axis)
+    middle = (place + 0.5) * step - 0.5
+    along, down = middle[..., None, :columns], middle[..., columns:, None]
+    centres = torch.stack(torch.broadcast_tensors(along, down), -1).flatten(-3, -2)
+    return _Layout(axis, place * step, (place + 1) * step, middle + 0.5, step / 2, centres, cell, extent.amax(-1))
+
+
+@constant
+def _layout_of_size(
+    columns: int, rows: int, width: float, height: float, made: torch.dtype, dtype: torch.dtype, device: torch.device
+) -> _Layout:
+    """`_layout` for one size, computed with a dtype before it is converted."""
+    layout = _layout(columns, rows, torch.tensor([width, height], dtype=torch.promote_types(made, torch.float32)))
+    return _Layout(layout.axis.to(device), *(each.to(device, dtype) for each in layout[1:]))
 
 
 def check_cells(grid: tuple[int, int]) -> None:

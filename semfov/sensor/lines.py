@@ -19,7 +19,7 @@ from semfov.errors import values_known
 _SMALL = 160
 
 # Pixels of planes that are filtered together.
-_CACHED = 1 << 18
+_CACHED = 1 << 19
 
 _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
@@ -53,21 +53,15 @@ class Taps:
 
 
 class Lines(NamedTuple):
-    """A matrix from input to output lines: dense, or tiles `(tiles, tile, window)` between dense ends."""
+    """A matrix from input to output lines: dense, or tiles `(tiles, tile, window)` between ends `(2, edge, span)`."""
 
-    first: Tensor
-    middle: Tensor | None = None
-    last: Tensor | None = None
+    length: int
+    dense: Tensor | None
+    ends: Tensor
+    middle: Tensor
+    rows: int = 0
     start: int = 0
     shift: int = 0
-
-    @property
-    def length(self) -> int:
-        """Number of pixels of an output line."""
-        made = len(self.first)
-        if self.middle is not None and self.last is not None:
-            made += self.middle.shape[0] * self.middle.shape[1] + len(self.last)
-        return made
 
 
 def banded(
@@ -79,34 +73,43 @@ def banded(
     before = -(-reach // shift)
     tiles = min((count - reach) // shift, length // tile) - before
     if max(count, length) <= _SMALL or tiles < 1:
-        return Lines(_dense(index, weight, count).to(device, dtype))
+        dense = _dense(index, weight, count).to(device, dtype)
+        return Lines(length, dense, dense[None], dense[None])
     start, rows, rest = before * shift - reach, before * tile, (before + tiles) * tile
     inner = index[rows:rest].reshape(tiles, tile, -1) - (start + shift * torch.arange(tiles)[:, None, None])
-    behind = start + tiles * shift
-    first = _dense(index[:rows], weight[:rows], start + 2 * reach).to(device, dtype)
     middle = _dense(inner, weight[rows:rest].reshape(inner.shape), window).to(device, dtype)
-    last = _dense(index[rest:] - behind, weight[rest:], count - behind).to(device, dtype)
     if values_known(middle) and bool((middle == middle[0]).all()):
         # Usually all tiles are equal, and a single one stays in the fastest cache.
         middle = middle[:1].expand(tiles, -1, -1)
-    return Lines(first, middle, last, start, shift)
+    # Both ends have the same size, so that one product computes them; the longer one decides.
+    edge = max(rows, length - rest)
+    span = min(count, max(-(-edge // tile) * shift, count - (length - edge) // tile * shift) + reach)
+    head, tail = slice(edge), slice(length - edge, length)
+    ends = _dense(index[head], weight[head], span), _dense(index[tail] - (count - span), weight[tail], span)
+    return Lines(length, None, torch.stack(ends).to(device, dtype), middle, rows, start, shift)
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     """Filter the columns of an image `(..., h, w)` with `down` and its rows with `across`."""
     if not values_known(image) or (image.requires_grad and torch.is_grad_enabled()) or image.device.type != "cpu":
         return _product(_product(image.mT, across).mT, down)
-    if down.middle is None and across.middle is None:
-        return down.first @ (image @ across.first.mT)
+    if down.dense is not None and across.dense is not None:
+        return down.dense @ (image @ across.dense.mT)
     planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
     result = planes.new_empty(len(planes), down.length, across.length)
-    # So many planes at a time that what is between the two passes stays in the cache.
-    number = max(1, _CACHED // (planes.shape[1] * max(planes.shape[2], across.length)))
-    between = planes.new_empty(min(number, len(planes)), planes.shape[1], across.length)
-    for group, made in zip(planes.split(number), result.split(number), strict=True):
-        _fill(between[: len(group)].flatten(0, 1).mT, group.reshape(-1, group.shape[-1]).mT, across)
-        for plane, filtered in zip(between, made, strict=False):
+    # The pass with fewer pixels is the slower one, across, which takes all planes at once. So many planes are filtered
+    # at a time that what is between the passes stays in the cache.
+    shrinks = down.length < planes.shape[1]
+    sides = (down.length, planes.shape[2]) if shrinks else (planes.shape[1], across.length)
+    between = planes.new_empty(min(max(1, _CACHED // (sides[0] * sides[1])), len(planes)), *sides)
+    for group, made in zip(planes.split(len(between)), result.split(len(between)), strict=True):
+        part = between[: len(group)]
+        if not shrinks:
+            _fill(part.flatten(0, 1).mT, group.reshape(-1, group.shape[-1]).mT, across)
+        for plane, filtered in zip(*((group, part) if shrinks else (part, made)), strict=True):
             _fill(filtered, plane, down)
+        if shrinks:
+            _fill(made.flatten(0, 1).mT, part.flatten(0, 1).mT, across)
     return result.reshape(*image.shape[:-2], *result.shape[-2:])
 
 
@@ -117,29 +120,35 @@ def _dense(index: Tensor, weight: Tensor, count: int) -> Tensor:
 
 def _product(image: Tensor, lines: Lines) -> Tensor:
     """Filter the columns of an image."""
-    if lines.middle is None or lines.last is None:
-        return lines.first @ image
-    top, bottom = (
-        lines.first @ image[..., : lines.first.shape[1], :],
-        lines.last @ image[..., image.shape[-2] - lines.last.shape[1] :, :],
-    )
-    return torch.cat([top, (lines.middle @ _windows(image, lines, lines.middle)).flatten(-3, -2), bottom], -2)
+    if lines.dense is not None:
+        return lines.dense @ image
+    _, edge, span = lines.ends.shape
+    made = lines.rows + lines.middle.shape[:2].numel()
+    top = lines.ends[0, : lines.rows] @ image[..., :span, :]
+    inner = (lines.middle @ _windows(image, lines)).flatten(-3, -2)
+    bottom = lines.ends[1, edge - lines.length + made :] @ image[..., image.shape[-2] - span :, :]
+    return torch.cat([top, inner, bottom], -2)
 
 
 def _fill(result: Tensor, plane: Tensor, lines: Lines) -> None:
     """Filter the columns of a plane `(h, w)`, and write each part into its place."""
-    if lines.middle is None or lines.last is None:
-        torch.mm(lines.first, plane, out=result)
+    if lines.dense is not None:
+        torch.mm(lines.dense, plane, out=result)
         return
-    top, bottom = len(lines.first), lines.length - len(lines.last)
-    torch.mm(lines.first, plane[: lines.first.shape[1]], out=result[:top])
-    torch.mm(lines.last, plane[plane.shape[0] - lines.last.shape[1] :], out=result[bottom:])
-    inner = result[top:bottom].unflatten(0, (len(lines.middle), -1))
-    torch.bmm(lines.middle, _windows(plane, lines, lines.middle), out=inner)
+    _, edge, span = lines.ends.shape
+    torch.bmm(lines.ends, _both_ends(plane, span), out=_both_ends(result, edge))
+    inner = result[lines.rows : lines.rows + lines.middle.shape[:2].numel()].unflatten(0, (len(lines.middle), -1))
+    torch.bmm(lines.middle, _windows(plane, lines), out=inner)
 
 
-def _windows(image: Tensor, lines: Lines, middle: Tensor) -> Tensor:
+def _both_ends(plane: Tensor, rows: int) -> Tensor:
+    """The first and the last rows of a plane, `(2, rows, w)`, which may overlap."""
+    (height, width), (step, along) = plane.shape, plane.stride()
+    return plane.as_strided((2, rows, width), ((height - rows) * step, step, along), plane.storage_offset())
+
+
+def _windows(image: Tensor, lines: Lines) -> Tensor:
     """The overlapping input windows of the tiles, `(..., tiles, window, w)`."""
-    tiles, _, window = middle.shape
+    tiles, _, window = lines.middle.shape
     stop = lines.start + (tiles - 1) * lines.shift + window
     return image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT

@@ -18,8 +18,9 @@ Convention = Literal["kornia", "opencv"]
 # gradients.
 _AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-# Input pixels that one tile covers: with fewer the products are slow, with more they multiply more zeros.
-_SHIFT = 32
+# Input pixels that one tile covers, down and across: with fewer the products are slow, with more they multiply more
+# zeros. Across they are slow sooner.
+_SHIFTS = 8, 32
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
     wide = widened(image)
-    down, across = (_reducing(count, convention, wide.dtype, image.device) for count in image.shape[-2:])
+    sides = zip(image.shape[-2:], _SHIFTS, strict=True)
+    down, across = (_reducing(count, shift, convention, wide.dtype, image.device) for count, shift in sides)
     return separable(wide, down, across).to(image.dtype)
 
 
@@ -133,8 +135,8 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
     """`pyrup` without the checks."""
     if _runs_in_kornia(image, convention, size):
         return _kornia().pyrup(image.contiguous())
-    lengths, wide = zip(image.shape[-2:], size, strict=True), widened(image)
-    down, across = (_expanding(count, length, convention, wide.dtype, image.device) for count, length in lengths)
+    sides, wide = zip(image.shape[-2:], size, _SHIFTS, strict=True), widened(image)
+    down, across = (_expanding(*side, convention, wide.dtype, image.device) for side in sides)
     return separable(wide, down, across).to(image.dtype)
 
 
@@ -226,18 +228,20 @@ def _check(image: Tensor, convention: Convention, levels: int | None = None) -> 
 
 
 @constant
-def _reducing(count: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
+def _reducing(count: int, shift: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
     """The matrix of `pyrdown` for a line of `count` pixels."""
     if convention == "opencv":
         taps = _blur(torch.arange(0, count, 2), count)
     else:
         taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
     # Halving an odd number of pixels shifts positions by one pixel from one end of the line to the other.
-    return banded(taps, count, _SHIFT // 2, _SHIFT, 2 + count % 2, dtype, device)
+    return banded(taps, count, shift // 2, shift, 2 + count % 2, dtype, device)
 
 
 @constant
-def _expanding(count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
+def _expanding(
+    count: int, length: int, shift: int, convention: Convention, dtype: torch.dtype, device: torch.device
+) -> Lines:
     """The matrix of `pyrup` from a line of `count` pixels to one of `length` pixels."""
     if convention == "opencv":
         # The blur of a line with zeros in between, mirrored before its first pixel and continued after its last.
@@ -249,7 +253,7 @@ def _expanding(count: int, length: int, convention: Convention, dtype: torch.dty
     else:
         taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
     drift = abs(length - 2 * count)
-    return banded(taps, count, 2 * _SHIFT, _SHIFT if drift <= 1 else count, 2 + drift, dtype, device)
+    return banded(taps, count, 2 * shift, shift if drift <= 1 else count, 2 + drift, dtype, device)
 
 
 def _blur(place: Tensor, count: int) -> Taps:

@@ -53,7 +53,9 @@ def test_only_long_lines_are_split_into_tiles():
     index = torch.arange(400)[:, None]
     taps = Taps(index, torch.ones(400, 1, dtype=torch.float64))
     lines = banded(taps, 400, 8, 8, 1, torch.float32, torch.device("cpu"))
-    assert lines.middle is not None
+    assert lines.dense is None
     assert lines.middle.shape == (48, 8, 10)
     assert lines.middle.stride(0) == 0, "equal tiles share one matrix"
-    assert banded(Taps(index[:100], taps.weight[:100]), 100, 8, 8, 1, torch.float32, torch.device("cpu")).middle is None
+    assert (
+        banded(Taps(index[:100], taps.weight[:100]), 100, 8, 8, 1, torch.float32, torch.device("cpu")).dense is not None
+    )
