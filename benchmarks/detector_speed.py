@@ -39,7 +39,6 @@ def programs(detector: Detector, images: Tensor) -> dict[str, Run]:
 def measure(options: argparse.Namespace) -> list[list[str]]:
     """Measure, and return the rows of the table."""
     torch.set_num_threads(options.threads)
-    torch.empty(31 << 20, dtype=torch.uint8)  # freeing it makes the C library keep memory, as in evaluation workers
     rows = []
     for stride in (32, None):
         loaded = [load_yolo(options.detector, weights=options.weights, stride=stride, runtime=r) for r in RUNTIMES]

@@ -8,10 +8,6 @@ fixations are timed part by part: sensor, detector, belief and policy.
 Repetitions are interleaved, each in another order. Times are medians over repetitions; ratios and shares are given with
 quartiles. The observation model changes no score, but costs as much as a fitted one.
 
-If a ratio stays above 1 without spinning, memory is the cause: glibc returns freed blocks of several MB to the system,
-and every fixation has to request its pages again. `--keep-memory` frees one block of 31 MB at the start, after which
-glibc keeps up to 62 MB.
-
 python -m benchmarks.interleave
 python -m benchmarks.interleave --model yolox_nano.onnx
 
@@ -178,15 +174,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", help="threads of torch and onnxruntime (default: 1 and all)")
     parser.add_argument("--repetitions", type=int, default=20, help="number of repetitions")
     parser.add_argument("--fixations", type=int, default=10, help="number of fixations in every repetition")
-    parser.add_argument("--keep-memory", action="store_true", help="make the C library keep freed memory")
     parser.add_argument("--processor-time", action="store_true", help="CPU time of the calling thread; 1 thread")
     options = parser.parse_args()
     options.threads = options.threads or sorted({1, torch.get_num_threads()})
     clock = time.perf_counter
     if options.processor_time:
         options.threads, clock = [1], time.thread_time
-    if options.keep_memory:
-        torch.empty(31 << 20, dtype=torch.uint8)
     image = photograph()
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         path = options.model

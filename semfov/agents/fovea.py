@@ -14,7 +14,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
 from semfov.belief.verification import Verification
-from semfov.data.inputs import Color, ImageLike, as_image
+from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import (
     MOST_CLOSER,
     OUTCOMES,
@@ -266,7 +266,8 @@ class FoveaEpisode(Episode[Scanpath]):
 
     def _look_at(self, frame: ImageLike) -> RecordedLook | None:
         """Spend a frame of a stream on a look."""
-        image = as_image(frame, like=self.eye.sensor.like, argument="frame", color=self.color)[None]
+        self._pixels = as_pixels(frame, argument="frame", color=self.color)
+        image = as_image(self._pixels, like=self.eye.sensor.like, argument="frame")[None]
         self._check_size((image.shape[-1], image.shape[-2]))
         self._faded += self.passed
         self._frame += self.passed
@@ -407,7 +408,11 @@ class FoveaEpisode(Episode[Scanpath]):
             probability = belief.probability(self.target)[0]
         # Reduced by a whole number: resampling a large frame takes as long as a look.
         side = -(-max(self._image.shape[-2:]) // _LONGEST)
-        small = self._image if side == 1 else F.avg_pool2d(self._image, side, ceil_mode=True, count_include_pad=False)
+        if side == 1 and self._pixels.dtype == torch.uint8:
+            photograph = self._pixels[0].clone().cpu()  # the frame may be in memory that takes the next one
+        else:
+            small = F.avg_pool2d(self._image, side, ceil_mode=True, count_include_pad=False)
+            photograph = in_bytes(small[0])
         return FoveaMoment(
             classes=self.classes,
             target=self.target,
@@ -423,7 +428,7 @@ class FoveaEpisode(Episode[Scanpath]):
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
             seconds=seconds,
             closer=None if closer is None else replace(closer, fixation=0),
-            photograph=in_bytes(small[0]),
+            photograph=photograph,
         )
 
     @property

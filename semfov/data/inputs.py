@@ -91,13 +91,20 @@ def as_images(
 
     Shapes: → `(B, 3, H, W)`.
     """
-    check_white(white)
-    pixels = channels_first(pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
-    pixels = in_rgb(pixels, images, color)
+    pixels = as_pixels(images, argument=argument, color=color, white=white)
     whole, pixels = not pixels.is_floating_point(), _in_unit(pixels, like, argument)
     if not whole:
         check_pixels(pixels, argument)
     return pixels
+
+
+def as_pixels(
+    images: ImageLike, *, argument: str = "image", color: Color = "rgb", white: White | None = None
+) -> Tensor:
+    """The pixels of a picture or a batch, RGB `(B, 3, H, W)`, with the numbers as they are given (`as_images`)."""
+    check_white(white)
+    pixels = channels_first(pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
+    return in_rgb(pixels, images, color)
 
 
 def as_batch(images: ImageLike) -> Tensor:

@@ -223,8 +223,8 @@ class Verifier(Generic[LookType]):
         weight = self.places.forgetting.keep**age
         if weight == 1:
             return before
-        odds, present = torch.tensor([before, now], dtype=torch.float64).logit(_FLOOR)
-        return float((weight * odds + (1 - weight) * present).sigmoid())
+        odds, present = (math.log(p / (1 - p)) for p in (min(max(p, _FLOOR), 1 - _FLOOR) for p in (before, now)))
+        return 1 / (1 + math.exp(-(weight * odds + (1 - weight) * present)))
 
 
 def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:

@@ -1,5 +1,6 @@
 """Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
 
+import math
 from typing import Any, Literal, TypeVar, get_args
 
 import torch
@@ -11,6 +12,9 @@ from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 
 _Padding = Literal["zeros", "border", "fill"]
+# Pixels of a canvas that are resampled together: with fewer the products are slow, with more they multiply more zeros.
+_TOGETHER = 32
+
 _Length = TypeVar("_Length", float, Tensor)
 
 
@@ -159,9 +163,32 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
     part = image[:, top:bottom, left:right]
     across, down = across.to(part), down.to(part)
-    if value:
-        return down @ (part - value) @ across.mT + value
-    return down @ part @ across.mT
+    part = part - value if value else part
+    recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
+    if recorded or not part.numel() or image.device.type != "cpu" or not values_known(image, box):
+        canvas = down @ part @ across.mT
+    else:
+        # The matrices are zero far from their diagonals.
+        x1, y1, x2, y2 = box.tolist()
+        between = part.new_empty(len(part), size[1], part.shape[-1])
+        canvas = part.new_empty(len(part), size[1], size[0])
+        _fill(between, down, part, y1 - top, y2 - top)
+        _fill(canvas.mT, across, between.mT, x1 - left, x2 - left)
+    return canvas + value if value else canvas
+
+
+def _fill(result: Tensor, weight: Tensor, part: Tensor, low: float, high: float) -> None:
+    """Resample the columns of planes `(C, n, w)`, some pixels of the canvas at a time, from the pixels they show."""
+    count, length = weight.shape
+    step = (high - low) / count
+    reach = max(step, 1.0) + 1  # and a pixel for rounding
+    together = _TOGETHER if length > 4 * _TOGETHER else count
+    for first in range(0, count, together):
+        last = min(first + together, count)
+        start = min(max(math.floor(low + (first + 0.5) * step - reach), 0), length - 1)
+        stop = min(max(math.ceil(low + (last - 0.5) * step + reach), start + 1), length)
+        some = weight[first:last, start:stop].expand(len(part), -1, -1)
+        torch.bmm(some, part[:, start:stop], out=result[:, first:last])
 
 
 def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:

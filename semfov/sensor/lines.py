@@ -21,6 +21,10 @@ _SMALL = 160
 # Pixels of planes that are filtered together.
 _CACHED = 1 << 19
 
+# The C library returns freed blocks of several MB to the system, and every look would request their pages again. Once
+# a block of this size was freed, it keeps up to twice as much.
+torch.empty(31 << 20, dtype=torch.uint8)
+
 _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
 

@@ -10,7 +10,7 @@ from benchmarks.interleave import main
 
 @pytest.mark.lab
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time", "--keep-memory"]])
+@pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time"]])
 def test_benchmark_prints_its_tables(make_onnx, monkeypatch, capsys, options):
     model = make_onnx(
         {"output": np.random.default_rng(0).random((1, 84, 85)).astype(np.float32) - 0.5 * (np.arange(85) < 4)}
