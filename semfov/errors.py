@@ -179,7 +179,7 @@ def check_pixels(image: Tensor, argument: str) -> None:
         return
     # In the order of memory, which is several times faster than across it.
     in_memory = image.detach().permute(sorted(range(image.ndim), key=image.stride, reverse=True))
-    least, most = (float(bound) for bound in in_memory.aminmax())
+    least, most = torch.stack(in_memory.aminmax()).tolist()
     inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
     got = "NaN" if math.isnan(least) else f"numbers from {least:g} to {most:g}"
     check(inside, argument, "RGB in [0, 1]", f"{got}; {_to_unit(least, most)}")

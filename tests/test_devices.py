@@ -230,6 +230,16 @@ def explored(count: int) -> object:
     return value(belief, torch.zeros(count, 4, dtype=torch.bool, device=GPU))
 
 
+def test_an_episode_believes_on_the_cpu_what_an_eye_on_the_gpu_sees():
+    agent, image = small.agent(small.Coloured()), small.rand(3, 120, 160)
+    here = agent.search(image, "green", how="fovea", shifts=3)
+    with torch.no_grad(), a_gpu():
+        there = agent.to(GPU).search(image, "green", how="fovea", shifts=3)
+    assert there.probabilities.device == CPU
+    torch.testing.assert_close(there.cells, here.cells)
+    torch.testing.assert_close(there.probabilities, here.probabilities, rtol=1e-3, atol=1e-4)
+
+
 def test_a_copy_on_the_cpu_is_made_once_for_each_state_of_a_module():
     with torch.no_grad(), a_gpu():
         module = nn.Linear(2, 1).to(GPU)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.agents.episode import Episode, EpisodeLimits
+from semfov.agents.episode import Episode, EpisodeLimits, on_cpu
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
@@ -104,7 +104,7 @@ class FoveaAgent:
         policy: str | None = None,
     ) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`)."""
-        observer = self.exploring.observer
+        observer = on_cpu(self.exploring.observer)
         if worth and not isinstance(observer, LearnedMap):
             raise InputError(
                 f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
@@ -203,12 +203,16 @@ class FoveaEpisode(Episode[Scanpath]):
         super().__init__(("background", *agent.eye.detector.classes), target, (), limits, rate)
         usual = agent.exploring if target is None else agent.searching
         self.agent, self.eye, self.color, self.viewed = agent, agent.eye, color, viewed
-        self.strategy = usual if strategy is None else strategy
-        self.verification, self.closer = None if target is None else agent.deciding(closer), closer
+        chosen, mapper = usual if strategy is None else strategy, agent.exploring.observer
+        # The belief of one episode is on the CPU, wherever the eye is.
+        self.strategy = on_cpu(chosen)
+        self._beside = None if mapper is chosen.observer else on_cpu(mapper)
+        model = None if target is None else agent.deciding(closer)
+        self.verification, self.closer = None if model is None else on_cpu(model), closer
         own = self.strategy.observer.thresholds
-        chosen = own if self.verification is None else self.verification.thresholds
+        usually = own if self.verification is None else self.verification.thresholds
         fading = own.give_up if rate and own is not None else None
-        self.thresholds = None if chosen is None else chosen.changed(give_up=fading).changed(confirm, give_up)
+        self.thresholds = None if usually is None else usually.changed(give_up=fading).changed(confirm, give_up)
         self.ends: Callable[[Step], Tensor] | None = None
         self.to_goal = False
         self._most = sys.maxsize if shifts is None else shifts + 1
@@ -230,11 +234,11 @@ class FoveaEpisode(Episode[Scanpath]):
         """
         self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
         start, generator = self._first
-        self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target)
-        first, viewed = torch.tensor([start], device=image.device), self.viewed
-        choice: Choice = Greedy(drawn_by(generator, len(grid), image))
+        self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target, device=torch.device("cpu"))
+        first, viewed = torch.tensor([start]), self.viewed
+        choice: Choice = Greedy(drawn_by(generator, len(grid), self._looks.like))
         if viewed is not None:
-            choice = Viewer(viewed.model, viewed.terms, grid, first.cpu(), generator)
+            choice = Viewer(viewed.model, viewed.terms, grid, first, generator)
         self._steps: Iterator[Step] = rollout(
             self._looks,
             self.strategy.observer,
@@ -251,9 +255,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._recent: deque[tuple[float, Detections]] = deque(maxlen=_MOST_RECENT if self.forgetting else None)
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
         if self.forgetting is None:
-            mapper = self.agent.exploring.observer
-            beside = None if mapper is self.strategy.observer else mapper
-            self._trace = Trace(grid, self.classes, self.target, beside, self.eye.detector.least)
+            self._trace = Trace(grid, self.classes, self.target, self._beside, self.eye.detector.least)
             self._stimulus = Stimulus.of(self.eye, image)
         return grid
 
@@ -314,7 +316,7 @@ class FoveaEpisode(Episode[Scanpath]):
 
     def _close_up(self, box: Tensor) -> Detections:
         self.passes += 1
-        self._closely = self.eye.close_up(self._image, box)
+        self._closely = self.eye.close_up(self._image, box).to(box.device)
         return self._closely
 
     def _looked(

@@ -198,9 +198,7 @@ def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool
     middle = low + (torch.arange(count).to(low) + 0.5) * step
     if not values_known(low, high):
         return _weights_of_all(middle, reach, length, border=border), (0, length)
-    around = float(reach.detach())
-    first = int((low.detach() - around).floor())
-    last = int((high.detach() + around).ceil()) + 1
+    first, last = torch.stack([(low - reach).floor(), (high + reach).ceil() + 1]).detach().long().tolist()
     pixel = torch.arange(first, last, device=low.device)
     weight = (1 - (middle[:, None] - (pixel.to(low) + 0.5)).abs() / reach).clamp(min=0)
     weight = weight / weight.sum(-1, keepdim=True)
