@@ -43,13 +43,21 @@ def material(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def runs():
+    """Folders of finished runs, by the name of the command."""
+    return {}
+
+
 @pytest.fixture(scope="module", params=RUN)
-def finished(request, material, tmp_path_factory):
+def finished(request, material, runs, tmp_path_factory):
     """A command, the settings of its small run, and the folder of the finished run."""
-    name, folder = request.param, tmp_path_factory.mktemp("command")
+    name = request.param
     settings = [word.replace("HERE", str(material)) for word in COMMANDS[name].settings]
-    assert run(name, *words(name, folder, *settings)) == 0
-    return name, settings, folder
+    if name not in runs:
+        runs[name] = tmp_path_factory.mktemp("command")
+        assert run(name, *words(name, runs[name], *settings)) == 0
+    return name, settings, runs[name]
 
 
 def test_a_run_writes_its_files(finished):
@@ -82,8 +90,8 @@ def test_the_same_bits_from_two_workers(finished, tmp_path):
     assert contents(name, tmp_path) == contents(name, folder)
 
 
-SHARE = {"no store": ("eval.search", "eval.zoom"), "small batches": ("eval.search", "eval.explore")}
-"""Commands with a store or with batches of their own; the others share them."""
+SHARE = {"no store": ("eval.search",), "small batches": ()}
+"""Commands that are enough: `lab/test_zoom` has the other store, and the tests of the protocols have batches."""
 
 
 @pytest.mark.parametrize(
