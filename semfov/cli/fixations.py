@@ -10,7 +10,7 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
-from semfov.data.fixations.reading import frame_of
+from semfov.data.fixations.reading import frame_of, json_reader
 from semfov.errors import InputError, SemfovError, check, printable
 
 
@@ -34,14 +34,16 @@ def check_fixations(options: CheckOptions) -> int:
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
             continue
-        print(f"{printable(name)}: {_content(records)}")
+        kind = json_reader(Path(name))[0] if name.lower().endswith(".json") else None
+        usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
+        print(f"{printable(name)}: {_content(records, usual)}")
         print(*(f"  suspicious: {line}" for line in lines), sep="\n") if lines else print("  nothing is suspicious")
         wrong = wrong or bool(lines)
     return 1 if wrong else 0
 
 
-def _content(records: list[Fixations]) -> str:
-    """What is in the records, in a line."""
+def _content(records: list[Fixations], usual: str) -> str:
+    """What is in the records, in a line; `usual` is said of frames that the file does not tell."""
     if not records:
         return "no fixations"
     people, pictures = ({getattr(each, name) for each in records} for name in ("subject", "picture"))
@@ -51,4 +53,4 @@ def _content(records: list[Fixations]) -> str:
     words = ", ".join(f"{n} {name if n == 1 else {'person': 'people'}.get(name, f'{name}s')}" for n, name in counts)
     times = [each.durations for each in records if each.durations is not None]
     lasting = f"; they take {np.median(np.concatenate(times)):g} ms in the median" if times else "; without durations"
-    return f"{words}, {len(pictures)} picture{'' if len(pictures) == 1 else 's'}, frames of {frames}{lasting}"
+    return f"{words}, {len(pictures)} picture{'' if len(pictures) == 1 else 's'}, frames of {frames}{usual}{lasting}"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from semfov.errors import DataError
-from semfov.io.files import check_regular
+from semfov.io.files import check_regular, read_text
 from semfov.io.schema import excerpt
 
 _MOST_BYTES = 2**20
@@ -91,7 +91,7 @@ def read_cfg(path: str | PathLike[str]) -> list[Section]:
         if Path(path).stat().st_size > _MOST_BYTES:
             size = Path(path).stat().st_size
             raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes, got {size:,}")
-        return _parse_cfg(Path(path).read_text(encoding="utf-8"), str(path))
+        return _parse_cfg(read_text(path), str(path))
     except OSError as error:
         raise DataError(f"cannot read the cfg {str(path)!r}: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -19,7 +19,7 @@ from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import YoloV3
 from semfov.errors import DataError, InputError, check, check_options, lookup
-from semfov.io.files import check_regular
+from semfov.io.files import check_regular, read_text
 
 _WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; give 'x.cfg' with weights='{}'"
 _PICKLE = (
@@ -229,7 +229,7 @@ def class_lines(path: str | PathLike[str]) -> tuple[str, ...]:
     """Class names from the lines of a file."""
     check_regular(path)
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read the class names in {str(path)!r}: {error}") from error
     return tuple(line.strip() for line in lines if line.strip())

@@ -12,7 +12,7 @@ from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_heads import cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, inside, sha256, write_bytes
+from semfov.io.files import check_regular, inside, read_text, sha256, write_bytes
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _MOST_ELEMENTS = 2**28
@@ -141,7 +141,7 @@ def _read(path: Path) -> str:
     if path.stat().st_size > _MOST_METADATA:
         raise DataError(f"{path}: expected at most {_MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read {path}: {error}") from error
 

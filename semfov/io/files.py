@@ -114,6 +114,12 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
         raise DataError(f"cannot write {path}: no permission to write in {place}")
 
 
+def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
+    """The text of a file in UTF-8, UTF-16 or UTF-32, with a byte order mark or without."""
+    content = Path(path).read_bytes()
+    return content.decode(json.detect_encoding(content), errors)
+
+
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode())

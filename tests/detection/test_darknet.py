@@ -289,7 +289,7 @@ def test_refuses_unreadable_files(tmp_path):
     with pytest.raises(DataError, match=r"cannot read the cfg .*missing.cfg"):
         read_cfg(tmp_path / "missing.cfg")
     binary = tmp_path / "binary.cfg"
-    binary.write_bytes(b"\xff\xfe\x00\x9f")
+    binary.write_bytes(b"\x9f\xfe\x07\x9f")
     with pytest.raises(DataError, match="a file that is not text"):
         read_cfg(binary)
 

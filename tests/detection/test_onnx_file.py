@@ -74,7 +74,7 @@ def test_invalid_settings_are_refused_with_the_name_of_the_file(tmp_path, text, 
 
 
 def test_binary_settings_files_are_refused(tmp_path):
-    (tmp_path / "model.json").write_bytes(b"\xff\xfe")
+    (tmp_path / "model.json").write_bytes(b"\x9f\xfe\x07\x9f")
     with pytest.raises(DataError, match="cannot read"):
         read_settings(tmp_path / "model.onnx", {})
 

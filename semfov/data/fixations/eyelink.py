@@ -12,7 +12,7 @@ import numpy as np
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular
+from semfov.io.files import check_regular, read_text
 
 _PICTURE = re.compile(r"^(?:!V IMGLOAD \S+|!V TRIAL_VAR (?:image|picture|img|stimulus))\s+(\S+)", re.IGNORECASE)
 _SIDE = r"[\s,]+(-?[\d.]+)"
@@ -58,7 +58,7 @@ def read_eyelink(
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     check_regular(path)
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = read_text(path, "replace").splitlines()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error}); correct or replace the file") from None
     trials: list[tuple[str, dict[str, list[tuple[float, float, float]]]]] = []

@@ -14,7 +14,7 @@ import numpy as np
 from semfov.data.fixations.record import Fixations, ObjectBox, by_picture
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check
-from semfov.io.files import check_regular, write_text
+from semfov.io.files import check_regular, read_text, write_text
 from semfov.io.schema import Anything, Array, Json, Maybe, Number, Object, Text
 
 _PIXELS = Array(Number(low=-1e6, high=1e6), least=1)
@@ -334,7 +334,7 @@ def _read(path: Path, kind: Json) -> Any:
     """The content of a JSON file; errors name the file, the record and the field."""
     check_regular(path)
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_text(path))
     except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
     try:

@@ -13,8 +13,8 @@ from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import of_source, read_table
-from semfov.errors import DataError, InputError
-from semfov.io.files import check_regular
+from semfov.errors import DataError, InputError, check
+from semfov.io.files import check_regular, read_text
 
 
 def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fixations]:
@@ -26,7 +26,7 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
 
     Args:
         source: the file or table.
-        **options: arguments of the reader, such as `size`.
+        **options: arguments of the reader, such as `size` (for a file of COCO-Search18 the screen).
 
     Returns:
         One record for each scanpath.
@@ -46,23 +46,31 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     if kind == ".asc":
         return read_eyelink(source, **options)
     if kind == ".json":
-        return _json_reader(Path(source))(source, **options)
+        name, reader = json_reader(Path(source))
+        if "size" in options and reader is not read_osie:
+            has = f"none for {source}, a file of {name}, whose frame is that of each trial"
+            check(reader is read_cocosearch, "size", has, options["size"])
+            options = {"screen": options["size"], **{key: each for key, each in options.items() if key != "size"}}
+        try:
+            return reader(source, **options)
+        except DataError as error:
+            raise DataError(f"{error}; it was read as a file of {name}") from None
     _, header, _ = of_source(source)
     ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or "columns" in options
     return read_export(source, **options) if is_export(header) and not ours else read_table(source, **options)
 
 
-def _json_reader(path: Path) -> Callable[..., list[Fixations]]:
-    """The reader of a file of JSON."""
+def json_reader(path: Path) -> tuple[str, Callable[..., list[Fixations]]]:
+    """The data set that a file of JSON has the form of, and its reader."""
     check_regular(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
     if isinstance(content, list):
-        return read_cocosearch
+        return "COCO-Search18", read_cocosearch
     people = isinstance(content, dict) and any(isinstance(each, list) for each in content.values())
-    return read_osie if people else read_ruarte
+    return ("OSIE", read_osie) if people else ("Ruarte and others", read_ruarte)
 
 
 def frame_of(text: str) -> tuple[int, int]:

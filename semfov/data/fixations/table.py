@@ -16,7 +16,7 @@ import numpy as np
 from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check, lookup
-from semfov.io.files import check_regular, write_text
+from semfov.io.files import check_regular, read_text, write_text
 
 Units = Literal["pixels", "fractions"]
 """Unit of the coordinates of a table: pixels, whose centres are at integers, or fractions of the sides of the frame."""
@@ -30,7 +30,6 @@ _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
-_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 _BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
 """What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
@@ -139,9 +138,7 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     """Names of the columns of a file, and its lines; decimal commas become points."""
     check_regular(path)
     try:
-        content = path.read_bytes()
-        encoding = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "utf-8")
-        text = content.decode(encoding)
+        text = read_text(path)
         before = _BEFORE.match(text)
         text = text[before.end() :] if before else text
         first = text.partition("\n")[0]

@@ -96,6 +96,14 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
     assert "give --size" in capsys.readouterr().err
     assert main([*command, "--size", "1600,1200"]) == 0
     assert main([*command, "--size", "wide"]) == 1
+    write_osie(tmp_path / "free.json", people(2))
+    write_cocosearch(tmp_path / "search.json", people(2))
+    capsys.readouterr()
+    for name, usual, data in (("free", "800 × 600", "OSIE"), ("search", "1680 × 1050", "COCO-Search18")):
+        main(["check", str(tmp_path / f"{name}.json")])
+        assert f"frames of {usual} (those of {data}, or give --size)" in capsys.readouterr().out
+        main(["check", str(tmp_path / f"{name}.json"), "--size", "1024,768"])
+        assert "frames of 1024 × 768; " in capsys.readouterr().out
 
 
 def test_a_file_tells_its_reader(tmp_path):
