@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, TextIO, get_args, get_type_hints
@@ -46,10 +46,10 @@ class _SearchJob(PictureJob):
     drawings = get_args(Drawing)
 
     def __init__(self, options: SearchOptions, agent: ActivePerception | None = None) -> None:
+        super().__init__(options)
         if not options.target:
             name = options.detector if options.models is None else options.models
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
-        super().__init__(options)
         self.start = _check(options)
         classes = detector_classes(options) if agent is None else agent.classes[1:]
         weights = None if classes is None else _meant(options, classes)
@@ -133,7 +133,24 @@ _turn = threading.Lock()
 
 def look_at(options: PictureOptions, stream: TextIO) -> int:
     """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
+    options = _with_target(options)
     return int(any("error" in row for row in look_at_pictures(_JOBS[type(options)](options), stream)))
+
+
+def _with_target(options: PictureOptions) -> PictureOptions:
+    """The options, with the target that stands among the pictures: `semfov search kitchen.jpg cup`."""
+    words = [name for name in options.pictures if Path(name).name == name and not Path(name).suffix]
+    words = [name for name in words if not os.path.lexists(name) and not set(name) & set("*?[")]
+    if not isinstance(options, SearchOptions | FindOptions) or options.target is not None or len(words) != 1:
+        return options
+    pictures, classes = tuple(name for name in options.pictures if name not in words), detector_classes(options)
+    if not pictures or classes is None:
+        return options
+    try:
+        several_classes(words[0], classes)
+    except InputError:
+        return options  # it is refused as a picture that is not there, with the way to name a class
+    return replace(options, target=words[0], pictures=pictures)
 
 
 def run(

@@ -14,11 +14,9 @@ from torch import Tensor
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import GazeOptions, PictureOptions, shown_by
 from semfov.data.large import open_large, picture_size
-from semfov.data.sources import Picture, picture_files
+from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
 from semfov.errors import check, printable
 from semfov.head import Flat, Panorama
-
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 class PictureSource(NamedTuple):
@@ -58,7 +56,7 @@ class PictureSource(NamedTuple):
 
 def _is_video(source: Path) -> bool:
     """Tell by its name whether a file is a video."""
-    return source.suffix.lower() in _VIDEOS and not source.is_dir()
+    return source.suffix.lower() in VIDEOS and not source.is_dir()
 
 
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
@@ -68,7 +66,10 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
     # A file may have brackets in its name, as copies do: photo[1].jpg.
     patterns = (name if set(name) & set("*?[") and not os.path.lexists(name) else None for name in pictures)
     matched = ([] if pattern is None else sorted(glob(pattern, recursive=True)) for pattern in patterns)
-    for name in (each for one, some in zip(pictures, matched, strict=True) for each in some or [one]):
+    names = [each for one, some in zip(pictures, matched, strict=True) for each in some or [one]]
+    # What a shell makes of `flight/*` is what is in a folder.
+    kept = {*photographs([Path(name) for name in names], "pictures")} if len(names) > 1 else set()
+    for name in [name for name in names if Path(name) in kept] or names:
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         there = path.exists() or bool(path.suffix) or len(path.parts) > 1

@@ -20,7 +20,7 @@ from torch import Tensor
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, InputError, printable
 from semfov.io.files import check_regular
 
 PHOTOGRAPHS = (
@@ -29,6 +29,9 @@ PHOTOGRAPHS = (
     *(".ppm", ".pgm", ".pbm", ".pnm", ".pfm"),
 )
 """Ends of the names of photographs."""
+
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+"""Ends of the names of videos."""
 
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -58,12 +61,10 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
     if not source.is_dir():
         return [source]
     # Names that begin with a dot are notes of the system, such as the ._a.jpg of an Apple disk.
-    files = sorted(
-        path
-        for path in (source.rglob("*") if recursive else source.iterdir())
-        if path.suffix.lower() in PHOTOGRAPHS
-        and not any(part.startswith(".") for part in path.relative_to(source).parts)
-    )
+    within = source.rglob("*") if recursive else source.iterdir()
+    seen = [path for path in within if not any(part.startswith(".") for part in path.relative_to(source).parts)]
+    files = sorted(path for path in seen if path.suffix.lower() in PHOTOGRAPHS)
+    photographs(seen, str(source))
     mosaics = [path.name for path in source.iterdir() if path.suffix.lower() == ".vrt"]
     if mosaics:
         remedy = "as their files are there, too; name them to look at them"
@@ -73,6 +74,18 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
         expected = f"photographs ({', '.join(PHOTOGRAPHS)}) in {source}, {where}"
         raise DataError(f"picture: expected {expected}, got none")
     return files
+
+
+def photographs(paths: Sequence[Path], where: str) -> list[Path]:
+    """The paths without the files whose names end as those of videos, texts and others, with a warning of these."""
+    kinds = {"", ".vrt", *PHOTOGRAPHS}
+    others = {path: None for path in paths if path.suffix.lower() not in kinds and path.is_file()}
+    if others:
+        count, such = len(others), printable(min(others).name)
+        kept = "1 file is no photograph and is" if count == 1 else f"{count} files are no photographs and are"
+        video = "; `semfov live` takes videos" if any(path.suffix.lower() in VIDEOS for path in others) else ""
+        warnings.warn(f"{where}: {kept} left out, {'' if count == 1 else 'such as '}{such}{video}", stacklevel=3)
+    return [path for path in paths if path not in others]
 
 
 def _check_there(source: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -16,7 +17,8 @@ from pycocotools.coco import COCO
 
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
-from semfov.cli.options import FindOptions
+from semfov.cli.options import FindOptions, SearchOptions
+from semfov.cli.search import _with_target
 from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth, read_truth
 from semfov.data import read_image
@@ -322,6 +324,23 @@ def test_folders_have_pictures_of_all_formats_that_are_read_alone(tmp_path):
         picture.save(tmp_path / f"a.{suffix}", kind)
     assert len(picture_files(tmp_path)) == len(kinds)
     assert all(read_image(path).shape == (3, 6, 8) for path in picture_files(tmp_path))
+
+
+def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_them(folder):
+    for name in ("film.mp4", "notes.txt"):
+        (folder / name).touch()
+    said = r"2 files are no photographs and are left out, such as film.mp4; `semfov live` takes videos"
+    shown = []
+    for names in ([folder], sorted(folder.iterdir()), [folder / "*"]):
+        with pytest.warns(UserWarning, match=said):
+            sources = picture_sources(FindOptions(pictures=tuple(map(str, names))))
+        shown.append([source.file for source in sources])
+    assert shown[0] == shown[1] == shown[2] != []
+    options = SearchOptions(pictures=("a.jpg", "Cups", "b.jpg"))
+    assert _with_target(options) == replace(options, pictures=("a.jpg", "b.jpg"), target="Cups")
+    for others in (("a.jpg", "cupp"), ("a.jpg", "cup", "fork"), ("cup",)):
+        options = FindOptions(pictures=others)
+        assert _with_target(options) is options
 
 
 def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_path):

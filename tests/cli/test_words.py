@@ -25,6 +25,8 @@ REFUSED = {
     "explore film.mp4": "picture: expected photographs; `semfov live` takes videos, got film.mp4",
     "explore http://example.org/a.jpg": "picture: expected a file on this machine",
     "explore FOLDER": "and --recursive also searches the folders in it, got none",
+    "search nosuch.jpg cup": "picture: no such file or folder: nosuch.jpg; check the path",
+    "search zebr nosuch.jpg": "picture: expected a file or folder (a class is given by --target zebr), got zebr",
     "find nosuch --target cup": "picture: expected a file or folder (a class is given by --target nosuch)",
     "find --classes cup": "classes: expected none for yolov3-tiny, which has its own; --target names",
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
