@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.beliefs import exploration, kaplan_update, predictive_search
+from benchmarks.beliefs import compiled, exploration, kaplan_update, predictive_search
 from benchmarks.fits import dirichlets
 from benchmarks.interleave import in_turn
 from benchmarks.kernels import fixations, half, lookahead, pictures, pyramid, roc_curve
@@ -33,6 +33,7 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     half,
     dirichlets,
     kaplan_update,
+    compiled,
     predictive_search,
     lambda: exploration("KL divergence"),
     lambda: exploration("negative entropy"),

@@ -117,6 +117,28 @@ def kaplan_update() -> Comparison:
     )
 
 
+def compiled() -> Comparison:
+    """Likelihoods of 30 detections fused into a map of 10 × 10 cells and 81 classes, compiled."""
+    with torch.inference_mode(False), torch.no_grad():  # tensors of inference count as new at each call
+        model, beta = make_model(), make_belief(100).beta
+    scores, footprint = make_look(100)
+    distance = torch.linspace(0, 0.6, DETECTIONS)[None]
+
+    calibrate, update = (torch.compile(each, fullgraph=True) for each in (model.calibrate, fuse))
+
+    def ours() -> Tensor:
+        result: Tensor = update(beta, calibrate(scores, distance), footprint)
+        return result
+
+    def eager() -> Tensor:
+        return fuse(beta, model.calibrate(scores, distance), footprint)
+
+    def agree() -> None:
+        torch.testing.assert_close(ours(), eager())
+
+    return Comparison("calibration and Kaplan's rule, 30 detections, compiled", ours, {"eager": eager}, {}, agree)
+
+
 def predictive_search() -> Comparison:
     """One decision of predictive search: the expected posterior of a target in every cell."""
     belief, model = make_belief(100), make_model()

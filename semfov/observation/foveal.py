@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.weak import WeakIdKeyDictionary
 
 from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, check_tensor, lookup, values_known
@@ -135,7 +136,6 @@ class FovealObservationModel(Pretrained):
                 table = alpha.new_zeros(size)
             self.register_buffer(name, table)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -389,18 +389,6 @@ class FovealObservationModel(Pretrained):
             model.check_compatible(detector.settings(), detector.classes)
         return model
 
-    def train(self, mode: bool = True) -> Self:
-        """Switch between training and evaluation mode, and drop the constants that evaluation mode caches.
-
-        Args:
-            mode: True for training mode.
-
-        Returns:
-            This model.
-        """
-        self._cache = None
-        return super().train(mode)
-
     def extra_repr(self) -> str:
         """Sizes for the `repr` of the module.
 
@@ -410,17 +398,15 @@ class FovealObservationModel(Pretrained):
         return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
 
     def _linear(self) -> tuple[Tensor, Tensor]:
-        """Weights and constants of the log likelihoods (`_linear_map`), cached in `eval` mode and without gradients."""
+        """Weights and constants of the log likelihoods (`_linear_map`), kept in `eval` mode and without gradients."""
         parameter = self.log_alpha
-        learning = self.training or (torch.is_grad_enabled() and parameter.requires_grad)
-        if learning or torch.compiler.is_compiling() or parameter.is_inference():
+        if self.training or (torch.is_grad_enabled() and parameter.requires_grad) or torch.compiler.is_exporting():
             return _linear_map(self.alpha)
-        key = (parameter, parameter._version, parameter.data_ptr())
-        kept = self._cache
-        if kept is None or kept[0] is not parameter or kept[1:3] != key[1:]:
-            with torch.inference_mode(False), torch.no_grad():
-                kept = self._cache = (*key, *_linear_map(parameter.exp()))
-        return kept[3:]
+        if torch.compiler.is_compiling():
+            # A graph would compute the gamma functions at each call, so that it takes ten times as long.
+            weight, constant = torch.ops.semfov.linear_map(parameter)
+            return weight, constant
+        return _kept_map(parameter)
 
 
 class FoldedObservationModel(FovealObservationModel):
@@ -468,3 +454,31 @@ def _linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
     # ln Γ of large parameters is much larger than the differences between likelihoods: compute it in float64.
     constant = -log_normaliser(by_level.to(torch.float64)).to(alpha.dtype)
     return (by_level - 1).flatten(0, 1), constant.flatten()
+
+
+_KEPT = WeakIdKeyDictionary()  # linear maps by the parameters they are made of, with the state of these then
+
+
+def _kept_map(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """`_linear_map` of parameters `ln α`, computed once for each of their states, without gradients."""
+    if log_alpha.is_inference():
+        return _linear_map(log_alpha.exp())
+    state = log_alpha._version, log_alpha.data_ptr()
+    kept: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
+    if kept is None or kept[0] != state:
+        with torch.inference_mode(False), torch.no_grad():
+            kept = _KEPT[log_alpha] = state, _linear_map(log_alpha.exp())
+    return kept[1]
+
+
+def _in_graph(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """`_kept_map` in memory that a compiled graph may write over."""
+    weight, constant = _kept_map(log_alpha)
+    return weight.clone(), constant.clone()
+
+
+# An operation into which compilation does not look.
+_OPERATIONS = torch.library.Library("semfov", "FRAGMENT")
+_OPERATIONS.define("linear_map(Tensor log_alpha) -> (Tensor, Tensor)")
+_OPERATIONS.impl("linear_map", _in_graph, "CompositeExplicitAutograd")
+_OPERATIONS.impl("linear_map", lambda log_alpha: _linear_map(log_alpha.exp()), "Meta")

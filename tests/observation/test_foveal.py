@@ -343,3 +343,16 @@ def test_values_that_are_no_tensors_of_numbers_between_0_and_1_are_refused_with_
         FovealObservationModel([[[1.0]]], [0.2], ("cup", "cat"))
     with pytest.raises(InputError, match=r"^classes: expected a sequence of names, got 'cup'"):
         FovealObservationModel(torch.ones(3, 2, 3), [0.2], "cup")
+
+
+def test_a_compiled_model_follows_its_parameters():
+    """In evaluation the graph keeps what it derives from them, until they change."""
+    model = FovealObservationModel(table(), EDGES, CLASSES).eval()
+    scores, distance = torch.rand(1, 5, len(CLASSES) + 1).softmax(-1), torch.linspace(0, 1, 5)[None]
+    compiled = torch.compile(model.calibrate, fullgraph=True, backend="eager")
+    with torch.no_grad():
+        for factor in (1.0, 0.5):
+            model.log_alpha.mul_(factor)
+            expected = FovealObservationModel(model.alpha, EDGES, CLASSES).calibrate(scores, distance)
+            torch.testing.assert_close(compiled(scores, distance), expected)
+            torch.testing.assert_close(model.calibrate(scores, distance), expected)
