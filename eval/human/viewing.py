@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +38,8 @@ _Array = NDArray[np.float64]
 PEOPLE = "inter-observer"
 _BANDWIDTH = 0.08
 """Bandwidth of the clusters of fixations that make up the letters of a sequence, in longer sides of the picture."""
+_OF_ONE_MAP = {"readouts": 1, "units": 4}
+"""Settings of the readout of a saliency map, which is one channel."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,11 @@ def compare_viewing(config: ViewingConfig) -> None:
         opened = source()
         groups, store = look(config, opened), FoldStore(config.out, {**opened.what, "data": data})
         folds = [Fold(groups, number, config.folds) for number in numbers]
-        rows[name] = joined([store.scores(name, fold, fit) for fold in _bar(folds, name)])
+        own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
+        rows[name] = joined([store.scores(name, fold, own) for fold in _bar(folds, name)])
         if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
-            alone = GazeFit(**{**vars(fit), "saccade_epochs": 0})
+            alone = replace(fit, saccade_epochs=0)
             splits[f"{name}: half of the people, scored by the others"] = _by_people(
                 store, name, groups, alone, config.folds
             )
