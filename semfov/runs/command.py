@@ -285,9 +285,10 @@ def _setting_types(config: type[Any]) -> dict[str, Any]:
 
 
 def _is_list(hint: Any) -> bool:
-    """Whether a type is a list of words or paths of any length."""
+    """Whether a type is a list of words, paths or numbers of any length."""
     item, *more = get_args(hint) or (None,)
-    return get_origin(hint) is tuple and more == [Ellipsis] and (item in (str, Path) or get_origin(item) is Literal)
+    words = item in (str, Path, float) or get_origin(item) is Literal
+    return get_origin(hint) is tuple and more == [Ellipsis] and words
 
 
 def _options_of(hint: Any) -> list[str]:
