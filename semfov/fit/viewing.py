@@ -168,9 +168,10 @@ def _nothing() -> Detections:
 
 def look(data: ViewingData, source: MapSource) -> list[Viewed]:
     """Look at all pictures, or read their maps from the cache; those of one data set and size are together."""
+    # Dimensions are numbered, as a dash in the name of a layer would be a minus in theirs.
     fields = {
-        name: Field((f"channels of {name}", f"rows of {name}", f"columns of {name}"), torch.float16, finite=False)
-        for name in source.layers
+        name: Field((f"channels {n}", f"rows {n}", f"columns {n}"), torch.float16, finite=False)
+        for n, name in enumerate(source.layers)
     }
     schema = Schema(fields | {"placed": Field((8,), torch.float64)})
     code = looks_digest("semfov.gaze.saliency", "semfov.detection", __name__)

@@ -16,7 +16,18 @@ from semfov.data.fixations import Fixations, write_table
 from semfov.detection import Candidates
 from semfov.fit.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
 from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
-from semfov.fit.viewing import _grouped, events_of, features_of, folds, log_centre, others_of
+from semfov.fit.viewing import (
+    MapSource,
+    ViewingData,
+    _grouped,
+    covering,
+    events_of,
+    features_of,
+    folds,
+    log_centre,
+    look,
+    others_of,
+)
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 
@@ -169,6 +180,23 @@ def test_folds_hold_out_each_picture_once():
     for fold in range(3):
         fitted, out = folds(11, 3, fold)
         assert sorted(fitted + out) == list(range(11))
+
+
+def test_pictures_are_looked_at_once(tmp_path):
+    """Maps of any names are read again."""
+    image, place = picture(3)
+    Image.fromarray((image * 255).byte().permute(1, 2, 0).numpy()).save(tmp_path / "3.png")
+    write_table(tmp_path / "people.csv", people(3, place, 2))
+    seen = []
+
+    def maps(image):
+        seen.append(image)
+        return covering({"itti-koch": image[:, :1]}, SIZE)
+
+    data = ViewingData(fixations=(tmp_path / "people.csv",), pictures=(tmp_path,), cache=tmp_path)
+    first, again = (look(data, MapSource(("itti-koch",), maps, {})) for _ in range(2))
+    assert len(seen) == 1
+    torch.testing.assert_close(first[0].features.maps, again[0].features.maps)
 
 
 @pytest.mark.slow
