@@ -95,7 +95,7 @@ def picture_searches(
     seed: int,
     title: str,
 ) -> Searches:
-    """Run all searches of `searches_of`, with the same arguments, and collect them."""
+    """Run all searches of `_searches_of`, with the same arguments, and collect them."""
     rows: list[list[Tensor]] = []
     searches = _searches_of(model, pictures, opened, classes=classes, passes=passes, seed=seed, title=title)
     for _, annotation, target, turns in searches:
@@ -225,7 +225,7 @@ class _Limits(SearchLimits, Protocol):
 def _mosaic_searches(
     model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: _Limits, title: str
 ) -> Iterator[_MosaicSearch]:
-    """Search every picture, without closer looks (`semfov.fit.windows_decision.searches_of`)."""
+    """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
     searches = _searches_of(
         model, pictures, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
