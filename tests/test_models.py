@@ -39,6 +39,18 @@ def test_shipped_files_are_small_and_in_their_card_and_name_no_place(kind, path)
     assert any(re.search(rf"`{path.stem}(\.safetensors)?`", card.read_text("utf-8")) for card in cards)
 
 
+def test_the_card_of_where_people_look_says_how_the_models_were_fitted():
+    shipped = semfov.saliency.FixationDensity.shipped
+    table = re.findall(r"^\| `(.+?)` \| (.+?) \| .+? \| (\d+) \|$", (shipped / "README.md").read_text("utf-8"), re.M)
+    assert {name for name, _, _ in table} == {path.stem for path in shipped.glob("*.safetensors")}
+    for name, layers, epochs in table:
+        model = semfov.saliency.FixationDensity.from_pretrained(name)
+        assert layers == ", ".join(f"`{each}`" for each in model.layers)
+        training = model.metadata["training"]
+        assert training["epochs"] == int(epochs)
+        assert [training[each] for each in ("readouts", "units", "rate", "batch")] == [2, 32, 0.003, 8]
+
+
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
 def test_shipped_observation_models(path):
     model = semfov.FovealObservationModel.from_pretrained(path.stem)
