@@ -38,6 +38,7 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     lambda: exploration("KL divergence"),
     lambda: exploration("negative entropy"),
     lookahead,
+    lambda: lookahead(classes=1203),
     roc_curve,
     lambda: saliency("VOCUS2"),
     lambda: saliency("Itti-Koch"),
