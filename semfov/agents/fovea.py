@@ -269,6 +269,8 @@ class FoveaEpisode(Episode[Scanpath]):
     def _look_at(self, frame: ImageLike) -> RecordedLook | None:
         """Spend a frame of a stream on a look."""
         self._pixels = as_pixels(frame, argument="frame", color=self.color)
+        if isinstance(frame, Tensor):  # of all others this is a copy
+            self._pixels = self._pixels.clone()
         image = as_image(self._pixels, like=self.eye.sensor.like, argument="frame")[None]
         self._check_size((image.shape[-1], image.shape[-2]))
         self._faded += self.passed
@@ -411,7 +413,7 @@ class FoveaEpisode(Episode[Scanpath]):
         # Reduced by a whole number: resampling a large frame takes as long as a look.
         side = -(-max(self._image.shape[-2:]) // _LONGEST)
         if side == 1 and self._pixels.dtype == torch.uint8:
-            photograph = self._pixels[0].clone().cpu()  # the frame may be in memory that takes the next one
+            photograph = self._pixels[0].cpu()
         else:
             small = F.avg_pool2d(self._image, side, ceil_mode=True, count_include_pad=False)
             photograph = in_bytes(small[0])

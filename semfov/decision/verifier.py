@@ -210,9 +210,8 @@ class Verifier(Generic[LookType]):
     def _followed(self, verdict: _Verdict) -> _Verdict:
         """The verdict at the place to which a look has followed its target."""
         look = verdict.look
-        return verdict._replace(
-            look=self.places.move(look, _follow_target(look.box, self.places.detections, look.target))
-        )
+        box = _follow_target(look.box, self.places.detections, look.target)
+        return verdict if box is look.box else verdict._replace(look=self.places.move(look, box))
 
     def _recent(self, verdict: _Verdict) -> bool:
         """Whether at least half of the evidence of a closer look is left."""
