@@ -83,7 +83,7 @@ def _spans(cells: int, pitch: float, length: int) -> _Spans:
     return [(first, min(max(int(np.ceil((n + 1) * pitch)), first + 1), length)) for n, first in enumerate(firsts)]
 
 
-def _runs(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(marked: NDArray[np.bool_] | np.bool_) -> list[tuple[int, int]]:
     """First and end of each run of marked places in a row."""
     turns = np.flatnonzero(np.diff(np.pad(marked.astype(np.int8), 1))).tolist()
     return [*zip(turns[::2], turns[1::2], strict=True)]
