@@ -76,7 +76,7 @@ class FitSearchConfig(FitOnLooksConfig):
         max_target_area: classes that cover a larger share of the image are not searched for.
         landing: weight of the loss term for landing on the target with the next fixation.
         presence: weight of the loss term for predicting whether the target is in the photograph.
-        gaze: weight of the loss term for two selected cells: the next one to fixate, and the most probable fixated one.
+        selected: weight of the loss term for two selected cells: the next to fixate, and the most probable fixated one.
         false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because their cell is not certain enough, and maximum
@@ -88,7 +88,7 @@ class FitSearchConfig(FitOnLooksConfig):
     max_target_area: Positive = 0.2
     landing: Weight = 1.0
     presence: Weight = 0.5
-    gaze: Weight = 1.0
+    selected: Weight = 1.0
     false_alarms: Share = 0.015
     surest: Share = 1.0
     lost: Share = 0.02
@@ -217,7 +217,7 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
     named = cells.detach().masked_fill(~step.visited, -torch.inf).argmax(-1)
     for chosen in (step.next_cell, named):
         there = goal.gather(-1, chosen[:, None]).to(cells)
-        loss = loss + config.gaze * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
+        loss = loss + config.selected * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
     # A real search ends when it fixates the target, so there is no next fixation to learn.
     some = goal.any(-1) & ~(goal & step.visited).any(-1)
     if some.any():

@@ -143,7 +143,7 @@ def test_objective_equals_its_formula(held):
         goal[row, places] = True
     visited[:, [4, 9]] = True
     following_cell = torch.tensor([2, 0, 7])
-    config = FitSearchConfig(landing=0.7, presence=0.4, gaze=0.3)
+    config = FitSearchConfig(landing=0.7, presence=0.4, selected=0.3)
     entropy, telling, landing, gazing = [], [], [], []
     for row in range(3):
         for cell in (int(following_cell[row]), max((4, 9), key=lambda c: float(cells[row, c]))):
