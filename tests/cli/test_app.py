@@ -5,12 +5,13 @@ import re
 import shutil
 import socket
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+from PIL import Image
 
-from semfov.cli.app import _look_at_cells
+from semfov.cli.app import _Calls, _look_at_cells
 from semfov.cli.main import main
 from semfov.data import read_image
 
@@ -48,6 +49,37 @@ def test_an_address_that_cannot_be_served_is_told_before_anything_is_loaded(monk
         port = taken.getsockname()[1]
         assert main(["app", "--port", str(port)]) == 1
     assert re.fullmatch(rf"error: app: cannot be served on 127.0.0.1:{port}: .*\n", capsys.readouterr().err)
+
+
+def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, photo, monkeypatch):
+    class Error(Exception):
+        def __init__(self, message, *, print_exception):
+            super().__init__(message)
+
+    gradio = ModuleType("gradio")
+    monkeypatch.setattr(gradio, "Error", Error, raising=False)
+    monkeypatch.setitem(sys.modules, "gradio", gradio)
+    calls, picture = _Calls(agent, seed=0), Image.open(photo)
+    refused = {"picture: expected one": (None, "red"), "class: expected one to search for": (picture, "all classes")}
+    for said, given in refused.items():
+        with pytest.raises(Error, match=said):
+            calls.look(*given, "search", 3.0)
+        with pytest.raises(Error, match=said):
+            calls.click(*given, [], SimpleNamespace(index=(1, 1)))
+    for task, target in (("search", "red"), ("find all", "all classes")):
+        words, page = calls.look(picture, target, task, 3.0)
+        assert words
+        assert page.startswith('<iframe title="The looks" sandbox="allow-scripts" srcdoc="&lt;!DOCTYPE html')
+    cells: list[int] = []
+    for x, y in ((5, 5), (picture.width - 5, picture.height - 5)):
+        cells, clicked, seen, believed, words = calls.click(picture, "red", cells, SimpleNamespace(index=(x, y)))
+        assert clicked.size == picture.size
+        assert seen is not None
+        assert believed is not None
+        assert words
+    assert cells == [0, agent.columns * agent.rows - 1]
+    assert calls.fresh(picture)[0] == []
+    assert calls.fresh(None)[1] is None
 
 
 @pytest.fixture
