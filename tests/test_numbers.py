@@ -131,7 +131,7 @@ KNOWN = {
     },
     "docs/zoom.md": {
         f"confidence of {FAINT}": "code",
-        f"hints of {PhotographPlaces.least}": "code",
+        f"candidates of {PhotographPlaces.least}": "code",
         f"window is {PART} times as long": "code",
         f"within {_WIDE_BORDER:g} canvas px": "code",
         "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
@@ -236,8 +236,8 @@ SHARES = {
     "docs/measurements/zoom.md": {
         "One of four boxes": ("0.250", 1),
         "less than half of themselves": "visibility in the annotations of the street",
-        "less than a tenth of an object": "the border of faint cells in the code",
-        "count for a tenth of their promise": "in the file of the model and its card",
+        "less than a tenth of an object": "the border of low-yield cells in the code",
+        "count for a tenth of it": "in the file of the model and its card",
         "about a tenth of the products": "50 of 540 million",
     },
 }
