@@ -114,10 +114,15 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
         raise DataError(f"cannot write {path}: no permission to write in {place}")
 
 
-def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
-    """The text of a file in UTF-8, UTF-16 or UTF-32, with a byte order mark or without."""
+def read_text(path: str | os.PathLike[str], otherwise: str | None = None) -> str:
+    """The text of a file in UTF-8, UTF-16 or UTF-32, with a byte order mark or without; or in another encoding."""
     content = Path(path).read_bytes()
-    return content.decode(json.detect_encoding(content), errors)
+    try:
+        return content.decode(json.detect_encoding(content))
+    except UnicodeDecodeError:
+        if otherwise is None:
+            raise
+        return content.decode(otherwise, "replace")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -58,7 +58,7 @@ def read_eyelink(
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     check_regular(path)
     try:
-        lines = read_text(path, "replace").splitlines()
+        lines = read_text(path, "cp1252").splitlines()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error}); correct or replace the file") from None
     trials: list[tuple[str, dict[str, list[tuple[float, float, float]]]]] = []

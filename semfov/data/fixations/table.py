@@ -34,6 +34,15 @@ _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 _BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
 """What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
 
+_REMEDIES = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save it as CSV, or give pandas.read_excel(file)"),
+    **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "unpack it, or give pandas.read_csv(file)"),
+    ".parquet": "give pandas.read_parquet(file)",
+    ".mat": "give a table of what scipy.io.loadmat(file) reads",
+    ".edf": "convert it to .asc (edf2asc of the EyeLink Developers Kit)",
+}
+"""What to do with files that are no text, by their ends."""
+
 _LARGEST = 1e6
 """Largest coordinate and side in pixels."""
 
@@ -120,6 +129,9 @@ def records_of(where: str, lines: Sequence[Line], size: Size | None, units: Unit
 def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
     """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
     frame = hasattr(source, "to_dict") and hasattr(source, "columns")
+    if not frame and not isinstance(source, str | PathLike):
+        expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
+        raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
     header, rows = _of_frame(source) if frame else _of_file(Path(source))
     return "the table" if frame else str(source), header, rows
 
@@ -129,13 +141,18 @@ def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     header = [str(name) for name in frame.columns]
     rows = []
     for number, row in enumerate(frame.itertuples(index=False, name=None)):
-        texts = ["" if str(value) in _MISSING else str(value) for value in row]
+        # A column of whole numbers in which one is missing is one of floats.
+        plain = [int(each) if isinstance(each, float) and each.is_integer() else each for each in row]
+        texts = ["" if str(value) in _MISSING else str(value) for value in plain]
         rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
     return header, rows
 
 
 def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     """Names of the columns of a file, and its lines; decimal commas become points."""
+    remedy = _REMEDIES.get(path.suffix.lower())
+    if remedy is not None and path.exists():
+        raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
     check_regular(path)
     try:
         text = read_text(path)
@@ -143,12 +160,12 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
         text = text[before.end() :] if before else text
         first = text.partition("\n")[0]
         separator = max(",;\t", key=first.count)
-        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-        lines = [(f"line {reader.line_num}", line) for line in reader]
+        table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        lines = [(f"line {table.line_num}", line) for line in table]
     except (OSError, UnicodeError, csv.Error) as error:
         remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
         raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
-    header = [(name or "").strip() for name in reader.fieldnames or ()]
+    header = [(name or "").strip() for name in table.fieldnames or ()]
     again = sorted({name for name in header if header.count(name) > 1 and name})
     if again:
         raise DataError(f"{path}: expected columns of different names, got several named {', '.join(again)}")
@@ -313,7 +330,7 @@ def _maybe(where: str, at: str, line: Mapping[str, str], name: str) -> float | N
     if not text:
         return None
     try:
-        value = float(text)
+        value = float(text.replace("_", "?"))  # what Python takes for a number
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

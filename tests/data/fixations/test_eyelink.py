@@ -72,3 +72,10 @@ def test_other_arguments_are_refused(tmp_path):
         read_eyelink(tmp_path / "a.asc", eye="right")
     with pytest.raises(InputError, match="eye: expected 'left', 'right' or None"):
         read_eyelink(tmp_path / "a.asc", eye="both")
+
+
+def test_names_of_pictures_may_be_in_the_encoding_of_windows(tmp_path):
+    text = (HEAD + TRIALS).replace("a b.jpg", "übung.jpg")
+    for encoding in ("utf-8", "utf-16", "cp1252"):
+        (tmp_path / "ann.asc").write_bytes(text.encode(encoding))
+        assert "übung.jpg" in {each.picture for each in read_eyelink(tmp_path / "ann.asc")}

@@ -4,7 +4,7 @@ import numpy as np
 import pandas
 import pytest
 
-from semfov.data.fixations import Fixations, read_cocosearch, read_table, write_table
+from semfov.data.fixations import Fixations, read_cocosearch, read_fixations, read_table, write_table
 from semfov.errors import DataError, InputError
 
 HEADER = "picture,subject,x,y,width,height"
@@ -195,3 +195,26 @@ def test_tables_that_say_too_much_or_too_little_are_refused(tmp_path, text, said
     (tmp_path / "a.csv").write_text(text, encoding="latin-1")
     with pytest.raises(DataError, match=said):
         read_table(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("kind", ["xlsx", "parquet", "mat", "csv.gz", "edf"])
+def test_files_that_are_no_text_are_refused_with_their_reader(tmp_path, kind):
+    (tmp_path / f"a.{kind}").write_bytes(b"PK\3\4")
+    with pytest.raises(DataError, match=rf"a table of text, such as .csv, got .{kind.rpartition('.')[2]}; \w+ "):
+        read_fixations(tmp_path / f"a.{kind}")
+
+
+def test_tables_of_other_types_and_numbers_of_python_are_refused(tmp_path):
+    for source in ({"picture": ["a.jpg"]}, [{"x": 1}]):
+        with pytest.raises(InputError, match=r"source: expected a file, or a pandas.DataFrame .*, got a (dict|list)"):
+            read_fixations(source)
+    (tmp_path / "t.csv").write_text(TABLE.replace("399.5", "39_9"))
+    with pytest.raises(DataError, match="line 2, x: expected a number, got '39_9'"):
+        read_fixations(tmp_path / "t.csv")
+
+
+def test_people_of_a_column_of_floats_have_whole_numbers():
+    people = pandas.DataFrame(
+        {"picture": ["a", "b"], "subject": [7.0, None], "x": 1, "y": 2, "width": 80, "height": 60}
+    )
+    assert [each.subject for each in read_table(people)] == ["7", ""]
