@@ -1,6 +1,7 @@
 """Loading of detectors by name, file or model: `load_detector`."""
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence, Set
 from inspect import Parameter, signature
 from os import PathLike, fspath
 from pathlib import Path
@@ -28,6 +29,13 @@ _PICKLE = (
     "'{1}.onnx'). A state dict of a torchvision model is read as 'torchvision:MODEL' with weights='{0}' "
     "and classes="
 )
+_EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?detr[a-z0-9_-]*)")
+"""Names of models of Ultralytics, of which there are files of Python's pickle."""
+
+_OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".keras", ".mlmodel", ".safetensors")
+"""Ends of the names of models in formats that are not read."""
+
+_EXPORT = "export it with: yolo export model={}.pt format=onnx"
 
 DetectorLike = str | PathLike[str] | nn.Module
 """What `load_detector` takes: the name or file of a detector, a `Detector`, or a model of another library."""
@@ -78,6 +86,15 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
 def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:
     """Call a loader with options that it has."""
     check_options(options, _options_of(load), f"semfov.load_detector for {what}")
+    if options.get("classes") is not None:
+        options = {**options, "classes": _given_names(options["classes"])}
+    if "device" in options:
+        try:
+            torch.device(options["device"])
+        except (RuntimeError, TypeError):
+            raise InputError(
+                f"device: expected a device of PyTorch, such as cpu or cuda, got {options['device']!r}"
+            ) from None
     return load(model, **options)
 
 
@@ -160,6 +177,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
 def detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is."""
     name = fspath(name_or_path)
+    check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")
     if name.endswith((".onnx", ".cfg")):
         return name
     if name.endswith(".weights"):
@@ -167,6 +185,12 @@ def detector_name(name_or_path: str | PathLike[str]) -> str:
     if name.endswith((".pt", ".pth")):
         raise InputError(_PICKLE.format(name, Path(name).stem))
     lower = name.lower()
+    if _EXPORTED.fullmatch(lower):
+        raise InputError(f"detector: expected an ONNX file of {name}, got its name; {_EXPORT.format(name)}")
+    if Path(name).suffix.lower() in _OTHER_FORMATS:
+        raise InputError(
+            f"detector: expected an ONNX file, a Darknet cfg or a name, got {name}; export the model to ONNX"
+        )
     if lower.startswith("torchvision:"):
         return lower
     if lower.startswith("hf:"):
@@ -206,7 +230,7 @@ def load_yolo(
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,
-        _names(classes),
+        COCO_CLASSES if classes is None else _given_names(classes),
         name=name,
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         stride=stride,
@@ -218,11 +242,21 @@ def load_yolo(
     return detector.to(device).eval()
 
 
-def _names(classes: Sequence[str] | str | PathLike[str] | None) -> tuple[str, ...]:
-    """Class names from a list or from the lines of a file; COCO's by default."""
-    if not isinstance(classes, str | PathLike):
-        return COCO_CLASSES if classes is None else tuple(classes)
-    return class_lines(classes)
+def _given_names(classes: Any) -> tuple[str, ...]:
+    """Class names in the order of the scores: of a list, a text with commas, the lines of a file, or by numbers."""
+    expected = "names in the order of the scores, in a list"
+    if isinstance(classes, str | PathLike):
+        text = fspath(classes)
+        if isinstance(classes, PathLike) or Path(text).suffix in (".txt", ".names") or Path(text).is_file():
+            return class_lines(text)
+        return tuple(name.strip() for name in text.split(","))
+    if isinstance(classes, Mapping):
+        known = {str(number): name for number, name in classes.items()}
+        numbers = [str(number) for number in range(len(known))]
+        check({*numbers} == {*known}, "classes", f"{expected}, or by numbers from 0", f"numbers {[*known][:5]}")
+        return tuple(known[number] for number in numbers)
+    check(not isinstance(classes, Set), "classes", expected, f"a {type(classes).__name__}, which has no order")
+    return tuple(classes)
 
 
 def class_lines(path: str | PathLike[str]) -> tuple[str, ...]:

@@ -204,7 +204,7 @@ def test_signed_numbers_of_eight_bits_need_their_black_and_white(tmp_path):
     values = np.arange(-128, 128, dtype=np.int8).reshape(16, 16)
     tifffile.imwrite(tmp_path / "a.tif", values)
     for read in (read_image, open_large):
-        with pytest.raises(DataError, match="expected 8 (bits without a sign|or 16 bits, got int8)"):
+        with pytest.raises(DataError, match=r"expected 8 (bits without a sign|or 16 bits, got int8)"):
             read(tmp_path / "a.tif")
     shown = open_large(tmp_path / "a.tif", white=(-128, 127)).pixels((0, 0, 16, 16))
     assert np.array_equal(shown[..., 0].ravel(), np.arange(256))

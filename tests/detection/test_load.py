@@ -53,6 +53,33 @@ def test_options_that_a_detector_does_not_have_are_refused_before_it_is_loaded(m
         load_detector(model, **options)
 
 
+def test_class_names_keep_the_order_of_the_scores(small_cfg, small_weights):
+    def classes(given):
+        return load_detector(small_cfg, weights=small_weights, stride=None, classes=given).classes
+
+    for given in (["cat", "dog"], "cat, dog", {1: "dog", 0: "cat"}, {"0": "cat", "1": "dog"}):
+        assert classes(given) == ("cat", "dog")
+    for given, said in (({"cat", "dog"}, "got a set, which has no order"), ({1: "cat", 2: "dog"}, "numbers from 0")):
+        with pytest.raises(InputError, match=f"classes: expected names in the order of the scores.*{said}"):
+            classes(given)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("yolov8n", r"expected an ONNX file of yolov8n, got its name; export it with: yolo export model=yolov8n.pt"),
+        ("yolo11x-seg", "yolo export model=yolo11x-seg.pt"),
+        ("model.tflite", "expected an ONNX file, a Darknet cfg or a name, got model.tflite; export the model to ONNX"),
+        ("https://example.org/a.onnx", "expected a file on this machine, or a name, got https://example.org/a.onnx"),
+    ],
+)
+def test_what_newcomers_name_is_refused_with_the_remedy(name, said):
+    with pytest.raises(InputError, match=said):
+        load_detector(name)
+    with pytest.raises(InputError, match="device: expected a device of PyTorch, such as cpu or cuda, got 'gpu'"):
+        load_detector("yolov3-tiny", device="gpu")
+
+
 def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_path):
     with pytest.raises(InputError, match=r"expected a cfg and its weights"):
         load_detector("x.weights")

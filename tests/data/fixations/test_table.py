@@ -214,7 +214,6 @@ def test_tables_of_other_types_and_numbers_of_python_are_refused(tmp_path):
 
 
 def test_people_of_a_column_of_floats_have_whole_numbers():
-    people = pandas.DataFrame(
-        {"picture": ["a", "b"], "subject": [7.0, None], "x": 1, "y": 2, "width": 80, "height": 60}
-    )
+    fixed = {"x": 1, "y": 2, "width": 80, "height": 60}
+    people = pandas.DataFrame({"picture": ["a", "b"], "subject": [7.0, None], **fixed})
     assert [each.subject for each in read_table(people)] == ["7", ""]
