@@ -54,12 +54,7 @@ def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
 
 
 class ModelFolder:
-    """The result of `semfov fit`: models for one detector and one sensor, and which of them the agent uses.
-
-    The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
-    The verification is compared with the same agent without closer looks, and the evidence for large pictures with
-    looks at slices in the order of raw scores.
-    """
+    """The result of `semfov fit`: models for one detector and one sensor, and which of them the agent uses."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = Path(path)

@@ -55,10 +55,7 @@ Start = int | tuple[int, int] | None
 
 @dataclass(frozen=True)
 class FoveaAgent:
-    """The parts of an agent that moves its gaze over a photograph `(1, 3, H, W)`; cells `(columns, rows)`.
-
-    The arguments of its methods are those of `ActivePerception`, which makes it.
-    """
+    """The parts of an agent that moves its gaze over a photograph `(1, 3, H, W)`; cells `(columns, rows)`."""
 
     eye: Eye
     searching: Strategy

@@ -89,8 +89,5 @@ def open_picture(
 
 
 def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
-    """Tell whether a picture is large enough for windows to pay: whether there are two octaves or more to zoom in.
-
-    Shapes: size `(width, height)`, canvas `(width, height)`.
-    """
+    """Tell whether a picture is large enough for windows to pay: whether there are two octaves or more to zoom in."""
     return Lattice.over(size, canvas).levels >= 3

@@ -240,12 +240,7 @@ class _PictureFiles:
 
 
 def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
-    """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream.
-
-    Returns the entry of each picture in a file of results, or its `error`, in the order of the pictures. A picture that
-    cannot be read is reported and left out, unless it is the only one. With a file of results, a command that was
-    stopped continues.
-    """
+    """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream."""
     wanted = job.options.draw or ()
     for source in job.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
         kind = job.agent.kind_of_look(source.opened("auto"), job.options.how, every=job.every)

@@ -43,10 +43,7 @@ def kind_of(path: Path) -> str | None:
 
 
 class ResultsFile:
-    """A file of results that is complete for the pictures so far, whenever the command ends.
-
-    JSON lines are written one by one, to the stream if one is given; the other kinds as a whole, atomically.
-    """
+    """A file of results that is complete for the pictures so far, whenever the command ends."""
 
     def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO, truth: Truth | None = None) -> None:
         self.path, self.kind, self.searched, self.truth = path, kind, searched, truth

@@ -159,9 +159,7 @@ _log = logging.getLogger(__name__)
 
 
 def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
-    """Read an image file in the orientation in which it was annotated.
-
-    That is upright, or as stored where only the stored pixels have the recorded size.
+    """Read an image file in the orientation in which it was annotated; size `(width, height)` → `(3, height, width)`.
 
     Shapes: size `(width, height)` → `(3, height, width)`.
     """
@@ -391,11 +389,7 @@ class _Packed:
 
 
 def _other_form(boxes: torch.Tensor, limits: torch.Tensor) -> str | None:
-    """What boxes `(N, 4)` in pictures of sizes `(N, 4)` look like if they are not [x, y, width, height] in pixels.
-
-    >>> _other_form(torch.tensor([[0.1, 0.2, 0.5, 0.5]]), torch.tensor([[640, 480, 640, 480]]))
-    'fractions of the picture'
-    """
+    """What boxes `(N, 4)` in pictures of sizes `(N, 4)` look like if they are not [x, y, width, height] in pixels."""
     if len(boxes) and float(boxes.max()) <= 1 and float(limits.min()) > 2:
         return "fractions of the picture"
     corners = bool(((boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)).all())

@@ -56,11 +56,7 @@ _SPLITS = {
 
 
 def _download_coco(split: str, root: str | os.PathLike[str], *, address: str = _ADDRESS, keep: bool = False) -> None:
-    """Fetch a split's images into `root/<split>` and its boxes into `root/annotations/instances_<split>.json`.
-
-    Files that are already complete are not fetched again, and an interrupted transfer continues where it stopped.
-    Archives that are already in `root` are verified, used and left there.
-    """
+    """Fetch a split's images into `root/<split>` and its boxes into `root/annotations/instances_<split>.json`."""
     images = _SPLITS[lookup(split, _SPLITS, "split")]
     check(address.startswith(("http://", "https://")), "address", "http://... or https://...", repr(address))
     _fetch_split(split, Path(root), images, _ANNOTATIONS, address=address, keep=keep)

@@ -36,7 +36,7 @@ _WIDTH, _HEIGHT = 256, 257  # tags of a TIFF
 
 
 class _ArrayPicture(LargePicture):
-    """A picture in an array, which may be a `numpy.memmap`; only the pixels of the windows are read.
+    """A picture in an array, which may be a `numpy.memmap`; only the pixels of the windows are read; array `(H, W, 3)`.
 
     Shapes: array `(H, W, 3)`.
     """
@@ -81,11 +81,7 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
 
 
 class _PhotographPicture(LargePicture):
-    """A picture in a file that Pillow reads.
-
-    Formats such as JPEG cannot be read window by window. The whole picture is decoded when a window is first needed,
-    and is kept in memory (three bytes for each pixel). Its pixels are those that `semfov.data.read_image` reads.
-    """
+    """A picture in a file that Pillow reads."""
 
     path: Path
 

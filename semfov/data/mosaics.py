@@ -25,13 +25,11 @@ class _Tile(NamedTuple):
 
 
 class Mosaics(ComposedScenes):
-    """Mosaics of `columns` × `rows` photographs.
+    """Mosaics of `columns` × `rows` photographs; tile `(width, height)`.
 
     Each photograph is resized to fit its slot, and keeps its proportions. The rest of the slot is grey. Mosaic `i`
     depends only on the seed, on `i` and on the photographs. No photograph is in a mosaic twice, unless there are fewer
     photographs than slots.
-
-    Shapes: tile `(width, height)`.
     """
 
     def __init__(

@@ -41,8 +41,6 @@ def first_for(size: tuple[int, int]) -> int:
 
     >>> first_for((20_000, 15_000)), first_for((40_000, 40_000))
     (4, 8)
-
-    Shapes: size `(width, height)`.
     """
     first = FIRST
     while size[0] * size[1] > _LARGEST * first**2:
@@ -76,7 +74,7 @@ class ReducedCopies:
     A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
     borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
 
-    Shapes: size `(width, height)`, read `(h, w, 3)`.
+    Shapes: read `(h, w, 3)`.
     """
 
     def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:

@@ -44,8 +44,6 @@ class Scattered(ComposedScenes):
     another; one of five grounds is plain. Objects stand alone in their photographs, and are about equally large in a
     picture: between `sides` on the longer side. They stand in groups. Picture `i` depends only on the seed, on `i` and
     on the photographs.
-
-    Shapes: size `(width, height)`.
     """
 
     def __init__(

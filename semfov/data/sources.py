@@ -195,11 +195,7 @@ def _record(
     gaps: Counter[str],
     white: White | None = None,
 ) -> Iterator[Picture]:
-    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again.
-
-    The number of frames that passed follows from the time stamps of videos and streams. A camera skips the frames that
-    nobody waits for, and these are not counted.
-    """
+    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again."""
     total, rate = (float(recorder.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
     whole_file = 0 < total < _MOST_FRAMES
     rate = rate if 0 < rate < _FASTEST else _USUAL_RATE

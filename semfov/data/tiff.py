@@ -40,10 +40,7 @@ _INFLATERS: dict[int, Callable[[], Any]] = {
 
 
 class TiffPicture(LargePicture):
-    """A TIFF, read by windows through `tifffile`; one of neither 8 nor 16 bits needs `white`.
-
-    Only the tiles that overlap a window are decoded, one at a time. Transparent pixels are blended with white.
-    """
+    """A TIFF, read by windows through `tifffile`; one of neither 8 nor 16 bits needs `white`."""
 
     path: Path
 

@@ -47,11 +47,7 @@ def black_and_white(white: White, values: NDArray[Any], nodata: float | None = N
 
 
 def between(values: NDArray[Any], tone: tuple[float, float]) -> NDArray[np.float32]:
-    """Values from 0, black, to 1, white; NaN is black.
-
-    >>> between(np.array([5, 10, 15, 40]), (10, 30)).tolist()
-    [0.0, 0.0, 0.25, 1.0]
-    """
+    """Values from 0, black, to 1, white; NaN is black."""
     low, high = tone
     share = (values.astype(np.float64) - low) / (high - low)
     return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)

@@ -55,7 +55,7 @@ class CloseUp:
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
-    """Decide by thresholds which searches end with this step.
+    """Decide by thresholds which searches end with this step; target `(A,)` → `(A,)`; target `(A,)` → `(A,)`.
 
     A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
     probable as the most probable one (`NEARLY`) and probable enough itself. A search gives up if no remaining cell is

@@ -31,7 +31,7 @@ class _Verdict(NamedTuple):
 
 
 class Verifier(Generic[LookType]):
-    r"""Decides one search, with closer looks at the places that seem to hold the target.
+    r"""Decides one search, with closer looks at the places that seem to hold the target; close_up `(4,)`.
 
     After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
     it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
@@ -131,10 +131,7 @@ class Verifier(Generic[LookType]):
         return self._verified(self._chances, over=self.over)
 
     def conclude(self, room: float = math.inf) -> Decision:
-        """Make the decision of a search that is over.
-
-        If it did not end, all its looks are spent: what is left of closer looks is made now.
-        """
+        """Make the decision of a search that is over."""
         if not self.outcome():
             self._choose(last=True)
             self.look_closely(room)
@@ -157,10 +154,7 @@ class Verifier(Generic[LookType]):
 
     @property
     def presence(self) -> float:
-        """Probability that the picture holds the target: after the closer looks, or that without them.
-
-        It is the largest after one of them, or that after the look at the best place (`CandidatePlaces.by_best`).
-        """
+        """Probability that the picture holds the target: after the closer looks, or that without them."""
         without = self.places.presence
         recent = [each for each in self.verdicts if self._recent(each)]
         if self.places.by_best:

@@ -31,12 +31,7 @@ _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class Convolution(nn.Conv2d):
-    """Convolution and activation; batch norm is folded into the weight and the bias.
-
-    Shape:
-        - input: `(B, in_channels, H, W)`
-        - output: `(B, out_channels, H', W')`
-    """
+    """Convolution and activation; batch norm is folded into the weight and the bias."""
 
     def __init__(
         self,
@@ -161,10 +156,7 @@ class Shape(NamedTuple):
 
 
 class _Builder:
-    """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads.
-
-    Shapes: size `(width, height)`.
-    """
+    """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads."""
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         self._pixels = size[0] * size[1]
@@ -326,8 +318,6 @@ class Darknet(nn.Module):
     Shape:
         - input: `(B, C, H, W)`
         - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
-
-    Shapes: input_size `(width, height)`.
     """
 
     def __init__(self, sections: Sequence[Section]) -> None:

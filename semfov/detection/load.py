@@ -214,10 +214,7 @@ def load_yolo(
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
-    """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights.
-
-    Shapes: input_size `(width, height)`.
-    """
+    """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights."""
     if name_or_cfg.endswith(".cfg"):
         if weights is None:
             raise InputError(f"weights: expected the path of the weights of {name_or_cfg!r}, got None")

@@ -18,10 +18,7 @@ from semfov.errors import InputError, check_shape
 
 
 class ModuleDetector(Detector):
-    """Base of detectors whose network is a torch module of another library; they are differentiable.
-
-    Shapes: input_size `(width, height)`.
-    """
+    """Base of detectors whose network is a torch module of another library; they are differentiable."""
 
     def __init__(
         self, model: nn.Module, classes: Sequence[str], name: str, input_size: tuple[int, int], **options: Any

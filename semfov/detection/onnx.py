@@ -209,13 +209,7 @@ def load_onnx(
     device: torch.device | str = "cpu",
     providers: Sequence[Provider] | None = None,
 ) -> OnnxDetector:
-    """Load a detector from an ONNX file, or a published one by its name.
-
-    A setting that is None is read from `model.json` in the folder of `model.onnx`, else from the model's metadata. If
-    neither has it, it follows from the model's family.
-
-    Shapes: input_size `(width, height)`, providers `(name, options)`.
-    """
+    """Load a detector from an ONNX file, or a published one by its name."""
     name = fspath(name_or_path)
     file = _locate(name, weights)
     published_name = name if name in _ONNX_MODELS else NETWORKS.get(sha256(file) if file.is_file() else "")

@@ -40,13 +40,13 @@ def _grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float,
 
 
 def _decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
-    """Decode the raw output of YOLOX (Ge et al. 2021).
+    """Decode the raw output of YOLOX (Ge et al. 2021); raw `(B, N, 5 + K)`, canvas `(width, height)`.
 
     For the cell (i, j) of a level with stride s, centre and size of the box are
 
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
 
-    Shapes: raw `(B, N, 5 + K)`, canvas `(width, height)`.
+    Shapes: raw `(B, N, 5 + K)`.
     """
     check_shape(raw, "raw", None, None, None)
     grid = _grid(raw, canvas, strides, 0.0)
@@ -109,7 +109,7 @@ def _decode_distances(
     The distance from the point `p = (cell + offset) s` to the left, upper, right or lower side is
     `d = s Σ_b b softmax(t)_b`.
 
-    Shapes: classes `(B, N, K)`, distances `(B, N, 4 bins)`, canvas `(width, height)`.
+    Shapes: classes `(B, N, K)`, distances `(B, N, 4 bins)`.
     """
     check_shape(classes, "classes", None, None, None)
     check_shape(distances, "distances", None, classes.shape[1], None)
@@ -125,7 +125,7 @@ def _decode_distances(
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
 
-    Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
+    Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`.
     """
     check_shape(logits, "logits", None, None, None)
     scores = logits.softmax(-1)
@@ -135,19 +135,19 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candi
 def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
 
-    Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`, canvas `(width, height)`.
+    Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`.
     """
     check_shape(logits, "logits", None, None, None)
     return Candidates(_fractions(boxes, canvas), logits.sigmoid())
 
 
 def _decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """Decode RT-DETR that returns one tensor.
+    """Decode RT-DETR that returns one tensor; rows `(B, Q, 4 + K)`, canvas `(width, height)`; rows `(B, Q, 4 + K)`.
 
     >>> _decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
 
-    Shapes: rows `(B, Q, 4 + K)`, canvas `(width, height)`.
+    Shapes: rows `(B, Q, 4 + K)`.
     """
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])

@@ -52,8 +52,7 @@ class OnnxSession:
 
     Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
 
-    Shapes: providers `(name, options)`. `further` names tensors inside the model that are outputs too; `open_ended`
-    says whether the sizes of tensors or the number of steps depend on values, None: whatever the file shows.
+    Shapes: . `further` names tensors inside the model that are outputs too; `open_ended`.
     """
 
     def __init__(

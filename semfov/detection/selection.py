@@ -45,10 +45,7 @@ class Selection:
 def select(
     candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
-    """Select the best boxes of each image, map them to the image, and compute their score vectors.
-
-    Gradients flow to the selected boxes and their scores; the selection itself is not differentiable.
-    """
+    """Select the best boxes of each image, map them to the image, and compute their score vectors."""
     count = candidates.boxes.shape[0]
     detections = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
     return detections[0] if count == 1 else Detections.stack(detections)

@@ -28,11 +28,7 @@ _LARGEST = 65_536  # side of a canvas in pixels
 
 
 class _TransformersDetector(ModuleDetector):
-    """An object detection model of transformers as a `Detector`; it is differentiable.
-
-    The model takes `pixel_values` and returns `logits` and `pred_boxes`. Everything is taken before the thresholds and
-    the top-k of transformers' `post_process_object_detection`.
-    """
+    """An object detection model of transformers as a `Detector`; it is differentiable."""
 
     def __init__(
         self,
@@ -164,10 +160,7 @@ def wrap_transformers(
 
 
 def load_hub(name: str, *, revision: str | None = None, **options: Any) -> _TransformersDetector:
-    """Load an object detection model from Hugging Face's hub, with the settings of its image processor.
-
-    Only safetensors are read, and no code of the repository is run.
-    """
+    """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
     repository = name.removeprefix("hf:")
     check(bool(repository), "detector", "hf:owner/name", repr(name))
     try:

@@ -14,13 +14,7 @@ from semfov.errors import InputError
 
 
 class _UltralyticsDetector(ModuleDetector):
-    """A detection model of Ultralytics as a `Detector`; it is differentiable.
-
-    Its network returns, for every cell, a box and a sigmoid for each class: `(B, 4 + K, N)`. The package itself is not
-    imported here.
-
-    Shapes: input_size `(width, height)`.
-    """
+    """A detection model of Ultralytics as a `Detector`; it is differentiable; input_size `(width, height)`."""
 
     def __init__(
         self,

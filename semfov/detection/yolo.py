@@ -25,7 +25,7 @@ def decode_yolo(
 
     Objectness and class scores are `σ(t)`.
 
-    Shapes: raw `(B, A (5 + K), h, w)`, anchors `(width, height)`, canvas `(width, height)`.
+    Shapes: raw `(B, A (5 + K), h, w)`.
     """
     batch, channels, rows, columns = raw.shape
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
@@ -45,7 +45,7 @@ _RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
 class YoloV3(Detector):
-    """A Darknet network with YOLOv3 heads as a `Detector`.
+    """A Darknet network with YOLOv3 heads as a `Detector`; input_size `(width, height)`.
 
     Boxes and scores are differentiable with respect to the image. A canvas of another dtype is converted to the
     network's dtype.
@@ -55,8 +55,6 @@ class YoloV3(Detector):
     and the canvas or a parameter requires one, on accelerators, in other precisions, with weights that were changed
     after loading, and in compiled, exported or transformed functions. Forward hooks of the network are not called where
     onnxruntime computes it.
-
-    Shapes: input_size `(width, height)`.
     """
 
     def __init__(

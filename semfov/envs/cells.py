@@ -30,10 +30,7 @@ _FIRST = torch.tensor([0])
 
 
 class _SceneLooks(Looks):
-    """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it.
-
-    Their evidence is one table for all scenes, so that a step of episodes in many scenes is a single gather.
-    """
+    """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it."""
 
     def __init__(self, open_scene: Callable[[int], StoredLooks], observer: Observer, episodes: int) -> None:
         self._open, self._observer = open_scene, observer

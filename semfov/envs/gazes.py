@@ -33,9 +33,6 @@ class Score(NamedTuple):
 class Gazes(ABC):
     """A batch of episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
 
-    An environment only adds Gymnasium's interface. Scenes are static, so a second look at the same place shows nothing
-    new: it costs its price and changes nothing.
-
     Shapes: targets `(B,)`, shift `(B,)`.
     """
 
@@ -181,7 +178,7 @@ class Gazes(ABC):
 
 
 def _detection_arrays(detections: Detections, detector: Detector) -> Arrays:
-    """Detections as arrays of one shape, padded to the largest number L that the detector gives.
+    """Detections as arrays of one shape, padded to the largest number L that the detector gives; → `(n, L, 4)`.
 
     Gymnasium's own vectorised environments require infos of constant shape.
 

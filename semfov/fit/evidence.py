@@ -193,7 +193,7 @@ def _searches(
 
 
 def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
-    r"""Compute the training loss after a look.
+    r"""Compute the training loss after a look; goal `(E, X·Y)`; goal `(E, X·Y)`.
 
     .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
               + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},

@@ -306,9 +306,7 @@ def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> 
 def _explore_curves(
     run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig
 ) -> dict[str, dict[str, FloatArray]]:
-    """Measure the share of cells that exploration strategies classify correctly.
-
-    The answer for a cell may be background, which is correct if the cell contains no object.
+    """Measure the share of cells that exploration strategies classify correctly; → `(P, shifts+1)`; → `(P, shifts+1)`.
 
     Shapes: → `(P, shifts+1)`.
     """

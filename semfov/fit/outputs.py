@@ -13,10 +13,7 @@ _Model = TypeVar("_Model", bound=Pretrained)
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
-    """Build the metadata of a model about its training: the photographs, and the settings that the model depends on.
-
-    The settings of detector and sensor are left out, because `Eye.settings()` provides them. Paths are left out too.
-    """
+    """Build the metadata of a model about its training: the photographs, and the settings that the model depends on."""
     left_out = {*WHERE, "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in config.plain().items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}

@@ -235,7 +235,7 @@ def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, sur
 
 
 def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
-    r"""Fit both logistic regressions by penalised maximum likelihood.
+    r"""Fit both logistic regressions by penalised maximum likelihood; chosen `(N,)`; chosen `(N,)`.
 
     .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \qquad
               \lambda = 10^{-4}
@@ -443,7 +443,7 @@ class VerificationFit(PartFit):
 
 
 def scores(searches: Sequence[_VerifiedSearch], ends: Sequence[_SearchEnd]) -> FloatArray:
-    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
+    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes; → `(P,)`.
 
     Shapes: → `(P,)`.
     """

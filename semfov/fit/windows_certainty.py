@@ -153,10 +153,7 @@ def certainty_again(
     *,
     passes: int,
 ) -> list[str]:
-    """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
-
-    Pictures differ in how far the evidence can be believed, so several kinds are needed.
-    """
+    """Fit the certainty of a model on some kinds of pictures, and evaluate it on others."""
     training, held_out = (
         [
             each

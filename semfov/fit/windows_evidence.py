@@ -205,10 +205,7 @@ def _descend_examples(
 
 
 def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
-    """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic.
-
-    Only a few classes enter: random samples of the clearly and of the faintly visible ones.
-    """
+    """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic."""
     strongest = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (
         (strongest >= example.least).nonzero()[:, 0] + 1,

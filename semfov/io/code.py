@@ -141,11 +141,7 @@ def _found(name: str) -> tuple[str | None, Iterable[str]]:
 
 
 def _of_others(name: str) -> bool:
-    """Whether a module belongs to Python, to a library or to this package: not to the user.
-
-    A library is in a folder of libraries, of this environment or of another, or where the metadata of its distribution
-    say that it is.
-    """
+    """Whether a module belongs to Python, to a library or to this package: not to the user."""
     top = name.partition(".")[0]
     if top == _PACKAGE or top in sys.stdlib_module_names:
         return True

@@ -30,11 +30,7 @@ def discard_unfinished() -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file atomically: a context manager that replaces `path` once its block has ended without an error.
-
-    Readers see the old file or the new one, never a part of it. A writer that fails or is killed leaves `path` as it
-    was.
-    """
+    """Write a file atomically: a context manager that replaces `path` once its block has ended without an error."""
     path = Path(path)
     temporary = None
     try:

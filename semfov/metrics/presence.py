@@ -17,7 +17,7 @@ def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def area_under_roc(score: Tensor, present: Tensor) -> float:
-    """Area under the receiver operating characteristic (Hanley and McNeil, 1982).
+    """Area under the receiver operating characteristic (Hanley and McNeil, 1982); score `(M,)`, present `(M,)`.
 
     It is the probability that a case with the target scores higher than one without:
 

@@ -60,7 +60,7 @@ def merge_fixations(
 
 
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
-    """Distance of a point to boxes; 0 inside a box.
+    """Distance of a point to boxes; 0 inside a box; boxes `(L, 4)`, point `(2,)` → `(L,)`.
 
     >>> distances_to(torch.tensor([[10.0, 10, 20, 20], [0, 0, 4, 5]]), torch.tensor([6.5, 8.5])).tolist()
     [3.1622776985168457, 5.0]

@@ -176,10 +176,7 @@ def tagged(
 
 
 def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
-    """Probability maps `(n, X·Y)`: of the target, then of the classes most probable anywhere, then of background.
-
-    The map of the target is the belief of the search, where the scanpath has one.
-    """
+    """Probability maps `(n, X·Y)`: of the target, then of the classes most probable anywhere, then of background."""
     probabilities = scanpath.probabilities.detach().cpu()
     order = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
     target, maps = scanpath.target, []

@@ -30,10 +30,7 @@ _QUALITY = 75  # of the photograph, a JPEG
 
 
 def record_html(record: Record) -> str:
-    """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML.
-
-    Objects that were confirmed are green, others orange. A grey rectangle stands for a photograph that was not kept.
-    """
+    """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML."""
     width, height = record.size
     unit = max(width, height) / _WIDTH
     shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
@@ -67,11 +64,7 @@ def _rect(box: Sequence[float], colour: str, line: float, inside: str = "") -> s
 
 
 def scanpath_html(scanpath: Scanpath) -> str:
-    """The page to step through in a frame; a short text where the page would be too large.
-
-    The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
-    outside.
-    """
+    """The page to step through in a frame; a short text where the page would be too large."""
     # Maps of classes fit beside those of background and entropy, and the acquisition values.
     cells = len(scanpath) * len(scanpath.grid)
     room, bytes_of_map = _MAPS - 8 * cells, 4 * cells / 3

@@ -52,8 +52,6 @@ def run_explorations(
 ) -> list[tuple[list[int], dict[str, list[int]]]]:
     """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
 
-    Returns the cells of each, and after every gaze shift its `COUNTS`.
-
     Shapes: noise `(episodes, shifts+1, X·Y)`.
     """
     starts = torch.tensor([episode.start for episode in episodes])

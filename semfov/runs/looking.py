@@ -22,10 +22,7 @@ from semfov.runs.store import cell_store, look_everywhere
 
 
 class Looking(SceneRun):
-    """Scenes, and an eye that looks at each of them from every cell; its detections are stored.
-
-    Its outcomes are the looks themselves. A subclass that compares policies adds the records of their episodes.
-    """
+    """Scenes, and an eye that looks at each of them from every cell; its detections are stored."""
 
     config: EyeConfig
 

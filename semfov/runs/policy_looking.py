@@ -22,10 +22,7 @@ from semfov.strategy import Strategy
 
 
 class PolicyLooking(Looking):
-    """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene.
-
-    A subclass runs their episodes (`outcomes`).
-    """
+    """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene."""
 
     task: Task
     config: RunConfig

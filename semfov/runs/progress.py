@@ -17,10 +17,7 @@ _whole: ContextVar[WholeBar | None] = ContextVar("whole", default=None)
 
 
 class WholeBar:
-    """One bar for several stages of different duration, each of which consists of tasks.
-
-    While it is open, `track` and `task_bar` move this bar instead of opening a bar for each task.
-    """
+    """One bar for several stages of different duration, each of which consists of tasks."""
 
     def __init__(self, title: str, stages: Mapping[str, Mapping[str, float]]) -> None:
         self.title, self.stages = title, stages

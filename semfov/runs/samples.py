@@ -113,7 +113,7 @@ def all_cells(size: tuple[int, int], fixation: Tensor, cells: tuple[int, int] = 
 
 
 def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
-    """Look at an image from each of several fixations.
+    """Look at an image from each of several fixations; image `(3, H, W)`, points `(F, 2)`.
 
     The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
     share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`): a
@@ -127,12 +127,7 @@ def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
 
 
 class Sampler:
-    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
-
-    The settings are those of the command: `data`, `detector` and `sensor`; `fixations` in each photograph, uniform over
-    its pixels; the `iou` at which a detection matches an object; `seed`; and the photographs in a `shard`, the unit of
-    work.
-    """
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs."""
 
     sources: ClassVar[tuple[str, ...]] = _SOURCES
     coordinates: ClassVar[int] = 2

@@ -57,10 +57,7 @@ class SceneStore:
 
 
 class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
-    """Looks at scenes by action, with the looks at a scene in one file.
-
-    A subclass says how an action is written as numbers, and how looks are written as tensors.
-    """
+    """Looks at scenes by action, with the looks at a scene in one file."""
 
     width: ClassVar[int]
 

@@ -104,10 +104,7 @@ def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None
 
 
 def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -> Tensor:
-    """Compare objects with the annotated ones, class by class.
-
-    Each object in turn, the most confident first, is matched to the annotated object of its class that it overlaps most
-    among those not matched yet.
+    """Compare objects with the annotated ones, class by class; → `(M,)`; → `(M,)`.
 
     Shapes: → `(M,)`.
     """

@@ -39,11 +39,7 @@ class _ClusterLost(Exception):
 
 @contextmanager
 def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Executor, int]]:
-    """Connect to a Dask scheduler, and give tasks to its workers; tells how many tasks they can have at once.
-
-    Dask gives the tasks of a worker that dies to another one. Slurm, Kubernetes and others start such workers by
-    `dask-jobqueue` and `dask-kubernetes`.
-    """
+    """Connect to a Dask scheduler, and give tasks to its workers; tells how many tasks they can have at once."""
     try:
         from distributed import Client, KilledWorker
         from distributed.comm.core import CommClosedError
@@ -138,10 +134,7 @@ def run_tasks(
 
 @contextmanager
 def shared_processes() -> Iterator[None]:
-    """Keep the processes of this machine for all calls of `run_tasks` in the block.
-
-    Otherwise they start and end with each call, and a process takes seconds to import the libraries.
-    """
+    """Keep the processes of this machine for all calls of `run_tasks` in the block."""
     with ExitStack() as pools:
         before = _shared.set((pools, {}))
         try:

@@ -70,10 +70,7 @@ class GlanceStore(LookStore[Window, Glance]):
 
 
 class StoredGlances(Glances):
-    """Looks at the windows of one picture, each computed once. They have all their hints.
-
-    The picture is composed or read only when a look is missing.
-    """
+    """Looks at the windows of one picture, each computed once. They have all their hints."""
 
     def __init__(self, eye: WindowEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
         self.lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)

@@ -56,9 +56,7 @@ def choose_fixations(record: Record, most: int) -> list[int]:
 
 
 def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> AxesImage:
-    """Draw a photograph or a view of it, of any size, in the coordinates of the grid.
-
-    Pixel edges, not centres, are at integers, as for boxes and for the grid.
+    """Draw a photograph or a view of it, of any size, in the coordinates of the grid; image `(3, h, w)`.
 
     Shapes: image `(3, h, w)`.
     """
@@ -153,12 +151,7 @@ def draw_look(
     target: int | None = None,
     obstacles: Sequence[LabelBox] = (),
 ) -> list[Artist]:
-    """Draw detections, each labelled with its best class other than background.
-
-    The figure must be laid out, because the positions of labels depend on the layout.
-
-    Shapes: frame `(width, height)`.
-    """
+    """Draw detections, each labelled with its best class other than background; frame `(width, height)`."""
     tags: list[Tag] = []
     drawn: list[Artist] = []
     for box, label, score in zip(

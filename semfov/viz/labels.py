@@ -34,12 +34,7 @@ def place_labels(
 def place_numbers(
     points: Sequence[_Point], sizes: Sequence[_Size], frame: _Size, reach: float
 ) -> list[LabelBox | None]:
-    """Rectangles for the numbers of points: on the point where there is room, or else near it.
-
-    No number covers another number or another point. The first and the last point are placed first.
-
-    Shapes: sizes `(width, height)`, frame `(width, height)`.
-    """
+    """Rectangles for the numbers of points: on the point where there is room, or else near it."""
     placed: list[LabelBox] = []
     places: list[LabelBox | None] = [None] * len(points)
     ends = [len(points) - 1, 0] if len(points) > 1 else [0]
@@ -59,12 +54,7 @@ def place_numbers(
 def place_within(
     candidates: Sequence[Iterable[_Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
-    """Rectangles for labels whose middle may be at any of several points: at the first free one.
-
-    Where none is free, the label is moved down from the first point.
-
-    Shapes: sizes `(width, height)`, frame `(width, height)`.
-    """
+    """Rectangles for labels whose middle may be at any of several points: at the first free one."""
     placed: list[LabelBox] = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x - width / 2, y - height / 2, width, height, frame) for x, y in points]

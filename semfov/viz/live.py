@@ -28,7 +28,7 @@ VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:
-    """Draw what is known at a frame, and where the next look goes, into the frame.
+    """Draw what is known at a frame, and where the next look goes, into the frame; image `(3, H, W)` → `(h, w, 3)`.
 
     Where there is a belief in cells, the opacity of the colour over a cell is proportional to its probability; a circle
     marks the present gaze, and a line leads to the point of the next one. A frame around the box of the target replaces

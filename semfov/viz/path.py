@@ -84,7 +84,7 @@ class GazePath:
 
     In a picture that repeats after the width `around`, a saccade takes the short way, across the seam if need be.
 
-    Shapes: fixations `(n, 2)`, frame `(width, height)`.
+    Shapes: fixations `(n, 2)`.
     """
 
     def __init__(

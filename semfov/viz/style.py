@@ -118,10 +118,7 @@ def make_figure(
     layout: Literal["constrained", "compressed"] = "constrained",
     axes: Sequence[Axes] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Make a figure of `width` × `height` inches without a window, or use the given axes.
-
-    The layout is `compressed` for pictures, whose proportions are fixed, so that they move together.
-    """
+    """Make a figure of `width` × `height` inches without a window, or use the given axes."""
     from matplotlib.figure import Figure
 
     if axes is not None:
@@ -174,10 +171,7 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
 
 @cache
 def overlay_colours() -> Colormap:
-    r"""Colour map of probabilities over a photograph: transparent at 0, with opacity :math:`\alpha = 0.85 \sqrt{p}`.
-
-    The square root makes small probabilities visible on a scale that ends at 1.
-    """
+    r"""Colour map of probabilities over a photograph: transparent at 0, with opacity :math:`\alpha = 0.85 \sqrt{p}`."""
     import numpy as np
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap

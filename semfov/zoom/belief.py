@@ -202,10 +202,7 @@ class ZoomBelief:
         return values + np.float32(foresight) * self._sum(level, 2)
 
     def unseen(self, level: int) -> Cells:
-        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`.
-
-        Of what is not blank in it.
-        """
+        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`."""
         if level not in self._areas:
             there, ones = self._there.numpy(), np.ones(self.lattice.span(level), np.float32)
             whole = min(len(ones), self.lattice.rows) * min(len(ones), self.lattice.columns)

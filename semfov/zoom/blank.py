@@ -17,12 +17,6 @@ _Spans = list[tuple[int, int]]
 def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
     """Cells whose pixels have no data, or all have the colour of a corner and lie in one blank area with the border.
 
-    >>> from semfov.data.large import open_large
-    >>> scan = torch.randint(256, (3, 1600, 1600), dtype=torch.uint8)
-    >>> scan[:, :, 800:] = 0
-    >>> blank_cells(open_large(scan), Lattice.over((1600, 1600), (400, 400))).float().mean(0)[[0, 15, 16, 31]]
-    tensor([0., 0., 1., 1.])
-
     Shapes: → `(rows, columns)` boolean; None where no cell is blank.
     """
     (width, height), (wide, high) = lattice.size, (min(64, length) for length in lattice.size)

@@ -79,7 +79,7 @@ class SearchFacts:
         return any(look.found >= DETECTION_SCORE for look in self.looks)
 
     def case(self, ahead: float) -> Tensor:
-        """Facts about the search for `GlimpseEvidence.anywhere`.
+        """Facts about the search for `GlimpseEvidence.anywhere`; → `(10,)`; → `(10,)`.
 
         As features of scores: the highest and the second highest score of the target in a look, the highest in a look
         of the last level, the score in the overview, the highest of a detection whose best class is the target, and the

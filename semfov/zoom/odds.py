@@ -124,7 +124,7 @@ class _Look:
 
 
 class WindowOdds:
-    r"""Log odds that a look at a window shows a class, for the windows of all levels.
+    r"""Log odds that a look at a window shows a class, for the windows of all levels; left `(rows, columns)`.
 
     Looks contribute from the coarsest to the closest. A closer look replaces the predictions of coarser ones for the
     windows inside it, and takes them as an input (`GlimpseEvidence.presence`). With the looks that hold the window w,

@@ -50,9 +50,7 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
 
 
 def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
-    """Sum the chances of closer windows, side by side, in each window of a level.
-
-    Closer windows whose middle was looked at from this level already count as 0.
+    """Sum the chances of closer windows, side by side, in each window of a level; → `(down, across)`.
 
     Shapes: → `(down, across)`.
     """

@@ -18,7 +18,7 @@ EVERYWHERE: Place = (slice(None), slice(None))
 
 
 class WindowSums:
-    r"""Weighted sums of the cells of every window.
+    r"""Weighted sums of the cells of every window; weight `(span,)`, shape `(rows, columns)`.
 
     .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
 

@@ -97,8 +97,6 @@ class Letterbox:
 def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
     """Convert points to pixels of the same frame at another size.
 
-    The centre of the first cell has coordinate 0 in cells. With cells of 50 pixels it is at 24.5 in pixels:
-
     Shapes: points `(n, 2)`, size `(width, height)`, new `(width, height)` → `(n, 2)`.
     """
     return np.asarray((points + 0.5) * (np.array(new) / np.array(size)) - 0.5)

@@ -150,10 +150,7 @@ def _durations(records: Sequence[Fixations]) -> list[str]:
 def warn_of_frames(
     source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
 ) -> list[Fixations]:
-    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records.
-
-    `units` says that they were read as pixels, in which case they may be fractions.
-    """
+    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records."""
     looks = _looks_like(fixations, units=units) if fixations else None
     if looks is None:
         return warn_outside(source, fixations, stacklevel=stacklevel + 1)

@@ -11,7 +11,7 @@ _TILE = 24
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
-    r"""Weights of a Gaussian kernel.
+    r"""Weights of a Gaussian kernel; → `(2r+1,)`; → `(2r+1,)`.
 
     .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
 

@@ -15,8 +15,6 @@ Fusion = Literal["mean", "max"]
 def combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion = "mean") -> Tensor:
     """Mean or maximum of all maps, each enlarged to `size` by cubic interpolation.
 
-    Fusion within and then across features gives the same result, because all features have the same number of maps.
-
     Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
     """
     lookup(fusion, get_args(Fusion), "fusion")

@@ -40,7 +40,7 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 
 def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
-    r"""Even and odd Gabor filters without response to a uniform image.
+    r"""Even and odd Gabor filters without response to a uniform image; → `(2n, 9, 9)`; → `(2n, 9, 9)`.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3

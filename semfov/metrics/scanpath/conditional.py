@@ -73,7 +73,7 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
 
 
 def share_below(ordered: _Array, values: _Array) -> _Array:
-    """Fraction of ascending numbers that are lower than each of `values`; ties count half.
+    """Fraction of ascending numbers that are lower than each of `values`; ties count half; values `(n,)` → `(n,)`.
 
     >>> share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
     array([0.5])
@@ -162,7 +162,7 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
 
 
 def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
-    """Read maps at the pixels of fixations.
+    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`.
 
     >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
     array([1.])

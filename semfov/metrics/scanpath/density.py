@@ -28,10 +28,7 @@ def _people_density(points: FixationValues, size: tuple[int, int], shape: tuple[
 
 
 def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> dict[str, float]:
-    """Measures of a density against all fixations of people but their first ones, and against their blurred density.
-
-    Maps have the cells of the prediction.
-    """
+    """Measures of a density against all fixations of people but their first ones, and against their blurred density."""
     records = warn_outside("people", [each.resized(prediction.size) for each in people])
     points = np.concatenate([each.points[1:][each.inside[1:]] for each in records])
     check(len(points) > 0, "people", "fixations inside the picture after the first of each person", "none")

@@ -81,7 +81,7 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
 
 
 def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
-    """Label fixations by fitted clusters.
+    """Label fixations by fitted clusters; points `(n, 2)` → `(n,)`; points `(n, 2)` → `(n,)`.
 
     >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
     >>> bool(labels[0] == labels[1] != labels[2])
