@@ -20,24 +20,7 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
-from semfov.fit.windows import (
-    PICTURE_KINDS,
-    FitZoomConfig,
-    RefitPart,
-    _figures_of,
-    fit_closer_looks,
-    fit_counts,
-    fit_decision,
-    fit_looks,
-    judge_windows,
-    look_at_all,
-    make_kinds,
-    make_mosaics,
-    make_store,
-    make_window_eye,
-    survey_again,
-    training_looks,
-)
+from semfov.fit.windows import PICTURE_KINDS, FitZoomConfig, MosaicFit, RefitPart, _figures_of, judge_windows
 from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
 from semfov.io.files import inside
 from semfov.runs.command import command
@@ -59,10 +42,7 @@ _JUDGED = ("judged", "judged far", "judged crowded")
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    eye = make_window_eye(config)
-    mosaics = make_mosaics(config, eye.detector.classes)
-    pictures = {**mosaics, **make_kinds(config, eye.detector.classes)}
-    store = make_store(config, eye)
+    fit = MosaicFit(config)
     lines: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
@@ -71,49 +51,48 @@ def fit_zoom(config: FitZoomConfig) -> None:
     looked += ["crowded", "judged crowded"] * ("survey" in refit)
     looked += [*config.kinds] * ("presence" in refit)
     looked += [f"judged {kind}" for kind in PICTURE_KINDS] * ("presence" in refit and config.evidence is not None)
-    examples = look_at_all(config, eye, pictures, store, looked)
+    examples = fit.look(looked)
     if config.evidence is None:
-        model = fit_looks(config, eye, mosaics["near"], examples)
+        model = fit.closer(examples)
         text, figures = judge_windows(model, examples["judged"])
-        tried = choose_patience(model, eye, mosaics["judged"], store)
+        tried = choose_patience(model, fit)
         lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
-        model.check_compatible(eye.settings())
+        model.check_compatible(fit.eye.settings())
         if "presence" in refit:
-            lines += _fit_further(config, model, examples)
+            lines += _fit_further(fit, model, examples)
     if "survey" in refit:
-        measured = survey_again(config, model, examples)
+        measured = fit.survey(model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
-        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in _JUDGED}, store)
+        tried = choose_foresight(model, fit, _JUDGED)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
         lines += [*_figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
-        lines += fit_decision(config, model, eye, pictures, store)
+        lines += fit.decisions(model)
         # A verification belongs to the probability that it was fitted with.
         model.verification = None
         model.metadata.pop("verification", None)
     if "verification" in refit:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        lines += fit_closer_looks(config, model, eye, pictures, store)
+        lines += fit.verification(model)
     if "certainty" in refit:
-        lines += fit_counts(config, model, eye, pictures, store)
+        lines += fit.certainty(model)
     if "photograph" in refit and config.photographs:
-        scenes = make_scenes(config.data, eye.detector.classes)
-        lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config)]
-    path = inside(config.out, f"{eye.detector.name}.safetensors")
+        scenes = make_scenes(config.data, fit.eye.detector.classes)
+        lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
+    path = inside(config.out, f"{fit.eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
 
 
-def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+def _fit_further(fit: MosaicFit, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
     """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
+    config = fit.config
     torch.manual_seed(config.seed)
     judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
     before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
-    fit_presence(
-        model.requires_grad_(True), pair_windows(training_looks(config, examples)), config.steps, rate=_FURTHER
-    )
+    fit_presence(model.requires_grad_(True), pair_windows(fit.training(examples)), config.steps, rate=_FURTHER)
     model.requires_grad_(False)
     model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]

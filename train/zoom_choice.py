@@ -1,19 +1,16 @@
 """Choose `foresight` and `patience`, the settings of a search by magnification, on mosaics of held-out photographs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain, islice
 
 import torch
 
-from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.fit.windows import open_all
+from semfov.fit.windows import MosaicFit
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_store import GlanceStore
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, Window, around
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
@@ -21,23 +18,21 @@ _PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 
 @torch.inference_mode()
-def choose_foresight(
-    model: GlimpseEvidence, eye: WindowEye, kinds: Mapping[str, Mosaics], store: GlanceStore
-) -> list[list[str]]:
+def choose_foresight(model: GlimpseEvidence, fit: MosaicFit, kinds: Sequence[str]) -> list[list[str]]:
     """Set the `foresight` of the survey to the one with which most objects are found.
 
     The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of mosaics
     differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
     """
-    opened = [open_all(eye, mosaics, store) for mosaics in kinds.values()]
-    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds.values()]
+    chosen, opened = [fit.mosaics[kind] for kind in kinds], [fit.opened(kind) for kind in kinds]
+    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in chosen]
     rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
     recalls: dict[float, list[float]] = {}
     for value in track(_FORESIGHTS, "choosing foresight", "value"):
         model.survey.foresight = value
         recalls[value] = [
             _mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
-            for looks, annotations, mosaics in zip(opened, objects, kinds.values(), strict=True)
+            for looks, annotations, mosaics in zip(opened, objects, chosen, strict=True)
         ]
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
         for glances in chain.from_iterable(opened):
@@ -49,17 +44,17 @@ def choose_foresight(
 
 
 @torch.inference_mode()
-def choose_patience(model: GlimpseEvidence, eye: WindowEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
+def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
     """Set `patience` to the value with which a class is found soonest.
 
     The measure is the mean number of passes until a look at a photograph that shows the class.
     """
-    opened = open_all(eye, near, store)
+    near, opened = fit.mosaics["judged"], fit.opened("judged")
     slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
     for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value
-        passes[value] = _mean_passes(model, opened, slots, eye.detector.least)
+        passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.least)
         for glances in opened:
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)

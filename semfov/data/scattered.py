@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
+from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes, boxes_meet
 from semfov.errors import check
 from semfov.io.files import json_sha256
 
@@ -110,7 +110,7 @@ class Scattered(ComposedScenes):
                 x, y = draw.normal(groups[draw.integers(len(groups))], spread)
                 place = round(x), round(y), round(x) + wide, round(y) + tall
                 inside = x >= 0 and y >= 0 and place[2] <= self.size[0] and place[3] <= self.size[1]
-                if inside and not any(_meet(place, other.place) for other in placed):
+                if inside and not any(boxes_meet(place, other.place) for other in placed):
                     placed.append(_Cutout(number, part, place))
                     break
         return placed
@@ -167,7 +167,7 @@ class Scattered(ComposedScenes):
             annotation = self.scenes.annotation(index)
             side = min(*annotation.size, int(draw.integers(48, 256)))
             x, y = (int(draw.integers(length - side + 1)) for length in annotation.size)
-            if not any(_meet((x, y, x + side, y + side), box) for box in annotation.boxes.tolist()):
+            if not any(boxes_meet((x, y, x + side, y + side), box) for box in annotation.boxes.tolist()):
                 patch = self.scenes[index].image[:, y : y + side, x : x + side]
                 break
         across, down = (_mirrored(length, side) for length, side in zip(self.size, patch.shape[:0:-1], strict=True))
@@ -185,7 +185,3 @@ def _fading(length: int) -> Tensor:
     margin = max(1.0, length * _MARGIN / (1 + 2 * _MARGIN))
     place = torch.arange(length) + 0.5
     return (torch.minimum(place, length - place) / margin).clamp(max=1)
-
-
-def _meet(box: _Box, other: _Box) -> bool:
-    return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]

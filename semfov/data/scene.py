@@ -154,6 +154,11 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum
     return float(area) / (size[0] * size[1])
 
 
+def boxes_meet(box: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether two boxes `(x1, y1, x2, y2)` have an area in common."""
+    return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
+
+
 def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: Coverage = "sum") -> list[int]:
     """List the classes that are present and whose boxes cover at most a given fraction of the image.
 

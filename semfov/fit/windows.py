@@ -1,5 +1,7 @@
 """Fit evidence by magnification on mosaics of photographs, and on other kinds of large pictures."""
 
+from __future__ import annotations
+
 import json
 import logging
 import math
@@ -9,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import torch
 
@@ -165,29 +167,6 @@ _SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps
 _log = logging.getLogger(__name__)
 
 
-def make_window_eye(config: FitZoomConfig) -> WindowEye:
-    """Make the eye that looks at the mosaics."""
-    return WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
-
-
-def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
-    """Compose the mosaics to fit on, and those of held-out photographs."""
-    training, held_out = split_photographs(config.data, classes, config.holdout)
-    tile = config.tile, config.tile * 3 // 4
-    return {
-        "near": Mosaics(training, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
-        "far": Mosaics(training, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
-        "small": Mosaics(training, 12, 12, tile=(tile[0] // 2, tile[1] // 2), count=config.far, seed=config.seed + 7),
-        "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
-        "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
-        "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
-        "crowded": Mosaics(_crowded(training, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
-        "judged crowded": Mosaics(
-            _crowded(held_out, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6
-        ),
-    }
-
-
 def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
     """Compose pictures of a kind."""
     seed += 10 + PICTURE_KINDS.index(kind)
@@ -206,203 +185,187 @@ def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, 
             return Scattered(scenes, size=ground, sides=(tile // 15, tile // 3), count=count, seed=seed)
 
 
-def make_kinds(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Scenes]:
-    """Compose the pictures of other kinds."""
-    training, held_out = split_photographs(config.data, classes, config.holdout)
-    pictures: dict[str, Scenes] = {}
-    for kind in PICTURE_KINDS:
-        pictures[kind] = _compose_pictures(kind, training, config.each, config.seed, config.tile)
-        pictures[f"judged {kind}"] = _compose_pictures(
-            kind, held_out, config.judged_each, config.seed + 20, config.tile
-        )
-    return pictures
-
-
-def open_all(eye: WindowEye, pictures: Scenes, store: GlanceStore) -> list[StoredGlances]:
-    """Open the stored looks of each picture."""
-    return [StoredGlances(eye, pictures, index, store) for index in range(len(pictures))]
-
-
-def make_store(config: FitZoomConfig, eye: WindowEye) -> GlanceStore:
-    """Open the store of looks at mosaics."""
-    return GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
-
-
-_process: dict[str, Any] = {}
+_process: dict[str, MosaicFit] = {}
 
 
 def _prepare_fit_process(config: FitZoomConfig) -> None:
-    """Build the eye, the mosaics and the store once in this process."""
+    """Build the eye, the pictures and the store once in this process."""
     prepare_worker()
-    eye = make_window_eye(config)
-    classes = eye.detector.classes
-    pictures = {**make_mosaics(config, classes), **make_kinds(config, classes)}
-    _process.update(eye=eye, pictures=pictures, store=make_store(config, eye))
+    _process["fit"] = MosaicFit(config)
 
 
-def look(task: tuple[str, int]) -> bytes:
-    """Look at all windows of a picture that are not in the store yet; returns all looks at it."""
-    kind, index = task
-    pictures = _process["pictures"][kind]
-    glances = StoredGlances(_process["eye"], pictures, index, _process["store"])
+def _look(task: tuple[str, int]) -> bytes:
+    """Look at all windows of a picture that are not in the store yet; returns what the store has of it."""
+    (kind, index), fit = task, _process["fit"]
+    pictures = fit.pictures[kind]
+    glances = StoredGlances(fit.eye, pictures, index, fit.store)
     glances.see(windows_of(pictures, index, glances.lattice))
     glances.save()
-    return pack_tensors(_process["store"].read(pictures.digest(index)))
+    kept = fit.store.read(pictures.digest(index))
+    return b"" if kept is None else pack_tensors(kept)
 
 
-def _read_examples(pictures: Scenes, store: GlanceStore, eye: WindowEye) -> list[ZoomExample]:
-    """Read the results of the looks at all pictures in which looks can be closer than an overview."""
-    opened = {n: StoredGlances(eye, pictures, n, store) for n in range(len(pictures))}
-    least = eye.detector.least
-    return [example_of(pictures, n, looks, least) for n, looks in opened.items() if looks.lattice.levels > 1]
+class MosaicFit:
+    """A fit of evidence part by part, with the mosaics and other pictures, and the store of the looks at them."""
 
+    def __init__(self, config: FitZoomConfig, eye: WindowEye | None = None) -> None:
+        if eye is None:
+            eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
+        self.config, self.eye = config, eye
+        training, held_out = split_photographs(config.data, eye.detector.classes, config.holdout)
+        tile, half = (config.tile, config.tile * 3 // 4), (config.tile // 2, config.tile * 3 // 4 // 2)
+        most, most_held = _crowded(training, 1 / 3), _crowded(held_out, 1 / 3)
+        seed = config.seed
+        self.mosaics = {
+            "near": Mosaics(training, 4, 4, tile=tile, count=config.mosaics, seed=seed),
+            "far": Mosaics(training, 8, 6, tile=tile, count=config.far, seed=seed + 1),
+            "small": Mosaics(training, 12, 12, tile=half, count=config.far, seed=seed + 7),
+            "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=seed + 2),
+            "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=seed + 3),
+            "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=seed + 4),
+            "crowded": Mosaics(most, 4, 4, tile=tile, count=config.crowded, seed=seed + 5),
+            "judged crowded": Mosaics(most_held, 4, 4, tile=tile, count=config.judged, seed=seed + 6),
+        }
+        self.pictures: dict[str, Scenes] = {**self.mosaics}
+        for kind in PICTURE_KINDS:
+            self.pictures[kind] = _compose_pictures(kind, training, config.each, seed, config.tile)
+            self.pictures[f"judged {kind}"] = _compose_pictures(
+                kind, held_out, config.judged_each, seed + 20, config.tile
+            )
+        self.store = GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
-def look_at_all(
-    config: FitZoomConfig,
-    eye: WindowEye,
-    pictures: Mapping[str, Scenes],
-    store: GlanceStore,
-    kinds: Sequence[str],
-) -> dict[str, list[ZoomExample]]:
-    """Look at all pictures of some kinds; returns the looks by kind."""
-    looked = {kind: pictures[kind] for kind in kinds}
-    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
-    done = run_tasks(
-        look,
-        todo,
-        where=config.where,
-        setup=_prepare_fit_process,
-        settings=(config,),
-        title="looking",
-        unit="picture",
-    )
-    with closing(done):
-        for (kind, index), looks in done:
-            digest = pictures[kind].digest(index)
-            if store.read(digest) is None:
-                store.write(digest, unpack_tensors(looks))
-    prepare_worker()
-    return {kind: _read_examples(some, store, eye) for kind, some in looked.items()}
+    def opened(self, kind: str) -> list[StoredGlances]:
+        """The stored looks at each picture of a kind."""
+        pictures = self.pictures[kind]
+        return [StoredGlances(self.eye, pictures, index, self.store) for index in range(len(pictures))]
 
-
-def fit_looks(
-    config: FitZoomConfig, eye: WindowEye, near: Scenes, examples: Mapping[str, list[ZoomExample]]
-) -> GlimpseEvidence:
-    """Fit the prediction of closer looks, class by class."""
-    torch.manual_seed(config.seed)
-    random.seed(config.seed)
-    metadata = {**eye.settings(), **training_of(config, near, "judged")}
-    model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
-    looks = training_looks(config, examples)
-    fit_presence(model, pair_windows(looks), config.steps)
-    fit_rates(model, looks, config.steps)
-    return model.eval().requires_grad_(False)
-
-
-def training_looks(config: FitZoomConfig, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
-    """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
-    return [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
-
-
-def survey_again(
-    config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]
-) -> dict[str, float]:
-    """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
-    torch.manual_seed(config.seed)
-    random.seed(config.seed)
-    survey = Survey(model.classes, foresight=model.survey.foresight)
-    kinds = {
-        kind: [SurveyExample.of(example) for example in examples[kind]]
-        for kind in ("near", "far", "crowded", "judged", "judged crowded")
-        if kind in examples
-    }
-    fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
-    model.survey = survey.eval().requires_grad_(False)
-    model.metadata["survey"] = {name: getattr(config, name) for name in _SURVEYING}
-    crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
-    return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
-
-
-def _searched_kinds(config: FitZoomConfig) -> dict[str, tuple[str, ...]]:
-    """Kinds of pictures to fit decisions on, and to choose thresholds on."""
-    return {"searched": ("searched", *config.kinds), "judged": ("judged", *(f"judged {kind}" for kind in config.kinds))}
-
-
-def fit_decision(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, pictures: Mapping[str, Scenes], store: GlanceStore
-) -> list[str]:
-    """Fit the decisions of searches: the probability of presence, and the thresholds."""
-    prepare_worker()
-    torch.manual_seed(config.seed)
-    searches = {
-        use: Searches.join(
-            [
-                picture_searches(
-                    model,
-                    pictures[kind],
-                    open_all(eye, pictures[kind], store),
-                    classes=config.sought,
-                    passes=config.passes,
-                    seed=config.seed,
-                    title=f"searching, {kind}",
-                )
-                for kind in kinds
+    def look(self, kinds: Sequence[str]) -> dict[str, list[ZoomExample]]:
+        """Look at all pictures of some kinds; returns the looks by kind, of pictures with closer looks."""
+        todo = [(kind, n) for kind in dict.fromkeys(kinds) for n in range(len(self.pictures[kind]))]
+        config, store = self.config, self.store
+        done = run_tasks(
+            _look, todo, where=config.where, setup=_prepare_fit_process, settings=(config,),
+            title="looking", unit="picture",
+        )  # fmt: skip
+        with closing(done):
+            for (kind, index), looks in done:
+                digest = self.pictures[kind].digest(index)
+                if looks and store.read(digest) is None:
+                    store.write(digest, unpack_tensors(looks))
+        prepare_worker()
+        least = self.eye.detector.least
+        return {
+            kind: [
+                example_of(self.pictures[kind], n, looks, least)
+                for n, looks in enumerate(self.opened(kind))
+                if looks.lattice.levels > 1
             ]
+            for kind in kinds
+        }
+
+    def training(self, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
+        """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
+        return [each for kind in ("near", "far", *self.config.kinds) for each in examples[kind]]
+
+    def closer(self, examples: Mapping[str, list[ZoomExample]]) -> GlimpseEvidence:
+        """Fit the prediction of closer looks, class by class."""
+        config = self.config
+        torch.manual_seed(config.seed)
+        random.seed(config.seed)
+        metadata = {**self.eye.settings(), **training_of(config, self.mosaics["near"], "judged")}
+        model = GlimpseEvidence(len(self.eye.detector.classes), metadata=metadata)
+        looks = self.training(examples)
+        fit_presence(model, pair_windows(looks), config.steps)
+        fit_rates(model, looks, config.steps)
+        return model.eval().requires_grad_(False)
+
+    def survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> dict[str, float]:
+        """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
+        config = self.config
+        torch.manual_seed(config.seed)
+        random.seed(config.seed)
+        survey = Survey(model.classes, foresight=model.survey.foresight)
+        kinds = {
+            kind: [SurveyExample.of(example) for example in examples[kind]]
+            for kind in ("near", "far", "crowded", "judged", "judged crowded")
+            if kind in examples
+        }
+        fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
+        model.survey = survey.eval().requires_grad_(False)
+        self._told(model, "survey", _SURVEYING)
+        crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
+        return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
+
+    def decisions(self, model: GlimpseEvidence) -> list[str]:
+        """Fit the decisions of searches: the probability of presence, and the thresholds."""
+        config = self.config
+        prepare_worker()
+        torch.manual_seed(config.seed)
+        searches = {
+            use: Searches.join(
+                [
+                    picture_searches(
+                        model,
+                        self.pictures[kind],
+                        self.opened(kind),
+                        classes=config.sought,
+                        passes=config.passes,
+                        seed=config.seed,
+                        title=f"searching, {kind}",
+                    )
+                    for kind in kinds
+                ]
+            )
+            for use, kinds in self._searched().items()
+        }
+        fit_judge(model, searches["searched"], config.judging)
+        rows = judge_searches(model, searches["judged"], config)
+        assert model.thresholds is not None
+        self._told(model, "decision", _DECIDING)
+        fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
+        return [
+            f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them "
+            f"for absent classes, and evaluated on {held_out} searches in pictures of held-out photographs.",
+            "",
+            *rows,
+            "",
+            f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
+            f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
+            "",
+        ]
+
+    def verification(self, model: GlimpseEvidence, prior: Verification | None = None) -> list[str]:
+        """Fit the probabilities after closer looks, with decisions that were fitted, and a prior."""
+        prepare_worker()
+        searched = {
+            use: [(self.pictures[kind], self.opened(kind)) for kind in kinds] for use, kinds in self._searched().items()
+        }
+        text = fit_closer(model, searched, self.config, prior)
+        if model.verification is not None:
+            self._told(model, "verification", _VERIFYING)
+        return ["Closer looks:", "", text]
+
+    def certainty(self, model: GlimpseEvidence) -> list[str]:
+        """Fit the probability that an object is there."""
+        prepare_worker()
+        fitted, judged = self._searched().values()
+        some = some_explored(self.config.searched)
+        training, held_out = (
+            {kind: (self.pictures[kind], self.opened(kind)[: some.get(kind)]) for kind in dict.fromkeys(kinds)}
+            for kinds in ((*fitted, *some), judged)
         )
-        for use, kinds in _searched_kinds(config).items()
-    }
-    fit_judge(model, searches["searched"], config.judging)
-    rows = judge_searches(model, searches["judged"], config)
-    assert model.thresholds is not None
-    model.metadata["decision"] = {name: getattr(config, name) for name in _DECIDING}
-    fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
-    return [
-        f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them for "
-        f"absent classes, and evaluated on {held_out} searches in pictures of held-out photographs.",
-        "",
-        *rows,
-        "",
-        f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
-        f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
-        "",
-    ]
+        lines = certainty_again(model, training, held_out, passes=self.config.passes)
+        self._told(model, "certainty", _COUNTING)
+        return lines
 
+    def _searched(self) -> dict[str, tuple[str, ...]]:
+        """Kinds of pictures to fit decisions on, and to choose thresholds on."""
+        kinds = self.config.kinds
+        return {"searched": ("searched", *kinds), "judged": ("judged", *(f"judged {kind}" for kind in kinds))}
 
-def fit_closer_looks(
-    config: FitZoomConfig,
-    model: GlimpseEvidence,
-    eye: WindowEye,
-    pictures: Mapping[str, Scenes],
-    store: GlanceStore,
-    prior: Verification | None = None,
-) -> list[str]:
-    """Fit the probabilities after closer looks, with the result of `fit_decision` and its arguments, and a prior."""
-    prepare_worker()
-    searched = {
-        use: [(pictures[kind], open_all(eye, pictures[kind], store)) for kind in kinds]
-        for use, kinds in _searched_kinds(config).items()
-    }
-    text = fit_closer(model, searched, config, prior)
-    if model.verification is not None:
-        model.metadata["verification"] = {name: getattr(config, name) for name in _VERIFYING}
-    return ["Closer looks:", "", text]
-
-
-def fit_counts(
-    config: FitZoomConfig, model: GlimpseEvidence, eye: WindowEye, pictures: Mapping[str, Scenes], store: GlanceStore
-) -> list[str]:
-    """Fit the probability that an object is there, with the arguments and the result of `fit_decision`."""
-    prepare_worker()
-    fitted, judged = _searched_kinds(config).values()
-    some = some_explored(config.searched)
-    names = dict.fromkeys((*fitted, *some)), dict.fromkeys(judged)
-    training, held_out = (
-        {kind: (pictures[kind], open_all(eye, pictures[kind], store)[: some.get(kind)]) for kind in kinds}
-        for kinds in names
-    )
-    lines = certainty_again(model, training, held_out, passes=config.passes)
-    model.metadata["certainty"] = {name: getattr(config, name) for name in _COUNTING}
-    return lines
+    def _told(self, model: GlimpseEvidence, part: str, settings: Sequence[str]) -> None:
+        """Note in the model the settings that a part depends on."""
+        model.metadata[part] = {name: getattr(self.config, name) for name in settings}
 
 
 def some_explored(searched: int) -> dict[str, int]:

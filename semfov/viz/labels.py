@@ -3,6 +3,8 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
+from semfov.data.scene import boxes_meet
+
 LabelBox = tuple[float, float, float, float]
 _Size = tuple[float, float]
 _Point = tuple[float, float]
@@ -82,14 +84,10 @@ def _into(x: float, y: float, width: float, height: float, frame: _Size) -> Labe
 def _further(label: LabelBox, placed: list[LabelBox]) -> LabelBox:
     """The label moved down until it is free, out of the frame if necessary."""
     x1, y1, x2, y2 = label
-    while covered := [other for other in placed if _cover((x1, y1, x2, y2), other)]:
+    while covered := [other for other in placed if boxes_meet((x1, y1, x2, y2), other)]:
         y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1
     return x1, y1, x2, y2
 
 
 def _covers_any(label: LabelBox, placed: list[LabelBox]) -> bool:
-    return any(_cover(label, other) for other in placed)
-
-
-def _cover(a: LabelBox, b: LabelBox) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+    return any(boxes_meet(label, other) for other in placed)

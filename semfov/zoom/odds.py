@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.scene import boxes_meet
 from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
@@ -166,7 +167,7 @@ class WindowOdds:
             concerned = [
                 look
                 for look in self._looks
-                if look.fresh or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
+                if look.fresh or any(level < look.gist.level and boxes_meet(look.box, box) for box, level in changed)
             ]
             self._read(concerned)
             for odds in self._odds.values():
@@ -214,10 +215,6 @@ class WindowOdds:
                 odds = odds.repeat(scale, 0).repeat(scale, 1)
             place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
             place[:] = odds[: place.shape[0], : place.shape[1]]
-
-
-def _overlap(box: Box, other: Box) -> bool:
-    return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
 
 
 def _shifted(part: slice, start: int) -> slice:

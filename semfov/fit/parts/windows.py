@@ -15,26 +15,13 @@ from semfov.fit.detector_report import Difference, in_words, mean_percent, secti
 from semfov.fit.parts.base import PartFit, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
-from semfov.fit.windows import (
-    FitZoomConfig,
-    fit_closer_looks,
-    fit_counts,
-    fit_decision,
-    fit_looks,
-    judge_windows,
-    look_at_all,
-    make_mosaics,
-    make_store,
-    open_all,
-    some_explored,
-    survey_again,
-)
+from semfov.fit.windows import FitZoomConfig, MosaicFit, judge_windows, some_explored
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes
 from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -146,12 +133,9 @@ class WindowsFit(PartFit):
             return self._fit(config)
 
     def _fit(self, config: FitZoomConfig) -> PartResult:
-        eye = WindowEye(self.run.eye.detector).eval().requires_grad_(False)
-        mosaics = make_mosaics(config, eye.detector.classes)
-        store = make_store(config, eye)
-        model, figures = _fit_mosaics(config, eye, mosaics, store)
-        judged = mosaics["judged"]
-        opened = open_all(eye, judged, store)
+        fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
+        model, figures = _fit_mosaics(fit)
+        judged, opened = fit.mosaics["judged"], fit.opened("judged")
         curves = {
             "fitted": _photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
             "raw": _photograph_recalls(judged, opened, _in_raw_order),
@@ -177,24 +161,20 @@ class WindowsFit(PartFit):
         return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
 
 
-def _fit_mosaics(
-    config: FitZoomConfig, eye: WindowEye, mosaics: dict[str, Mosaics], store: GlanceStore
-) -> tuple[GlimpseEvidence, str]:
+def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
     """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
-    examples = look_at_all(config, eye, mosaics, store, ("near", "far", "crowded", "judged"))
-    model = fit_looks(config, eye, mosaics["near"], examples)
-    survey_again(config, model, examples)
-    lines = [judge_windows(model, examples["judged"])[0]]
-    lines += fit_decision(config, model, eye, mosaics, store)
+    examples = fit.look(("near", "far", "crowded", "judged"))
+    model = fit.closer(examples)
+    fit.survey(model, examples)
+    lines = [judge_windows(model, examples["judged"])[0], *fit.decisions(model)]
     shipped = [
         GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
     ]
-    larger = [each.verification for each in shipped if each.verification is not None]
-    lines += fit_closer_looks(config, model, eye, mosaics, store, mean_of(larger))
-    lines += fit_counts(config, model, eye, mosaics, store)
+    lines += fit.verification(model, mean_of([each.verification for each in shipped if each.verification is not None]))
+    lines += fit.certainty(model)
     alone = [each.photograph.verification for each in shipped if each.photograph is not None]
-    scenes = make_scenes(config.data, eye.detector.classes)
-    lines += ["Photographs:", "", fit_photographs(model, scenes, eye, config, mean_of(alone))]
+    scenes = make_scenes(fit.config.data, fit.eye.detector.classes)
+    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(alone))]
     return model, "\n".join(lines)
 
 
