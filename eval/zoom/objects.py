@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -109,13 +108,14 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
     }
 
 
-def average_precision(scores: Tensor, right: Tensor, objects: int) -> float:
+def average_precision(scores: Tensor, right: Tensor, objects: int, counts: Tensor | None = None) -> float:
     """Average precision as COCO computes it: the mean over 101 recalls of the highest precision at that recall or more.
 
     Args:
         scores: `(N,)`, scores of boxes.
         right: `(N,)`, whether each of them is right.
         objects: number of annotated objects.
+        counts: `(N,)`, how often each box counts; None for once.
 
     Returns:
         The average precision, from 0 to 1; NaN without objects.
@@ -125,60 +125,87 @@ def average_precision(scores: Tensor, right: Tensor, objects: int) -> float:
     """
     if not objects:
         return torch.nan
-    hits = right[scores.argsort(descending=True, stable=True)].double().cumsum(0)
-    precision = hits / torch.arange(1, len(hits) + 1)
+    order = scores.argsort(descending=True, stable=True)
+    each = torch.ones(len(order)).double() if counts is None else counts[order].double()
+    hits = (right[order] * each).cumsum(0)
+    precision = hits / each.cumsum(0).clamp(min=1)
     precision = precision.flip(0).cummax(0).values.flip(0) if len(hits) else precision
     at = torch.searchsorted(hits / objects, torch.linspace(0, 1, _RECALLS, dtype=torch.float64) - 1e-9)
     return float(torch.cat([precision, precision.new_zeros(1)])[at.clamp(max=len(hits))].mean())
 
 
-def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str], pictures: Tensor) -> Tensor:
+class _Boxes(NamedTuple):
+    """All boxes of a way of looking after a number of passes, the best first, with their pictures; each `(N,)`."""
+
+    scores: Tensor
+    labels: Tensor
+    right: Tensor
+    pictures: Tensor
+
+    @classmethod
+    def of(cls, group: Sequence[ResultRecord], number: str) -> Self:
+        """The boxes of the records of all pictures."""
+        after = [record["after"][number] for record in group]
+        scores, labels, right = (
+            torch.tensor([value for each in after for value in each[name]]) for name in ("scores", "labels", "right")
+        )
+        pictures = torch.arange(len(after)).repeat_interleave(torch.tensor([len(each["scores"]) for each in after]))
+        order = scores.argsort(descending=True, stable=True)
+        return cls(scores.double()[order], labels.long()[order], right[order] > 0, pictures[order])
+
+
+def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]) -> Callable[[Tensor], Tensor]:
     """Figures of each way of looking at some pictures.
 
     Args:
         groups: for each way, a record of each picture.
         numbers: numbers of passes.
-        pictures: indices of the pictures, some of them repeated.
 
     Returns:
-        `(ways, len(numbers) + 6)`, float64: the average precision after each number of passes, and after the last one,
-        of the objects that are listed, precision, recall, number for each annotated object, and the mean absolute error
-        of their number in a picture; then that of the sum of all scores, and the expected calibration error of the
-        scores.
+        A function of the indices of the pictures, some of them repeated → `(ways, len(numbers) + 6)`, float64: the
+        average precision after each number of passes, and after the last one, of the objects that are listed,
+        precision, recall, number for each annotated object, and the mean absolute error of their number in a picture;
+        then that of the sum of all scores, and the expected calibration error of the scores.
     """
-    rows = []
-    for group in groups.values():
-        chosen = [group[picture] for picture in pictures.tolist()]
-        total = sum(record["objects"] for record in chosen)
-        line = []
-        for number in numbers:
-            after = [record["after"][number] for record in chosen]
-            scores = torch.cat([torch.as_tensor(each["scores"], dtype=torch.float64) for each in after])
-            right = torch.cat([torch.as_tensor(each["right"]) for each in after]) > 0
-            line.append(average_precision(scores, right, total))
-        listed, hits = (sum(each[name] for each in after) for name in ("listed", "listed right"))
-        pairs = [(each, record["objects"]) for each, record in zip(after, chosen, strict=True)]
-        off = [abs(each["listed"] - count) for each, count in pairs]
-        apart = [abs(float(torch.as_tensor(each["scores"]).sum()) - count) for each, count in pairs]
-        line += [hits / max(listed, 1), hits / max(total, 1), listed / max(total, 1)]
-        line += [sum(off) / len(off), sum(apart) / len(apart), BinarySums.of(scores, right).ece if len(scores) else 0]
-        rows.append(line)
-    return torch.tensor(rows, dtype=torch.float64)
+    boxes = {way: [_Boxes.of(group, number) for number in numbers] for way, group in groups.items()}
+    counts = {
+        way: torch.tensor(
+            [
+                [last["listed"], last["listed right"], sum(last["scores"]), record["objects"]]
+                for record in group
+                for last in [record["after"][numbers[-1]]]
+            ],
+            dtype=torch.float64,
+        )
+        for way, group in groups.items()
+    }
+
+    def figures(pictures: Tensor) -> Tensor:
+        rows = []
+        for way, some in boxes.items():
+            drawn = counts[way][pictures]
+            listed, hits, _, total = drawn.sum(0).tolist()
+            weight = pictures.bincount(minlength=len(counts[way]))
+            line = [average_precision(each.scores, each.right, int(total), weight[each.pictures]) for each in some]
+            off, apart = ((drawn[:, column] - drawn[:, 3]).abs().mean().item() for column in (0, 2))
+            line += [hits / max(listed, 1), hits / max(total, 1), listed / max(total, 1), off, apart]
+            last = some[-1]
+            repeated = torch.arange(len(last.scores)).repeat_interleave(weight[last.pictures])
+            line.append(BinarySums.of(last.scores[repeated], last.right[repeated]).ece if len(repeated) else 0)
+            rows.append(line)
+        return torch.tensor(rows, dtype=torch.float64)
+
+    return figures
 
 
 def object_table(records: Sequence[ResultRecord]) -> list[str]:
     """Table of the figures of all ways, as Markdown."""
     groups: dict[str, list[ResultRecord]] = {}
     for record in records:
-        # The bootstrap reads the numbers many times.
-        after = {
-            n: outcome | {name: torch.tensor(outcome[name]) for name in ("scores", "labels", "right")}
-            for n, outcome in record["after"].items()
-        }
-        groups.setdefault(record["way"], []).append(record | {"after": after})
+        groups.setdefault(record["way"], []).append(record)
     first = next(iter(groups.values()))
     numbers = list(first[0]["after"])
-    figures = Bootstrap.of(partial(object_figures, groups, numbers), range(len(first)))
+    figures = Bootstrap.of(object_figures(groups, numbers), range(len(first)))
     heads = [f"AP50, {number}" for number in numbers]
     heads += ["precision", "recall", "boxes for each object"]
     heads += [f"mean absolute error of the {number}" for number in ("count", "expected number")] + ["ECE"]
@@ -206,7 +233,7 @@ def plain_table(groups: Mapping[str, Sequence[ResultRecord]], numbers: Sequence[
         last, shown = [record["after"][numbers[-1]] for record in group], [record["plain"] for record in group]
         kept = f"{sum(after['kept'] for after in last) / sum(shown):.3f}" if sum(shown) else "-"
         without = sum(count > 0 and not after["listed"] for count, after in zip(shown, last, strict=True))
-        means = [class_mean([(record, record["after"][number]) for record in group]) for number in numbers]
+        means = [class_mean(group, number) for number in numbers]
         rows.append([way, *(f"{mean:.3f}" for mean in means), kept, str(without)])
     return [
         f"The mean of AP50 over the classes that are annotated; the share of the {sum(shown)} boxes that one plain "
@@ -218,15 +245,13 @@ def plain_table(groups: Mapping[str, Sequence[ResultRecord]], numbers: Sequence[
     ]
 
 
-def class_mean(outcomes: Sequence[tuple[ResultRecord, ResultRecord]]) -> float:
-    """Mean over the annotated classes of the average precision of records, after some number of passes."""
-    scores, labels, right = (
-        torch.cat([torch.as_tensor(after[name]) for _, after in outcomes]) for name in ("scores", "labels", "right")
-    )
-    totals = Counter[int]()
-    for record, _ in outcomes:
+def class_mean(group: Sequence[ResultRecord], number: str) -> float:
+    """Mean over the annotated classes of the average precision after a number of passes."""
+    boxes, totals = _Boxes.of(group, number), Counter[int]()
+    for record in group:
         totals.update({int(label): count for label, count in record["by class"].items()})
-    each = [average_precision(scores[labels == label], right[labels == label] > 0, n) for label, n in totals.items()]
+    of_class = {label: boxes.labels == label for label in totals}
+    each = [average_precision(boxes.scores[mine], boxes.right[mine], totals[label]) for label, mine in of_class.items()]
     return sum(each) / max(len(each), 1)
 
 

@@ -125,13 +125,18 @@ def test_figures_of_objects_match_hand_calculations():
         {"objects": 2, "by class": counts, "plain": 2, "after": {"1": none, "4": dict(zip(none, after, strict=False))}}
         for after, counts in zip(found, ({"1": 1, "2": 1}, {"1": 2}), strict=True)
     ]
-    assert class_mean([(record, record["after"]["4"]) for record in records]) == pytest.approx((1 + 0) / 2)
-    none, precision, *figures = object_figures({"semfov": records}, ["1", "4"], torch.arange(2))[0].tolist()
+    assert class_mean(records, "4") == pytest.approx((1 + 0) / 2)
+    measure = object_figures({"semfov": records}, ["1", "4"])
+    none, precision, *figures = measure(torch.arange(2))[0].tolist()
     assert none == 0
     # Precision 1 up to a recall of 2 / 4, 3 / 4 up to 3 / 4, and 0 beyond it.
     assert precision == pytest.approx((51 + 25 * 0.75) / 101)
     ece = (abs(0.9 - 1) + abs(0.6 - 0) + abs(0.8 - 1) + abs(0.1 - 1)) / 4
     assert figures == pytest.approx([2 / 3, 2 / 4, 3 / 4, (0 + 1) / 2, (0.5 + 1.1) / 2, ece])
+    drawn = torch.tensor([1, 0, 1])
+    torch.testing.assert_close(
+        measure(drawn), object_figures({"semfov": [records[n] for n in drawn]}, ["1", "4"])(torch.arange(3))
+    )
 
 
 def test_plain_suppression_equals_that_of_torchvision():
