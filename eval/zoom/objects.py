@@ -20,6 +20,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
+from semfov.zoom.certainty import SPREAD
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge
 
@@ -31,11 +32,12 @@ _SAME = 0.5
 
 
 class Returned(NamedTuple):
-    """What a way of looking returns: all objects, those that are listed, and the number that was not seen, if known."""
+    """All objects, those that are listed, the number that was not seen, if known, and whether a number is given."""
 
     objects: Objects
     listed: Objects
     unseen: tuple[float, float] | None = None
+    given: bool = False
 
 
 def merged(looks: Sequence[Glance], target: int | None) -> Returned:
@@ -81,7 +83,7 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         are left out.
     """
     after = {}
-    for number, (objects, listed, unseen) in returned.items():
+    for number, (objects, listed, unseen, given) in returned.items():
         right, sure = right_boxes(objects, annotation), right_boxes(listed, annotation)
         counts = right >= 0
         chances = objects.scores[counts].double()
@@ -94,7 +96,8 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
             "listed right": int((sure > 0).sum()),
             "kept": int(alike.any(1).sum()) if len(listed) else 0,
             "in all": None if unseen is None else float(chances.sum()) + unseen[0],
-            "error": None if unseen is None else (float((chances * (1 - chances)).sum()) + unseen[1]) ** 0.5,
+            "error": None if unseen is None else _error(chances, unseen),
+            "given": given,
         }
     labels = annotation.labels[~annotation.crowd]
     counted = {str(label): int((labels == label).sum()) for label in labels.unique().tolist()}
@@ -106,6 +109,12 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         "plain": len(plain),
         "after": after,
     }
+
+
+def _error(chances: Tensor, unseen: tuple[float, float]) -> float:
+    """Standard deviation of the number of objects in all (`ZoomPath.expected_error`)."""
+    spread = SPREAD * (float(chances.sum()) + unseen[0])
+    return float((chances * (1 - chances)).sum() + unseen[1] + spread**2) ** 0.5
 
 
 def average_precision(scores: Tensor, right: Tensor, objects: int, counts: Tensor | None = None) -> float:
@@ -271,10 +280,12 @@ def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> lis
     error = torch.tensor([[record["after"][n]["error"] for n in numbers] for record in expecting], dtype=torch.float64)
     rows.append(["its error", *(f"{each:.1f}" for each in error.mean(0).tolist())])
     rows.append(["within two errors", *(f"{each:.2f}" for each in (off <= 2 * error).double().mean(0).tolist())])
+    rows.append(["number given", *(f"{sum(r['after'][n]['given'] for r in expecting)}" for n in numbers)])
     return [
         f"The number of objects that semfov expects in all after n passes, those that no look has shown included: the "
-        f"mean over pictures, the mean absolute error, the error that it is given with, and the share of the pictures "
-        f"in which it is off by at most twice that. There are {float(true.mean()):.1f} in the mean.",
+        f"mean over pictures, the mean absolute error, the error that it is given with, the share of the pictures in "
+        f"which it is off by at most twice that, and the pictures in which a number is given. There are "
+        f"{float(true.mean()):.1f} in the mean.",
         "",
         *table(rows),
         "",

@@ -142,13 +142,13 @@ class ZoomRun(WindowLooking, SceneRun):
         def looked(turns: Iterator[WindowStep[Any]]) -> list[Glance]:
             return [turn.glance for turn in islice(turns, config.passes)]
 
-        orders = {
-            RASTER: in_order(cut),
-            "slices, sparse": sparse(cut, targets, config.sparse),
-            "slices as in ASAHI": in_order(adaptive_slices(lattice)),
-            "slices, ranked by the overview": ranked(cut, targets),
-            "quad-tree, best first": quad_tree(lattice, target, most=False),
-        }
+        orders = {RASTER: in_order(cut), "slices, ranked by the overview": ranked(cut, targets)}
+        if lattice.levels > 1:
+            orders |= {
+                "slices, sparse": sparse(cut, targets, config.sparse),
+                "slices as in ASAHI": in_order(adaptive_slices(lattice)),
+                "quad-tree, best first": quad_tree(lattice, target, most=False),
+            }
         seen = {name: looked(look_by_look(glances, order, None)) for name, order in orders.items()}
         episode = WindowEpisode(("background", *self.scenes.classes), self.evidence, None, targets, worth=0.0)
         episode.open(glances)
@@ -223,7 +223,10 @@ class ZoomRun(WindowLooking, SceneRun):
             number: suppressed(seen[RASTER][:number], self.target) for number in self.numbers
         }
         ways[f"{SEMFOV}, scores of the detector"] = ways[SEMFOV]
-        ways[SEMFOV] = {number: Returned(path.candidates, path.objects, path.unseen) for number, path in paths.items()}
+        ways[SEMFOV] = {
+            number: Returned(path.candidates, path.objects, path.unseen, path.reacts and len(path.objects) > 1)
+            for number, path in paths.items()
+        }
         for way, returned in ways.items():
             yield object_record(way, returned, annotation, plain) | {"scene": self.scenes.ids[index]}
 

@@ -18,6 +18,7 @@ from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
+from semfov.zoom.certainty import SPREAD
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
@@ -56,6 +57,10 @@ VALUES: dict[str, Json] = {
     "seconds": Array(Number(low=0)),
 }
 """JSON values of the files of looks at windows."""
+
+
+_SURE, _SEVERAL, _MOST = 0.5, 5, 0.6
+"""Probability, number and share of the objects to which a detector reacts (`ZoomPath.reacts`)."""
 
 _NUMBER = (
     "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
@@ -131,14 +136,28 @@ class ZoomPath(GazeRecord):
 
     @property
     def expected_error(self) -> dict[str, float]:
-        """Standard deviation of the expected number of objects by the name of their class.
+        r"""Standard deviation of the expected number of objects by the name of their class; 0 without probabilities.
 
-        The candidates are independent (a Poisson-binomial distribution); what no look has shown has the distribution of
-        `semfov.zoom.certainty`. It is 0 without probabilities.
+        With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
+        has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
+        share :math:`\tau = 0.3` of the expected number E:
+
+        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
         if self.unseen is None:
             return super().expected_error
         return {name: variance**0.5 for name, (_, variance) in self._numbers().items()}
+
+    @property
+    def reacts(self) -> bool:
+        """Whether the detector reacts to what is there, so that a number of objects can be believed.
+
+        It does where objects are listed of which five or more have a probability of one half, or where these make up
+        three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
+        """
+        chances = self.candidates.of(self._sought).scores
+        sure = chances[chances >= _SURE]
+        return len(self.objects) > 0 and (len(sure) >= _SEVERAL or float(sure.sum()) >= _MOST * float(chances.sum()))
 
     def _numbers(self) -> dict[str, tuple[float, float]]:
         """Mean and variance of the number of objects of each class."""
@@ -153,7 +172,7 @@ class ZoomPath(GazeRecord):
         share = (sums[sought] + 1e-9) / (sums[sought] + 1e-9).sum()
         means, variances = sums[sought] + share * more, spreads[sought] + share * spread
         return {
-            self.classes[label]: (mean, variance)
+            self.classes[label]: (mean, variance + (SPREAD * mean) ** 2)
             for label, mean, variance in zip(sought, means.tolist(), variances.tolist(), strict=True)
         }
 
@@ -198,8 +217,8 @@ class ZoomPath(GazeRecord):
         """Count the objects, by class where classes were searched for, and say how many this detector can show.
 
         Where fewer are expected than are counted, it is said how many of those counted are right. Without a class to
-        search for there is no such number, since the small rests of all classes add up to many. Where no object was
-        found, the detector hardly reacts to what is there, and no number is given either.
+        search for there is no such number, since the small rests of all classes add up to many. Of one object it would
+        say no more. Where the detector hardly reacts to what is there (`reacts`), no number is given either.
 
         Returns:
             A phrase such as `41 × person from probability or score 0.5 (about 47 ± 5 that this detector can show)`, or
@@ -208,13 +227,20 @@ class ZoomPath(GazeRecord):
         text = super().objects_in_words()
         if self.unseen is None or not self._sought:
             return text
-        if not len(self.objects):
+        if not self.reacts:
             return f"{text} (the detector hardly reacts, so no number is given)"
-        mean, variance = (sum(each) for each in zip(*self._numbers().values(), (0.0, 0.0), strict=True))
-        of = "that this detector can show"
-        if round(mean) < len(self.objects):
-            chances = self.objects.scores.double()
-            mean, variance, of = float(chances.sum()), float((chances * (1 - chances)).sum()), "of them right"
+        chances = self.objects.scores.double()
+        if len(chances) == 1:
+            return text
+        mean, of = float(chances.sum()), "of them right"
+        variance = float((chances * (1 - chances)).sum()) + (SPREAD * mean) ** 2
+        expected = sum(self.expected.values())
+        if round(expected) >= len(chances):
+            mean, variance, of = (
+                expected,
+                sum(e**2 for e in self.expected_error.values()),
+                "that this detector can show",
+            )
         return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of})"
 
     def _looks(self) -> Iterator[RecordedLook]:

@@ -31,6 +31,9 @@ FACTS = (
 )
 """Facts about an object, from which its probability is predicted (`object_facts`)."""
 
+SPREAD = 0.3
+"""Standard deviation of the share by which the probabilities of one picture are all too low or too high."""
+
 _LEAST, _MOST = 0.01, 0.999
 _SMALLEST = 6.0
 """Side in canvas pixels from which on a look should show an object."""

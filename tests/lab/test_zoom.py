@@ -27,6 +27,7 @@ from semfov.detection.objects import Objects
 from semfov.runs.config import DataConfig
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom import GlimpseEvidence
+from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
@@ -104,15 +105,19 @@ def test_the_number_in_all_is_compared_with_the_annotated_one():
     ours = [
         {
             "objects": 4,
-            "after": {n: {"in all": mean, "error": error} for n, (mean, error) in zip("14", each, strict=True)},
+            "after": {
+                n: {"in all": mean, "error": error, "given": mean > 3}
+                for n, (mean, error) in zip("14", each, strict=True)
+            },
         }
         for each in numbers
     ]
     others = [{"objects": 4, "after": {"1": {"in all": None}, "4": {"in all": None}}}]
     text = in_all_table([*others, *ours], ["1", "4"])
     rows = cells_of("\n".join(text))
-    assert rows[-4:-2] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
-    assert rows[-2:] == [["its error", "0.5", "1.0"], ["within two errors", "0.50", "1.00"]]
+    assert rows[-5:-3] == [["expected in all", "4.0", "3.0"], ["off by", "1.0", "1.0"]]
+    assert rows[-3:-1] == [["its error", "0.5", "1.0"], ["within two errors", "0.50", "1.00"]]
+    assert rows[-1] == ["number given", "1", "1"]
     assert "There are 4.0 in the mean." in text[0]
     assert in_all_table(others, ["1", "4"]) == []
 
@@ -166,7 +171,7 @@ def test_boxes_of_a_plain_pass_are_kept_where_one_of_their_class_is_listed():
     after = record["after"]["4"]
     assert (record["objects"], record["by class"], record["plain"]) == (2, {"1": 1, "2": 1}, 3)
     assert (after["listed"], after["listed right"], after["kept"]) == (2, 1, 1)
-    assert (after["in all"], after["error"]) == pytest.approx((3 * 0.9 + 1, (3 * 0.09 + 0.25) ** 0.5))
+    assert (after["in all"], after["error"]) == pytest.approx((3.7, (3 * 0.09 + 0.25 + (SPREAD * 3.7) ** 2) ** 0.5))
 
 
 def test_average_precision_equals_that_of_coco():

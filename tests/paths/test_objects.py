@@ -17,6 +17,7 @@ from semfov.zoom.glances import Glance, around, overview
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
+HARDLY = "the detector hardly reacts, so no number is given"
 LEFT, RIGHT = [10.0, 10, 30, 30], [50.0, 40, 70, 55]
 
 
@@ -94,19 +95,26 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
         (
             [0.9, 0.9, 0.9, 0.2],
             (1.5, 0.25),
-            "3 × cup from probability or score 0.5 (about 4 ± 1 that this detector can show)",
+            "3 × cup from probability or score 0.5 (about 4 ± 2 that this detector can show)",
         ),
         (
             [0.9, 0.9, 0.9, 0.3],
             (0.0, 0.0),
             "3 × cup from probability or score 0.5 (about 3 ± 1 that this detector can show)",
         ),
+        ([0.9, *[0.3] * 9], (0.0, 0.0), f"1 × cup from probability or score 0.5 ({HARDLY})"),
+        ([0.9, 0.1], (0.0, 0.0), "1 × cup from probability or score 0.5"),
+        (
+            [*[0.6] * 5, *[0.4] * 20],
+            (0, 0),
+            "5 × cup from probability or score 0.5 (about 11 ± 4 that this detector can show)",
+        ),
         ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
         ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
         (
             [0.2],
             (0.0, 0.0),
-            "0 × cup from probability or score 0.5 (the detector hardly reacts, so no number is given)",
+            f"0 × cup from probability or score 0.5 ({HARDLY})",
         ),
     ],
 )

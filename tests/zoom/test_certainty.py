@@ -18,7 +18,7 @@ from semfov.fit.windows_certainty import _fit_unseen, fit_certainty
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.certainty import FACTS, Certainty, object_facts
+from semfov.zoom.certainty import FACTS, SPREAD, Certainty, object_facts
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, merge_with_facts
@@ -227,6 +227,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     chances = path.candidates.scores.double()
     assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
+    variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
     assert path.describe() == f"{len(path.objects)} objects from probability or score 0.5 in 4 passes"
     path.save(tmp_path / "a.safetensors")
