@@ -64,21 +64,7 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
 
 def _digest(files: Iterable[Path]) -> str:
     """sha256 over files, sorted by content: it does not depend on their folders and names."""
-    return hashlib.sha256("".join(sorted(map(_code, files))).encode()).hexdigest()
-
-
-def _code(file: Path) -> str:
-    """sha256 of a file's syntax tree without docstrings; of its bytes where Python cannot parse it."""
-    source = _source(file)
-    tree = _tree(source)
-    if tree is not None:
-        for node in ast.walk(tree):
-            body = getattr(node, "body", None)
-            if isinstance(body, list):
-                node.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
-        with suppress(RecursionError):
-            source = ast.dump(tree).encode()
-    return hashlib.sha256(source).hexdigest()
+    return hashlib.sha256("".join(sorted(_parsed(_source(file))[0] for file in files)).encode()).hexdigest()
 
 
 def _source(file: Path) -> bytes:
@@ -89,24 +75,45 @@ def _source(file: Path) -> bytes:
         return b""
 
 
-def _tree(source: bytes) -> ast.Module | None:
-    try:
-        return ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return None
+@cache
+def _parsed(source: bytes) -> tuple[str, list[ast.Import | ast.ImportFrom]]:
+    """sha256 of a syntax tree without docstrings, or of the source where Python cannot parse it; and its imports."""
+    words: list[str] = []
+    imports: list[ast.Import | ast.ImportFrom] = []
+    with suppress(SyntaxError, ValueError, RecursionError, MemoryError):
+        _spell(ast.parse(source), words, imports)
+        source = "\n".join(words).encode()
+    return hashlib.sha256(source).hexdigest(), imports
 
 
-def _is_text(line: ast.AST) -> bool:
+def _spell(part: object, words: list[str], imports: list[ast.Import | ast.ImportFrom]) -> None:
+    """Append what a part of a syntax tree consists of, in order and without docstrings, and its imports."""
+    if isinstance(part, ast.AST):
+        words.append(type(part).__name__)
+        for name in part._fields:
+            _spell(getattr(part, name, None), words, imports)
+        if isinstance(part, ast.Import | ast.ImportFrom):
+            imports.append(part)
+    elif isinstance(part, list):
+        lines = [line for line in part if not _is_text(line)]
+        words.append(str(len(lines)))
+        for line in lines:
+            _spell(line, words, imports)
+    else:
+        words.append(repr(part))
+
+
+def _is_text(line: object) -> bool:
     return isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant) and isinstance(line.value.value, str)
 
 
 def _imports(name: str, file: Path) -> Iterator[str]:
     """Dotted names of all imports in a module, at any depth; `from a import b` gives both `a` and `a.b`."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-    for node in ast.walk(_tree(_source(file)) or ast.Module([], [])):
+    for node in _parsed(_source(file))[1]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
             base = ".".join([*parents, *([node.module] if node.module else [])])
             yield base

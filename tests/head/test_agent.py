@@ -195,10 +195,10 @@ def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama
 @pytest.mark.slow
 def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
     world = Panorama(panorama)
-    everything = agent.find_all(world, passes=30)
-    both = agent.find_all(world, ["red", "blue"], passes=30)
-    blue = agent.find_all(world, "blue", passes=30)
-    assert everything.actions == both.actions == blue.actions == agent.explore(world, passes=30).actions
+    everything = agent.find_all(world, passes=16)
+    both = agent.find_all(world, ["red", "blue"], passes=16)
+    blue = agent.find_all(world, "blue", passes=16)
+    assert everything.actions == both.actions == blue.actions == agent.explore(world, passes=16).actions
     assert (both.target, both.targets, blue.target) == (None, (1, 3), 3)
     assert both.decision is None
     assert set(both.objects.labels.tolist()) == {1, 3}

@@ -14,7 +14,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects
 from semfov.errors import InputError
 from semfov.report import episode_data, page_html, zoom_data
-from semfov.report.zoom import _DRAWN, _MOST_DETECTIONS
+from semfov.report.zoom import _MOST_DETECTIONS
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -117,8 +117,9 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     assert texts.count("Closer look probability 0.88 that the target is there") == 1
 
 
-def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
-    many = _DRAWN + 7
+def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
+    monkeypatch.setattr("semfov.report.zoom._DRAWN", drawn := _MOST_DETECTIONS + 5)
+    many = drawn + 7
     scores = torch.linspace(0.9, 0.3, many)
     place = torch.tensor([[10.0, 10, 20, 20]]).expand(many, 4)
     objects = Objects(place, scores, torch.full((many,), 2), torch.zeros(many).long())
@@ -136,8 +137,8 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
     assert f"<p>{many - _MOST_DETECTIONS} less confident detections are left out.</p>" in page
-    assert page.count("<tr data-object=") == _DRAWN
-    one = replace(zoom_path, decision=None, candidates=objects[torch.arange(_DRAWN + 1)])
+    assert page.count("<tr data-object=") == drawn
+    one = replace(zoom_path, decision=None, candidates=objects[torch.arange(drawn + 1)])
     page = page_html("crowd", [zoom_data(one, large_picture, name="crowd")])
     assert "<p>1 less confident object is left out.</p>" in page
 

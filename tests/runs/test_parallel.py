@@ -90,7 +90,9 @@ def wait_until(condition, seconds=120):
     [
         (signal.SIGKILL, -9, None),
         (signal.SIGTERM, 143, "terminated; give the same command again to continue"),
-        (signal.SIGINT, 130, "interrupted; give the same command again to continue"),
+        pytest.param(
+            signal.SIGINT, 130, "interrupted; give the same command again to continue", marks=pytest.mark.long
+        ),
     ],
     ids=["SIGKILL", "SIGTERM", "SIGINT"],
 )
