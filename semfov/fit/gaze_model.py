@@ -36,7 +36,9 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     source = features_of(detector, config.layers)
     groups = look(config, source)
     pictures = sum(map(len, groups))
-    check(pictures >= max(config.folds, 1), "fixations", f"pictures for {config.folds} folds", f"{pictures}")
+    fewest = min(sum(len(group) for group in groups if group.source == n) for n in range(len(config.fixations)))
+    expected = f"at least {max(config.folds, 1)} pictures in each file, or fewer folds than {config.folds}"
+    check(fewest >= max(config.folds, 1), "fixations", expected, fewest)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
     folds = [Fold(groups, number, config.folds) for number in range(config.folds)]
     scored = joined([kept.scores(detector.name, fold, config.fit) for fold in folds])
