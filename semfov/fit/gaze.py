@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from semfov.fit.viewing import LONGEST, Events, Viewed, events_of, log_centre
+from semfov.fit.viewing import Events, Viewed, events_of, log_centre
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.gaze.saliency.oculomotor import OculomotorBias
@@ -236,27 +236,6 @@ def _drawn(events: Events, size: tuple[int, int], generator: torch.Generator) ->
     return Events(chosen.before[:, -longest:], chosen.cell, chosen.person), (top, left, 2)
 
 
-def describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
-    """Set first fixations, durations and pauses of a model to those of all people."""
-    firsts, left, lengths = [], [], []
-    logs: list[list[Tensor]] = [[] for _ in range(5)]
-    for group in groups:
-        height, width = group.size
-        firsts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
-        for each in (one for people in group.people for one in people if one.durations is not None):
-            times = torch.from_numpy(each.durations).float()
-            for number, log in enumerate(times[:LONGEST].clamp(min=1).log()):
-                logs[min(number, 4)].append(log)
-            left.append(1000 * group.seconds - times.sum())
-            lengths.append(len(times))
-    first = torch.stack(firsts)
-    model.start = torch.stack([first.mean(0), first.std(0)])
-    if left:
-        model.duration = torch.stack([torch.stack([torch.stack(x).mean(), torch.stack(x).std()]) for x in logs if x])
-        pauses = torch.stack([time / number for time, number in zip(left, lengths, strict=True)])
-        model.pause = pauses.mean().clamp(min=0)
-
-
 @torch.no_grad()
 def score(
     model: FixationDensity,
@@ -297,9 +276,3 @@ def _scores(density: Tensor, cell: Tensor) -> Tensor:
     z = (at - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
     below = (density < at[:, None]).float().mean(1) + (density == at[:, None]).float().mean(1) / 2
     return torch.stack([z.mean(), below.mean(), (at * density.shape[1]).log2().mean()])
-
-
-def summary_of(metrics: Tensor, baseline: Tensor) -> Mapping[str, float]:
-    """Means over pictures of NSS, AUC and information gain over a baseline, `(P, 3)` each."""
-    gain = metrics[:, 2] - baseline[:, 2]
-    return {"NSS": float(metrics[:, 0].mean()), "AUC": float(metrics[:, 1].mean()), "gain": float(gain.mean())}

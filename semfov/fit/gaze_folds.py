@@ -9,9 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from semfov.errors import SemfovError
+from semfov.errors import SemfovError, check
 from semfov.fit.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
-from semfov.fit.viewing import Viewed, folds, log_centre, others_of
+from semfov.fit.viewing import Viewed, log_centre, others_of
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.code import modules_digest
 from semfov.io.storage import read_tensors, write_tensors
@@ -28,6 +28,16 @@ ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases
 """Rows by the terms of their models, without and with the scanpath."""
 
 
+def _folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int], list[int]]:
+    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out.
+
+    `first` is the number of the first picture in its data set, of which a group has the pictures of one size.
+    """
+    check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
+    held = [*range((fold - first) % count, number, count)]
+    return [each for each in range(number) if each not in set(held)], held
+
+
 class Fold:
     """The pictures of one of `count` folds, which are held out, and the others, to which models are fitted.
 
@@ -40,7 +50,7 @@ class Fold:
         split = []
         for group in groups:
             first = before.get(group.source, 0)
-            split.append(folds(len(group), count, number, first))
+            split.append(_folds(len(group), count, number, first))
             before[group.source] = first + len(group)
         self.held = [held for _, held in split]
         self.fitted = self._of(only, [fitted for fitted, _ in split])

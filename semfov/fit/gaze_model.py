@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from semfov.detection.detector import Detector
 from semfov.errors import check
-from semfov.fit.gaze import GazeFit, describe_viewing, fitted_density, summary_of
+from semfov.fit.gaze import GazeFit, fitted_density
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
-from semfov.fit.viewing import ViewingData, features_of, look
+from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.runs.settings import Whole
 from semfov.runs.tables import table
@@ -30,6 +33,27 @@ class GazeModelFit(ViewingData, GazeFit):
     folds: Whole = 5
 
 
+def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
+    """Set first fixations, durations and pauses of a model to those of all people."""
+    firsts, left, lengths = [], [], []
+    logs: list[list[Tensor]] = [[] for _ in range(5)]
+    for group in groups:
+        height, width = group.size
+        firsts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
+        for each in (one for people in group.people for one in people if one.durations is not None):
+            times = torch.from_numpy(each.durations).float()
+            for number, log in enumerate(times[:LONGEST].clamp(min=1).log()):
+                logs[min(number, 4)].append(log)
+            left.append(1000 * group.seconds - times.sum())
+            lengths.append(len(times))
+    first = torch.stack(firsts)
+    model.start = torch.stack([first.mean(0), first.std(0)])
+    if left:
+        model.duration = torch.stack([torch.stack([torch.stack(x).mean(), torch.stack(x).std()]) for x in logs if x])
+        pauses = torch.stack([time / number for time, number in zip(left, lengths, strict=True)])
+        model.pause = pauses.mean().clamp(min=0)
+
+
 def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tuple[FixationDensity, Scores]:
     """Look at all pictures, evaluate on folds, whose models and scores are kept in a folder, and fit to all."""
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
@@ -43,7 +67,7 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     folds = [Fold(groups, number, config.folds) for number in range(config.folds)]
     scored = joined([kept.scores(detector.name, fold, config.fit) for fold in folds])
     model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
-    describe_viewing(model, groups)
+    _describe_viewing(model, groups)
     scanpaths = sum(len(some) for group in groups for some in group.people)
     known = {name: detector.settings()[name] for name in ("name", "digest", "input_size", "stretch")}
     training = {**config.fit.plain(), "pictures": pictures, "scanpaths": scanpaths}
@@ -51,11 +75,17 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     return model, scored
 
 
+def _summary_of(metrics: Tensor, baseline: Tensor) -> Mapping[str, float]:
+    """Means over pictures of NSS, AUC and information gain over a baseline, `(P, 3)` each."""
+    gain = metrics[:, 2] - baseline[:, 2]
+    return {"NSS": float(metrics[:, 0].mean()), "AUC": float(metrics[:, 1].mean()), "gain": float(gain.mean())}
+
+
 def summaries(scored: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
     """Means over the held-out pictures, by number of the data set and row."""
     return {
         str(source + 1): {
-            row: {**summary_of(scored[row, source], scored[CENTRE, source]), "pictures": len(scored[row, source])}
+            row: {**_summary_of(scored[row, source], scored[CENTRE, source]), "pictures": len(scored[row, source])}
             for row in (CENTRE, *ROWS[False], *ROWS[True])
             if (row, source) in scored
         }

@@ -288,13 +288,3 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
             smooth = _blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
             total += smooth / smooth.sum()
     return ((1 - floor) * total / total.sum() + floor / total.numel()).log()
-
-
-def folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int], list[int]]:
-    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out.
-
-    `first` is the number of the first picture in its data set, of which a group has the pictures of one size.
-    """
-    check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
-    held = [*range((fold - first) % count, number, count)]
-    return [each for each in range(number) if each not in set(held)], held

@@ -33,7 +33,6 @@ class Range:
         return is_number(value, whole=whole) and self.low <= value <= self.high and value > self.above  # type: ignore[operator]
 
 
-@dataclass(frozen=True)
 class _FileName:
     """Restriction of a text setting to valid file names, in a type annotation."""
 

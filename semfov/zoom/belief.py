@@ -16,7 +16,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
 from semfov.zoom.photograph import PhotographEvidence
-from semfov.zoom.sums import EVERYWHERE, Box, Cells, Place, WindowSums, extent
+from semfov.zoom.sums import Box, Cells, Place, extent, union
 
 _SLIVER = 0.25
 """Share of a window: where less is not blank, little counts as little, and the edge of a scan takes no look."""
@@ -40,6 +40,48 @@ class Rates(Protocol):
     def taper(self, span: int) -> Tensor:
         """See `GlimpseEvidence.taper`."""
         ...
+
+
+class _WindowSums:
+    r"""Weighted sums of the cells of every window; weight `(span,)`, shape `(rows, columns)`.
+
+    .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
+
+    A sum along an axis is a product with a banded matrix. Only the windows that hold a cell which has changed are
+    summed again. A window that reaches beyond the cells sums those that it holds.
+
+    Shapes: weight `(span,)`, shape `(rows, columns)`.
+    """
+
+    def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[Place], Cells]) -> None:
+        self._span, self._cells = len(weight), cells
+        places = np.arange(max(max(n - self._span, 0) + 1 for n in shape))
+        self._band = np.zeros((len(places) + self._span - 1, len(places)), np.float32)
+        self._band[places + np.arange(self._span)[:, None], places] = weight[:, None]
+        self._sums = np.zeros([max(n - self._span, 0) + 1 for n in shape], np.float32)
+        self._changed: Box | None = (0, 0, shape[1], shape[0])
+
+    def mark(self, changed: Box) -> None:
+        """Have the windows summed again that hold one of some cells."""
+        self._changed = union(changed, self._changed)
+
+    def update(self) -> Cells:
+        """Sum the cells of every window, `(down, across)`; the next call changes the result."""
+        if self._changed is None:
+            return self._sums
+        (x1, y1, x2, y2), self._changed = self._changed, None
+        reach = self._span - 1
+        top, left = max(y1 - reach, 0), max(x1 - reach, 0)
+        bottom, right = min(y2, self._sums.shape[0]), min(x2, self._sums.shape[1])
+        part = self._cells((slice(top, bottom + reach), slice(left, right + reach)))
+        down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
+        # NumPy would start threads for large pictures, and they would wait at full load for the next product.
+        lines = torch.from_numpy(part) @ torch.from_numpy(across)
+        self._sums[top:bottom, left:right] = (torch.from_numpy(down).mT @ lines).numpy()
+        return self._sums
+
+
+_EVERYWHERE: Place = (slice(None), slice(None))
 
 
 class ZoomBelief:
@@ -80,7 +122,7 @@ class ZoomBelief:
         self.source = torch.full(shape, -1)
         self.left = self._there.clone()
         self.gists: list[Gist] = []
-        self._sums: dict[tuple[int, int], WindowSums] = {}
+        self._sums: dict[tuple[int, int], _WindowSums] = {}
         self._odds: WindowOdds | None = None
         self._odds_of: dict[Window, float] = {}
 
@@ -179,7 +221,7 @@ class ZoomBelief:
         clear = float(expected[expected >= _CLEAR].sum())
         return clear, float(expected.sum()) - clear
 
-    def _expected(self, level: int, at: Place = EVERYWHERE) -> Cells:
+    def _expected(self, level: int, at: Place = _EVERYWHERE) -> Cells:
         """`expected` in some rows and columns."""
         self._predict()
         expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
@@ -206,7 +248,7 @@ class ZoomBelief:
         if level not in self._areas:
             there, ones = self._there.numpy(), np.ones(self.lattice.span(level), np.float32)
             whole = min(len(ones), self.lattice.rows) * min(len(ones), self.lattice.columns)
-            self._areas[level] = WindowSums(ones, there.shape, there.__getitem__).update().clip(_SLIVER * whole)
+            self._areas[level] = _WindowSums(ones, there.shape, there.__getitem__).update().clip(_SLIVER * whole)
         return self._sum(level, 0) / self._areas[level]
 
     @property
@@ -224,7 +266,7 @@ class ZoomBelief:
             )[octaves]
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)
-            self._sums[level, octaves] = WindowSums(weight, (self.lattice.rows, self.lattice.columns), cells)
+            self._sums[level, octaves] = _WindowSums(weight, (self.lattice.rows, self.lattice.columns), cells)
         return self._sums[level, octaves].update()
 
     def odds(self, level: int) -> Tensor:

@@ -14,8 +14,9 @@ from semfov import Detector, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
 from semfov.detection import Candidates
-from semfov.fit.gaze import GazeFit, _fit_map, describe_viewing, fit_oculomotor, maps_of, score, summary_of
-from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
+from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
+from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore, _folds
+from semfov.fit.gaze_model import _describe_viewing, _summary_of
 from semfov.fit.viewing import (
     MapSource,
     ViewingData,
@@ -23,7 +24,6 @@ from semfov.fit.viewing import (
     covering,
     events_of,
     features_of,
-    folds,
     log_centre,
     look,
     others_of,
@@ -77,7 +77,7 @@ def group():
 
 def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     torch.manual_seed(0)
-    fitted, held = folds(len(group), 4, 0)
+    fitted, held = _folds(len(group), 4, 0)
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     losses = []
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
@@ -86,13 +86,13 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)
     (baseline,) = score(base, group, [torch.zeros_like(each) for each in maps], held, conditional=False)
-    scores = summary_of(score(model, group, maps, held, conditional=False)[0], baseline)
+    scores = _summary_of(score(model, group, maps, held, conditional=False)[0], baseline)
     assert scores["gain"] > 1.5
     assert scores["NSS"] > 3
     fit_oculomotor(model, [group], [maps_of(model, group, fitted)], [fitted], fit, rate=0.1)
-    after = summary_of(score(model, group, maps, held, conditional=True)[0], baseline)
+    after = _summary_of(score(model, group, maps, held, conditional=True)[0], baseline)
     assert after["gain"] > scores["gain"] - 0.05
-    describe_viewing(model, [group])
+    _describe_viewing(model, [group])
     assert float(model.duration[0, 0]) == pytest.approx(math.log(200), abs=1e-5)
     assert float(model.pause) == pytest.approx((3000 - 1600) / 8)
 
@@ -129,7 +129,7 @@ def test_people_are_predicted_by_the_others(group):
     fit = GazeFit(saccade_epochs=1)
     fold = Fold([group], 0, 4)
     scored = fold.scores(fold.fit(fit, "other people"), fit, "other people")
-    assert summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
+    assert _summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
     alone = group.by({"0"})
     assert float(others_of(alone, 5, torch.zeros(39, 52)).std()) < 1e-6
 
@@ -175,10 +175,10 @@ def test_oculomotor_biases_recover_a_known_saccade_length():
 
 
 def test_folds_hold_out_each_picture_once():
-    held = [folds(11, 3, fold)[1] for fold in range(3)]
+    held = [_folds(11, 3, fold)[1] for fold in range(3)]
     assert sorted(each for some in held for each in some) == list(range(11))
     for fold in range(3):
-        fitted, out = folds(11, 3, fold)
+        fitted, out = _folds(11, 3, fold)
         assert sorted(fitted + out) == list(range(11))
 
 

@@ -6,13 +6,12 @@ import torch
 
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.belief import ZoomBelief, _WindowSums
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
-from semfov.zoom.sums import WindowSums
 from tests.zoom import plain
 
 
@@ -39,7 +38,7 @@ def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
-        kept = WindowSums(weight, shape, cells.__getitem__)
+        kept = _WindowSums(weight, shape, cells.__getitem__)
         for _ in range(6):
             padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
             windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from functools import cached_property
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 
@@ -38,13 +38,12 @@ _LONGEST = 15
 """Maximum number of gaze shifts in them."""
 
 
-@dataclass(frozen=True)
-class PartResult:
+class PartResult(NamedTuple):
     """A fitted part with its report."""
 
     part: Part
     report: str
-    figures: list[str] = field(default_factory=list)
+    figures: Sequence[str] = ()
 
 
 class PartInputs:

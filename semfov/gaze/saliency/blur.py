@@ -76,3 +76,11 @@ def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device
     # Tiles are evenly spaced only where the ratio is a whole number.
     shift = count if rest else max(_TILE // ratio, 1)
     return banded(taps, count, length if rest else shift * ratio, shift, 2, dtype, device)
+
+
+def rescale(saliency: Tensor, flat: float = 0.0) -> Tensor:
+    """Shift and scale maps to [0, 1]; saliency `(..., H, W)`."""
+    low, high = saliency.amin((-2, -1), keepdim=True), saliency.amax((-2, -1), keepdim=True)
+    span = high - low
+    # Division by infinity sets a flat map to 0, and its gradient too.
+    return (saliency - low) / torch.where(span > flat, span, torch.inf)

@@ -1,5 +1,6 @@
 """VOCUS2: saliency as the contrast of two Gaussian pyramids, of centres and of surrounds."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -8,8 +9,7 @@ from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape, lookup
-from semfov.gaze.saliency.blur import gaussian_blur
-from semfov.gaze.saliency.conspicuity import Fusion, combine_maps, rescale
+from semfov.gaze.saliency.blur import enlarge, gaussian_blur, rescale
 from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 _ColorSpace = Literal["opponent", "lab"]
@@ -71,6 +71,25 @@ def _on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]
     return F.relu(centre - surround), F.relu(surround - centre)
 
 
+_Fusion = Literal["mean", "max"]
+
+
+def _combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: _Fusion = "mean") -> Tensor:
+    """Mean or maximum of all maps, each enlarged to `size` by cubic interpolation.
+
+    Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
+    """
+    lookup(fusion, get_args(_Fusion), "fusion")
+    check(len(maps) > 0, "maps", "at least one tensor", 0)
+    for layer in maps:
+        check_shape(layer, "maps", maps[0].shape[0], maps[0].shape[1], None, None)
+    if fusion == "mean":
+        # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
+        enlarged = (enlarge(layer.mean(1), size) for layer in maps)
+        return sum(enlarged, next(enlarged)) / len(maps)
+    return torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
+
+
 def vocus2_saliency(
     image: Tensor,
     *,
@@ -78,7 +97,7 @@ def vocus2_saliency(
     surround_sigma: float = 6.0,
     layers: int = 5,
     scales: int = 2,
-    fusion: Fusion = "mean",
+    fusion: _Fusion = "mean",
     color_space: _ColorSpace = "opponent",
     normalise: bool = True,
 ) -> Tensor:
@@ -121,7 +140,7 @@ def vocus2_saliency(
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
-        saliency = combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
+        saliency = _combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
     return rescale(saliency, flat) if normalise else saliency
@@ -153,7 +172,7 @@ class VOCUS2(nn.Module):
         *,
         layers: int = 5,
         scales: int = 2,
-        fusion: Fusion = "mean",
+        fusion: _Fusion = "mean",
         color_space: _ColorSpace = "opponent",
         normalise: bool = True,
     ) -> None:
@@ -165,7 +184,7 @@ class VOCUS2(nn.Module):
         self.surround_sigma = surround_sigma
         self.layers = layers
         self.scales = scales
-        self.fusion: Fusion = fusion
+        self.fusion: _Fusion = fusion
         self.color_space: _ColorSpace = color_space
         self.normalise = normalise
 
@@ -196,7 +215,7 @@ class VOCUS2(nn.Module):
         return f"{sigmas}, {settings}, color_space={self.color_space!r}"
 
 
-def _contrasts(twin: _Twin, fusion: Fusion) -> Tensor:
+def _contrasts(twin: _Twin, fusion: _Fusion) -> Tensor:
     """Contrasts to be fused `(B, N, h, w)`."""
     if fusion == "mean":
         # One of the two contrasts is 0, so their mean is half the difference. The mean over channels is taken as well.

@@ -6,14 +6,15 @@ import pytest
 import torch
 
 from semfov.errors import InputError
-from semfov.gaze.saliency.conspicuity import combine_maps, rescale
+from semfov.gaze.saliency.blur import rescale
+from semfov.gaze.saliency.vocus2 import _combine_maps
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
 def test_fusion_equals_opencv(fusion: str, dtype: torch.dtype, tolerance: float) -> None:
     sizes = [(24, 37), (12, 18), (6, 9), (3, 4)]
     maps = [torch.rand(2, 6, *size, dtype=dtype) for size in sizes]
-    fused = combine_maps(maps, sizes[0], fusion)
+    fused = _combine_maps(maps, sizes[0], fusion)
     for image in range(2):
         enlarged = [
             cv2.resize(each.double().numpy(), sizes[0][::-1], interpolation=cv2.INTER_CUBIC)
@@ -44,8 +45,8 @@ def test_gradient_of_a_flat_map_is_finite() -> None:
 
 def test_bad_input() -> None:
     with pytest.raises(InputError, match="maps"):
-        combine_maps([], (4, 4))
+        _combine_maps([], (4, 4))
     with pytest.raises(InputError, match="maps"):
-        combine_maps([torch.zeros(1, 2, 4, 4), torch.zeros(1, 3, 2, 2)], (4, 4))
+        _combine_maps([torch.zeros(1, 2, 4, 4), torch.zeros(1, 3, 2, 2)], (4, 4))
     with pytest.raises(InputError, match="fusion"):
-        combine_maps([torch.zeros(1, 2, 4, 4)], (4, 4), "median")
+        _combine_maps([torch.zeros(1, 2, 4, 4)], (4, 4), "median")
