@@ -209,6 +209,15 @@ class ActivePerception(nn.Module):
         self.eye.detector._apply(fn, recurse)
         return self
 
+    def __getattr__(self, name: str) -> Any:
+        """The parts of the module; other libraries' words for what an agent does are refused with its own."""
+        instead = {"detect": "find_all", "find": "find_all", "locate": "search", "predict": "find_all"}
+        try:
+            return super().__getattr__(name)
+        except AttributeError as error:
+            own = f"; an agent has search, find_all and explore: use {instead[name]}" if name in instead else ""
+            raise AttributeError(f"{error}{own}", name=name, obj=self) from None
+
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
         fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]

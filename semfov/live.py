@@ -109,6 +109,8 @@ class LivePerception:
             InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
             DataError: the file of the frame cannot be read.
         """
+        got = "None (OpenCV gives None after the last frame, and where it cannot read one)"
+        check(frame is not None, "frame", "a picture", got)
         if self._white is not None:
             frame = as_image(frame, argument="frame", white=self._white)
         picture = open_picture(frame)

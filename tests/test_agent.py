@@ -439,6 +439,15 @@ def test_agents_and_streams_are_printed_in_one_line():
     assert repr(live) == "LivePerception: searching for “red”, how='fovea'"
 
 
+def test_words_of_other_libraries_are_refused_with_those_of_an_agent():
+    agent = one_agent(Coloured(("red", "wine glass")))
+    for name, own in {"find": "find_all", "predict": "find_all", "locate": "search"}.items():
+        with pytest.raises(AttributeError, match=rf"an agent has search, find_all and explore: use {own}$"):
+            getattr(agent, name)
+    with pytest.raises(AttributeError, match=r"has no attribute 'nothing'$"):
+        _ = agent.nothing
+
+
 def test_an_exploration_as_people_look_follows_the_density(agent, image, monkeypatch):
     """People who look at one place alone are followed there; the looks are those of any exploration."""
     model = saliency.FixationDensity({"none": 1}).requires_grad_(False)

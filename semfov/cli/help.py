@@ -251,7 +251,8 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("max_shifts", "fixations", "saccades"), ("shifts",)),
     **dict.fromkeys(("time", "timeout", "max_seconds"), ("seconds",)),
     **dict.fromkeys(("jobs", "processes", "num_workers", "threads"), ("workers",)),
-    **dict.fromkeys(("verbose", "silent"), ("quiet",)),
+    "verbose": ("looks", "quiet"),
+    "silent": ("quiet",),
     **dict.fromkeys(("batch_size",), ("batch",)),
     **dict.fromkeys(("names",), ("classes",)),
 }

@@ -38,6 +38,8 @@ def look_live(options: LiveOptions) -> int:
     _sought(options, detector_classes(options))
     source = options.source if options.camera is None else options.camera
     assert source is not None
+    if isinstance(source, str) and source.isdecimal() and not Path(source).exists():
+        source = int(source)  # `semfov live 0`, as in OpenCV
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}

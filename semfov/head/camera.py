@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias, cast
 
@@ -89,6 +90,8 @@ class PanTiltCamera(Protocol):
 
 def _check_degrees(pan: tuple[float, float], tilt: tuple[float, float]) -> None:
     """Raise `InputError` for limits that are so narrow that they are radians, or ONVIF's numbers from -1 to 1."""
+    for name, limits in (("pan", pan), ("tilt", tilt)):
+        check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
     sides = [abs(float(side)) for side in (*pan, *tilt)]
     if 0 < max(sides) <= 2 * math.pi:
         whole = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"

@@ -32,6 +32,8 @@ def discard_unfinished() -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: a context manager that replaces `path` once its block has ended without an error."""
     path = Path(path)
+    if not path.name:
+        raise DataError(f"cannot write {str(path)!r}: expected the name of a file")
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

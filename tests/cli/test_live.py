@@ -167,8 +167,9 @@ def test_a_camera_runs_until_it_is_stopped(run, tmp_path, monkeypatch):
 
     asked = []
     monkeypatch.setattr(live, "open_stream", lambda *what: asked.append(what) or Stream("camera 0", None, endless()))
+    run("live", "0")
     code, printed = run("live", "--camera", 0, "--target", "red", "--rate", 0.5, "--out", tmp_path / "out")
-    assert asked == [(0, None, None)]
+    assert asked == [(0, None, None)] * 2
     assert code == 0
     assert "stopped\n3 frames" in printed.out
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 3

@@ -281,7 +281,12 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
 
 @pytest.mark.parametrize(
     ("limits", "unit"),
-    [(((-3.15, 3.15), (-0.5, 1.57)), "radians"), (((-1, 1), (-1, 1)), "ONVIF"), (((0, 0), (-1, 0.5)), "ONVIF")],
+    [
+        ((90, (-20, 20)), "got 90"),
+        (((-3.15, 3.15), (-0.5, 1.57)), "radians"),
+        (((-1, 1), (-1, 1)), "ONVIF"),
+        (((0, 0), (-1, 0.5)), "ONVIF"),
+    ],
 )
 def test_limits_in_other_units_are_refused(limits, unit):
     class Narrow(PanTiltCamera):
@@ -290,5 +295,5 @@ def test_limits_in_other_units_are_refused(limits, unit):
         def look_at(self, direction, field):
             return torch.rand(3, 30, 40)
 
-    with pytest.raises(InputError, match=f"pan: expected limits in degrees.*{unit}"):
+    with pytest.raises(InputError, match=f"pan: expected .*limits in degrees.*{unit}"):
         CameraScene(Narrow())

@@ -45,6 +45,12 @@ def test_a_path_below_a_file_is_refused(tmp_path):
         pass
 
 
+def test_a_name_is_needed():
+    for path in ("", "."):
+        with pytest.raises(DataError, match=r"cannot write '.': expected the name of a file"), replacing(path):
+            pass
+
+
 def test_parts_of_writers_that_were_killed_are_removed_when_they_are_old(tmp_path):
     names = [".a.json.0123abcd.part", ".b.json.00000000.part", "c.part", ".d.0123abcd.part.txt"]
     for name in names:

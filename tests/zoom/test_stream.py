@@ -225,3 +225,7 @@ def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(whole, picture)
         InputError, match=r"frame: expected 1024 × 768 pixels, the size of the first frame, got 1024 × 700"
     ):
         running.step(picture[:, :700])
+    with pytest.raises(
+        InputError, match=r"frame: expected a picture, got None \(OpenCV gives None after the last frame"
+    ):
+        running.step(None)
