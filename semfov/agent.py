@@ -211,12 +211,9 @@ class ActivePerception(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         """The parts of the module; other libraries' words for what an agent does are refused with its own."""
-        instead = {"detect": "find_all", "find": "find_all", "locate": "search", "predict": "find_all"}
-        try:
-            return super().__getattr__(name)
-        except AttributeError as error:
-            own = f"; an agent has search, find_all and explore: use {instead[name]}" if name in instead else ""
-            raise AttributeError(f"{error}{own}", name=name, obj=self) from None
+        if name in ("detect", "find", "locate", "predict"):
+            raise AttributeError(f"an agent has search, find_all and explore, not {name!r}")
+        return super().__getattr__(name)
 
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
@@ -567,21 +564,15 @@ class ActivePerception(nn.Module):
         numbers, one = class_numbers(target, self.classes[1:], "target"), not isinstance(target, list | tuple)
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
-        return LivePerception(
-            self.fovea,
-            self.zoom,
-            numbers[0] if numbers and one else None,
-            () if one else numbers,
-            how=lookup(how, get_args(How), "kind of look"),
-            rate=rate,
-            start=start,
-            seed=seed,
-            confirm=confirm,
-            give_up=give_up,
-            closer=closer,
-            color=color,
-            white=white,
-        )
+        sought, found = numbers[0] if numbers and one else None, () if one else numbers
+        settings: dict[str, Any] = {"rate": rate, "start": start, "seed": seed, "confirm": confirm, "give_up": give_up}
+        settings |= {
+            "closer": closer,
+            "color": color,
+            "white": white,
+            "how": lookup(how, get_args(How), "kind of look"),
+        }
+        return LivePerception(self.fovea, self.zoom, sought, found, **settings)
 
     def _kind(
         self, picture: OpenedPicture, how: How, shifts: int | None, duration: float | None, **wanted: bool
