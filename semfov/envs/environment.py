@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium
@@ -17,7 +18,7 @@ from semfov.envs.gazes import Arrays, Gazes
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.envs.windows import WindowGaze
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, check_options
 
 _Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
 
@@ -325,6 +326,7 @@ def scenery_or_open(
     """Take the scenery that is given, or open one; raises an error if both a scenery and options are given."""
     expected = f"no options of `{open_it.__name__}` beside it"
     check(scenery is None or not options, "scenery", expected, ", ".join(options))
+    check_options(options, signature(open_it).parameters.keys() - {"task"}, f"`{open_it.__name__}`")
     return open_it(*task, **options) if scenery is None else scenery
 
 

@@ -247,6 +247,8 @@ def test_invalid_calls_are_refused(sceneries):
         env.reset(options={"start": 3})
     with pytest.raises(InputError, match="scenery: expected no options of `open_scenery` beside it, got count"):
         GazeSearch(scenery, count=3)
+    with pytest.raises(InputError, match=r"shift: expected an option of `open_scenery`.* did you mean shifts="):
+        GazeSearch(shift=3)
     with pytest.raises(InputError, match="render_mode: expected 'rgb_array' or None"):
         GazeSearch(scenery, render_mode="human")
     with pytest.raises(InputError, match="price"):
