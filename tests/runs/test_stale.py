@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from eval.comparison.records import StoredRecords, gather
+from eval.comparison.records import StoredRecords
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import TargetPosterior
@@ -205,9 +205,6 @@ def test_a_policy_given_twice_is_refused(config):
 
 
 def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
-    run = SearchRun(config)
-    finish(run, "searching")
-    assert [*gather(run)]
+    key = SearchRun(config).key
     monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
-    other = SearchRun(config)
-    assert outcomes(other.results, 0) is None
+    assert SearchRun(config).key != key

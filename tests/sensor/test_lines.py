@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semfov.sensor.lines import Taps, banded, separable
 
 
 @pytest.mark.slow
+@settings(max_examples=40)
 @given(
     tiles=st.integers(1, 30),
     tile=st.integers(1, 16),
