@@ -2,7 +2,7 @@
 
 A process runs the scenes and is killed when half of them are finished. A second one continues, and reads all records.
 The table tells how long it took to find out what was finished, and how much memory the process took, beside a run over
-a tenth of the scenes.
+a tenth of the scenes. With `--cluster` it tells instead what the scenes cost the process that gives them to a worker.
 """
 
 import argparse
@@ -36,7 +36,7 @@ class StubConfig:
 
     out: Path
     scenes: int
-    where: int = 1
+    where: int | str = 1
 
     def plain(self) -> dict[str, Any]:
         """The settings that outcomes depend on."""
@@ -117,14 +117,34 @@ def killed_and_continued(scenes: int) -> list[dict[str, float]]:
     return [{"scenes": max(1, scenes // 10), **few, "size": 0.0}, {"scenes": scenes, **many, "size": size}]
 
 
+def coordination(scenes: int) -> float:
+    """Milliseconds of the processor that scheduler and coordinator need for each scene, with one worker."""
+    from distributed import LocalCluster
+
+    def seconds(count: int) -> float:
+        began = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            finish(StubRun(StubConfig(Path(folder), count, cluster.scheduler_address)), "stub looks")
+        return time.process_time() - began
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        few = max(1, scenes // 10)
+        seconds(few)  # imports
+        return 1e3 * (seconds(scenes) - seconds(few)) / (scenes - few)
+
+
 def main() -> None:
     """Measure, and write the table."""
     parser = command("benchmarks.scale", __doc__, seconds=0.0)
     parser.add_argument("--scenes", type=int, default=2000, help="number of scenes")
+    parser.add_argument("--cluster", action="store_true", help="measure what a cluster costs its coordinator")
     parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work is not None:
         work(options.work, options.scenes)
+        return
+    if options.cluster:
+        print(f"{coordination(options.scenes):.2f} ms of the coordinator's processor for each scene")
         return
     _, about = begin(options)
     told = killed_and_continued(options.scenes)
