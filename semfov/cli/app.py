@@ -62,8 +62,8 @@ def serve(options: AppOptions) -> int:
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
-        page = make_page(agent, options.seed)
-        address = launched(page, options.host, options.port)
+        page = _make_page(agent, options.seed)
+        address = _launched(page, options.host, options.port)
         print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
         try:
             threading.Event().wait()
@@ -72,7 +72,7 @@ def serve(options: AppOptions) -> int:
     return 0
 
 
-def launched(page: Any, host: str, port: int | None) -> str:
+def _launched(page: Any, host: str, port: int | None) -> str:
     """Serve a page, with one look at a time; returns its address."""
     import gradio
 
@@ -143,7 +143,13 @@ class _Calls:
             point = torch.tensor([[side * scale for side in event.index]])
             cells = [*cells, int(_grid_of(self.agent, image).cell_of(point)[0])]
             looked = _look_at_cells(self.agent, image, _one(target, self.classes), cells)
-            return cells, _clicked(image, looked), _seen(looked), _believed(looked), looked.describe()
+            return (
+                cells,
+                _clicked(image, looked),
+                _seen(looked),
+                render([plot_belief(looked.record, -1)], dpi=110)[0],
+                looked.describe(),
+            )
 
     def fresh(self, picture: Any) -> tuple[Any, ...]:
         """No cells, and the picture to click on."""
@@ -163,7 +169,7 @@ def _told() -> Iterator[None]:
         raise gradio.Error(str(error), print_exception=False) from None
 
 
-def make_page(agent: ActivePerception, seed: int = 0) -> Any:
+def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
     """The page, a `gradio.Blocks`; pictures that it is given are removed within minutes."""
     import gradio
 
@@ -310,8 +316,3 @@ def _seen(looked: _OwnLooks) -> Image.Image:
             draw.text((box[0] * scale + 4, box[1] * scale + 2), f"{record.classes[label]} {score:.2f}", fill="white",
                       stroke_width=2, stroke_fill=colour, font_size=max(12, picture.width / 40))  # fmt: skip
     return picture
-
-
-def _believed(looked: _OwnLooks) -> Any:
-    """The probability of the target in each cell after the last look."""
-    return render([plot_belief(looked.record, -1)], dpi=110)[0]

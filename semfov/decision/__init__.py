@@ -3,7 +3,6 @@
 from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
 from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
 from semfov.decision.rule import (
-    NEARLY,
     OUTCOMES,
     CloseUp,
     Decision,
@@ -15,14 +14,12 @@ from semfov.decision.rule import (
     outcome_of,
     place_known,
     settle,
-    surely,
     verified,
 )
 from semfov.decision.verifier import MOST_CLOSER, Verifier
 
 __all__ = [
     "MOST_CLOSER",
-    "NEARLY",
     "OUTCOMES",
     "SAME",
     "CandidateCells",
@@ -44,6 +41,5 @@ __all__ = [
     "settle",
     "strength",
     "strongest",
-    "surely",
     "verified",
 ]

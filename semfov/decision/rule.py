@@ -22,7 +22,7 @@ Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 """Outcomes by their number in `decide`; the first is that of searches that run out of gaze shifts."""
 
-NEARLY = 0.9
+_NEARLY = 0.9
 """A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
 
 
@@ -58,7 +58,7 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     """Decide by thresholds which searches end with this step; target `(A,)` → `(A,)`; target `(A,)` → `(A,)`.
 
     A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
-    probable as the most probable one (`NEARLY`) and probable enough itself. A search gives up if no remaining cell is
+    probable as the most probable one (`_NEARLY`) and probable enough itself. A search gives up if no remaining cell is
     probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
     then absent, unless the image holds it with a probability of at least `_ABSENT`.
 
@@ -89,7 +89,7 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
     Shapes: cells `(..., X·Y)`, visited `(..., X·Y)`.
     """
     fixated = cells.masked_fill(~visited, 0).amax(-1)
-    return (fixated >= NEARLY * cells.amax(-1)) & (fixated >= place)
+    return (fixated >= _NEARLY * cells.amax(-1)) & (fixated >= place)
 
 
 def conclude(
@@ -113,19 +113,15 @@ def conclude(
     return Decision("found", probability, cell, strongest(looks, grid, cell, target)[1])
 
 
-def surely(confirm: float) -> float:
-    """Threshold on a place's probability at which a search ends at once: halfway between `confirm` and 1."""
-    return (1 + confirm) / 2
-
-
 def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
     """Decide a search after closer looks.
 
-    It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
-    enough; otherwise the target is absent if the picture holds it with a probability below `_ABSENT`.
+    It has found its target if a place is sure: halfway between `confirm` and 1, or more. When it is over, it has found
+    it if a place is probable enough; otherwise the target is absent if the picture holds it with a probability below
+    `_ABSENT`.
     """
     best = max(places, default=0.0)
-    if places and best >= (confirm if over else surely(confirm)):
+    if places and best >= (confirm if over else (1 + confirm) / 2):
         return OUTCOMES.index("found")
     if not over:
         return 0

@@ -35,7 +35,7 @@ class Verifier(Generic[LookType]):
 
     After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
     it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
-    and 1, or more (`surely`); after `MOST_CLOSER` closer looks, with one of at least `confirm`. Otherwise it goes on,
+    and 1, or more; after `MOST_CLOSER` closer looks, with one of at least `confirm`. Otherwise it goes on,
     until no look is worth a pass, or `most` closer looks were made. Then it has found the target at the best of the
     examined places, if that is probable enough. If not, the target is absent or the search undecided, by the
     probability that the picture holds it (`verified`).

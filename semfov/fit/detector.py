@@ -368,9 +368,7 @@ class _FolderFit:
                 result = PartResult(
                     Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
                 )
-            write_text(
-                self._record(name), json.dumps({"key": key, **{**result._asdict(), "part": asdict(result.part)}})
-            )
+            write_text(self._record(name), json.dumps({"key": key, **result._asdict(), "part": asdict(result.part)}))
         results[name] = result
         return result
 

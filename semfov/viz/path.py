@@ -49,11 +49,6 @@ class LookPath:
                 self._numbers.append((look.number, text))
         self.number_boxes += [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in middles]
 
-    @property
-    def outlined(self) -> bool:
-        """Whether some looks show a part of the picture."""
-        return bool(self._outlines)
-
     def show(self, last: int) -> None:
         """Show the looks up to `last`, whose outline is wider."""
         if self.gaze is not None:

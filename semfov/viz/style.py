@@ -44,7 +44,7 @@ STYLE: Any = {
     "legend.fontsize": 8,
 }
 
-FILES: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
+_FILES: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
 """Text in vector files looks the same everywhere: PDFs embed the font, and SVGs its outlines."""
 
 _Arguments = ParamSpec("_Arguments")
@@ -164,7 +164,7 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
     from matplotlib import rc_context
 
     path = Path(path)
-    with rc_context(FILES), replacing(path) as temporary:
+    with rc_context(_FILES), replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, format=path.suffix[1:].lower() or "png")
     return path
 

@@ -89,12 +89,12 @@ def served(agent, tmp_path, monkeypatch):
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
     if CHROMIUM is None:
         pytest.skip("needs Chromium (apt-get install chromium, or set $CHROMIUM)")
-    from semfov.cli.app import launched, make_page
+    from semfov.cli.app import _launched, _make_page
 
     assert gradio
     monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
-    page, told = make_page(agent), []
-    address = launched(page, "127.0.0.1", None)
+    page, told = _make_page(agent), []
+    address = _launched(page, "127.0.0.1", None)
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         view = browser.new_page(viewport={"width": 390, "height": 900})

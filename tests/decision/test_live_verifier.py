@@ -68,7 +68,7 @@ def script(seed, length=12):
 
 
 def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
-    """The same looks, closer looks and decision, to the bit; only a place below `surely` is found earlier."""
+    """The same looks, closer looks and decision, to the bit; only a place that is not sure is found earlier."""
     ways = set()
     for seed in range(12):
         picture = spots(0, 5, 7, 10, contrast=(0.9, 0.72, 0.3)[seed % 3])
