@@ -230,3 +230,12 @@ def test_frames_of_opencv_give_the_same_moments():
     assert int(moments[0].detections.labels[0, 0]) == 2
     with pytest.raises(InputError, match="order of channels"):
         agent_with(observer).live("green", color="brg")
+
+
+@pytest.mark.parametrize("kind", ["array", "tensor", "floats"])
+def test_a_moment_keeps_the_bytes_of_its_frame_also_where_the_next_one_takes_its_memory(kind):
+    live, pixels = agent_with(Semantic(3)).live("green", how="fovea"), scene(100, 80).mul(255).round().to(torch.uint8)
+    frame = {"array": pixels.permute(1, 2, 0).numpy().copy(), "tensor": pixels.clone(), "floats": pixels / 255}[kind]
+    moment = live.step(frame)
+    frame *= 0
+    assert torch.equal(moment.photograph, pixels)
