@@ -88,10 +88,10 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
     return [path for path in paths if path not in others]
 
 
-def _check_there(source: Path) -> None:
+def _check_there(source: Path, argument: str = "picture") -> None:
     """Raise `DataError` where a file or folder does not exist; a link to nothing is one that cannot be read."""
     if not source.exists() and not source.is_symlink():
-        raise DataError(f"picture: no such file or folder: {source}; check the path")
+        raise DataError(f"{argument}: no such file or folder: {source}; check the path")
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
@@ -133,7 +133,9 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
             f"{name}: expected OpenCV for videos, cameras and streams; pip install opencv-python-headless"
         ) from None
     if isinstance(source, Path):
-        _check_there(source)
+        _check_there(source, "source")
+        if source.is_dir():
+            raise DataError(f"source: expected a video, got the folder {source}; semfov find takes these")
         check_regular(source)
         with suppress(OSError), source.open("rb") as file:
             if file.read(len(_PLAYLIST)) == _PLAYLIST:

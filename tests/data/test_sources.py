@@ -109,8 +109,10 @@ def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
     broken.write_bytes(b"no video")
     with pytest.raises(DataError, match=r"broken\.mp4: cannot be opened"):
         open_stream(broken)
-    with pytest.raises(DataError, match="no such file or folder"):
+    with pytest.raises(DataError, match="source: no such file or folder"):
         open_stream(tmp_path / "none.mp4")
+    with pytest.raises(DataError, match=r"source: expected a video, got the folder .*; semfov find takes"):
+        open_stream(tmp_path)
     with pytest.raises(DataError, match="camera 99: cannot be opened; check that it is connected"):
         open_stream(99)
     monkeypatch.setitem(sys.modules, "cv2", None)
