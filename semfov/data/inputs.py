@@ -132,6 +132,7 @@ def pixels_of(image: ImageLike, argument: str = "image", white: White | None = N
         check(values.dtype.kind in "buif" and values.size > 0, argument, "numbers", f"{values.dtype} {values.shape}")
         return torch.from_numpy(between(values, black_and_white(white, values)))
     if isinstance(image, Tensor):
+        check(image.layout == torch.strided, argument, "a dense tensor", "a sparse one; use image.to_dense()")
         return image
     if isinstance(image, np.ndarray):
         kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}

@@ -157,6 +157,7 @@ INVALID_IMAGES = {
     "five axes": (lambda _: RGB[None, None], r"got shape \(1, 1, 3, 30, 44\)"),
     "empty": (lambda _: RGB[:, :0], "expected at least one pixel"),
     "empty array": (lambda _: PIXELS[:, :0], "expected at least one pixel"),
+    "sparse": (lambda _: RGB.to_sparse(), "expected a dense tensor, got a sparse one; use image.to_dense"),
     "either way round": (lambda _: PIXELS[:3], r"got shape \(3, 44, 3\), which is ambiguous"),
     "long integers": (lambda _: PIXELS.astype(np.int64), r"expected bytes.*int64; convert it to bytes"),
     "tensor of integers": (lambda _: (RGB * 255).int(), r"expected bytes.*torch\.int32; convert it to bytes"),
