@@ -81,7 +81,7 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
     assert 0.5 < areas["mean"] <= 1
     run = [
         "--data.limit", "1", "--belief.columns", "4", "--belief.rows", "3", "--protocol.starts", "2",
-        "--protocol.shifts", "4", "--policies", "[ivsn,random]", "--workers", "1", "--scanpaths", "1",
+        "--protocol.shifts", "4", "--policies", "[ivsn,random]", "--workers", "1", "--scanpaths", "0",
         "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "out"), "--templates", str(path),
     ]  # fmt: skip
     assert search(run) == 0
