@@ -48,6 +48,8 @@ class Film:
     def save(self, path: str | PathLike[str]) -> list[Path]:
         """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""
         path = Path(path)
+        expected = "a file that ends in .gif (where ffmpeg is installed, an MP4 is written beside it)"
+        check(path.suffix.lower() == ".gif", "path", expected, repr(str(path)))
         with replacing(path) as temporary, temporary.open("wb") as file:
             _write_gif(self.frames, file, self.seconds, self.hold)
         ffmpeg = shutil.which("ffmpeg")

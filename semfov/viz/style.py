@@ -154,6 +154,7 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
         The path.
 
     Raises:
+        InputError: the format is unknown.
         DataError: the file cannot be written.
 
     >>> import tempfile
@@ -164,6 +165,9 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
     from matplotlib import rc_context
 
     path = Path(path)
+    kinds = figure.canvas.get_supported_filetypes()
+    fits = path.suffix[1:].lower() in ("", *kinds)
+    check(fits, "path", f"a file that ends in {', '.join(f'.{kind}' for kind in kinds)}", path.name)
     with rc_context(_FILES), replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, format=path.suffix[1:].lower() or "png")
     return path

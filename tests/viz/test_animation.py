@@ -108,6 +108,8 @@ def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_pa
             assert (shown[0] == 255).all()
             # The photograph is noise, which has more colours than a GIF.
             assert np.abs(shown - frame).mean() < 9
+    with pytest.raises(InputError, match=r"path: expected a file that ends in \.gif .*film\.mp4"):
+        film.save(tmp_path / "film.mp4")
     for bad in ({"seconds": 0.0}, {"hold": -1.0}):
         with pytest.raises(InputError, match=next(iter(bad))):
             animate(scanpath, image=image, views=views, **bad)
