@@ -3,6 +3,7 @@
 Commands of a checkout are not run: their programs exist and take the options.
 """
 
+import logging
 import re
 import shlex
 from pathlib import Path
@@ -24,8 +25,18 @@ def filled(tmp_path_factory):
     return folder, fill(folder)
 
 
+@pytest.fixture
+def kept_level():
+    """A page sets what semfov logs."""
+    log = logging.getLogger("semfov")
+    level = log.level
+    yield
+    log.setLevel(level)
+
+
 @pytest.mark.weights
 @pytest.mark.slow
+@pytest.mark.usefixtures("kept_level")
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
 def test_a_page_runs_as_printed(page, filled, monkeypatch, capsys, one_thread):
     folder, given = filled
