@@ -240,16 +240,21 @@ def test_an_episode_believes_on_the_cpu_what_an_eye_on_the_gpu_sees():
     torch.testing.assert_close(there.probabilities, here.probabilities, rtol=1e-3, atol=1e-4)
 
 
-def test_a_copy_on_the_cpu_is_made_once_for_each_state_of_a_module():
+def test_a_copy_on_the_cpu_is_as_its_module_is_now():
     with torch.no_grad(), a_gpu():
-        module = nn.Linear(2, 1).to(GPU)
-        first = on_cpu(module)
-        assert first.weight.device == CPU
+        part = nn.BatchNorm1d(2)
+        module = nn.Sequential(part, nn.Linear(2, 2), part).to(GPU)
+        module.eval().note = "changed"
+        module[1].weight.data.fill_(3.0)
         with waits() as found:
-            assert on_cpu(module) is first
-        assert not found
-        module.weight.fill_(3.0)
-        assert on_cpu(module).weight.tolist() == [[3.0, 3.0]]
+            here = on_cpu(module)
+        assert len(found) <= len({each.dtype for each in module.state_dict().values()})
+        assert {each.device for each in here.state_dict().values()} == {CPU}
+        assert here[0] is here[2]
+        assert here[0] is not part
+        assert (here.training, here.note, here[1].weight.tolist()) == (False, "changed", [[3.0, 3.0]] * 2)
+        assert module[1].weight.device == GPU
+        torch.testing.assert_close(here(torch.ones(1, 2)), module(torch.ones(1, 2, device=GPU)).cpu())
 
 
 @pytest.mark.parametrize("work", [foveated, fused, explored])

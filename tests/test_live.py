@@ -52,6 +52,17 @@ def agent_with(observer, policy=None):
 
 
 @pytest.mark.parametrize("name", observers())
+def test_after_a_long_gap_a_frame_is_as_the_first(name):
+    """A camera that comes back after hours has told nothing that still counts."""
+    agent, image = agent_with(observers()[name]), scene(100, 80)
+    live = agent.live("green", seed=5, how="fovea", start=3)
+    live.step(torch.full((3, 120, 160), 0.4))
+    after = live.step(image, passed=1e9)
+    fresh = agent.live("green", seed=5, how="fovea", start=after.cell).step(image)
+    torch.testing.assert_close(after.probability, fresh.probability, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", observers())
 def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_thread):
     """Cells, posterior, detections and visited cells are equal to the bit."""
     agent, image = agent_with(observers()[name]), scene(100, 80)

@@ -46,6 +46,7 @@ class TestActivePerception(TensorTester):
     """The beliefs of an agent after looks at three given cells."""
 
     test_shapes = test_no_rows = None  # one image at a time
+    on_cpu = True  # what one episode believes
 
     def make(self):
         strategy = (observing(), InOrder())

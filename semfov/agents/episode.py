@@ -1,12 +1,10 @@
 """An episode under way: limited, look by look, with its decision and its record at any time."""
 
-import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Generic, Literal, TypeVar
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import nn
@@ -19,8 +17,6 @@ from semfov.paths import Ending, GazeRecord, Moment, RecordedLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record = TypeVar("_Record", bound=GazeRecord)
-
-_COPIES: WeakKeyDictionary[nn.Module, tuple[list[tuple[int, int]], Any]] = WeakKeyDictionary()
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
@@ -208,14 +204,33 @@ def without_none(**values: Any) -> dict[str, Any]:
 def on_cpu(module: _Module) -> _Module:
     """A module on the CPU, without moving the given one, which other parts of the agent may share.
 
-    A copy is kept as long as the module, until one of its tensors changes: copying waits for a GPU once for each.
+    Its tensors are copied from a GPU together, since each copy waits for it. All else is shared.
     """
-    tensors = (*module.parameters(), *module.buffers())
-    if all(each.device.type == "cpu" for each in tensors):
+    tensors = {id(each): each for each in (*module.parameters(), *module.buffers())}
+    away = {key: each for key, each in tensors.items() if each.device.type != "cpu"}
+    if not away:
         return module
-    state = [(id(each), 0 if each.is_inference() else each._version) for each in tensors]
-    kept = _COPIES.get(module)
-    if kept is None or kept[0] != state:
-        kept = _COPIES[module] = state, copy.deepcopy(module).cpu()
-    copied: _Module = kept[1]
-    return copied
+    copies: dict[int, Any] = {}
+    for dtype in {each.dtype for each in away.values()}:
+        some = {key: each for key, each in away.items() if each.dtype == dtype}
+        together = torch.cat([each.detach().flatten() for each in some.values()]).cpu()
+        parts = together.split([each.numel() for each in some.values()])
+        for (key, each), part in zip(some.items(), parts, strict=True):
+            here = part.view(each.shape)
+            copies[key] = nn.Parameter(here, each.requires_grad) if isinstance(each, nn.Parameter) else here
+    return _with_tensors(module, copies)
+
+
+def _with_tensors(module: _Module, copies: dict[int, Any]) -> _Module:
+    """A module with others in the places of its tensors; both, and modules that were copied, by identity."""
+    made = object.__new__(type(module))
+    copies[id(module)] = made
+    made.__dict__.update(module.__dict__)
+    for kind in ("_parameters", "_buffers"):
+        given = getattr(module, kind).items()
+        made.__dict__[kind] = {name: copies.get(id(each), each) for name, each in given}
+    parts = module._modules.items()
+    made.__dict__["_modules"] = {
+        name: each if each is None else copies.get(id(each)) or _with_tensors(each, copies) for name, each in parts
+    }
+    return made

@@ -1,6 +1,7 @@
 """Learned evidence for a class in a cell: a network for a single look, and one for all looks together."""
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -118,7 +119,7 @@ def nearness(distance: Tensor) -> Tensor:
 
 def farther(keep: float) -> float:
     """Increase of the distance, in longer sides of the image, that multiplies the nearness by `keep`."""
-    return -math.log(keep) * _REACH
+    return -math.log(max(keep, sys.float_info.min)) * _REACH
 
 
 def logarithm(odds: Tensor) -> Tensor:

@@ -397,6 +397,19 @@ class FovealObservationModel(Pretrained):
         """
         return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
 
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation mode, and drop what evaluation mode keeps.
+
+        Args:
+            mode: True for training mode.
+
+        Returns:
+            This model.
+        """
+        # Fused optimisers change parameters without counting it.
+        _KEPT.pop(self.log_alpha, None)
+        return super().train(mode)
+
     def _linear(self) -> tuple[Tensor, Tensor]:
         """Weights and constants of the log likelihoods (`_linear_map`), kept in `eval` mode and without gradients."""
         parameter = self.log_alpha

@@ -356,3 +356,17 @@ def test_a_compiled_model_follows_its_parameters():
             expected = FovealObservationModel(model.alpha, EDGES, CLASSES).calibrate(scores, distance)
             torch.testing.assert_close(compiled(scores, distance), expected)
             torch.testing.assert_close(model.calibrate(scores, distance), expected)
+
+
+def test_likelihoods_after_training_are_those_of_the_trained_parameters():
+    """Fused optimisers and changes of the data of a parameter are not counted in its version."""
+    scores, distance = looks(dtype=torch.float32)
+    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES).eval()
+    with torch.no_grad():
+        model(scores, distance)
+    model.train()
+    model.log_alpha.data.add_(0.5)
+    with torch.no_grad():
+        after = model.eval()(scores, distance)
+        fresh = FovealObservationModel(model.alpha, EDGES, CLASSES).eval()(scores, distance)
+    torch.testing.assert_close(after, fresh)
