@@ -83,7 +83,7 @@ _EXPORTS = (
 _OURS = ("picture", "subject", "target", "trial")
 _GONE = ("", ".", "nan", "none", "null", "na")  # lost, or not a number
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
-"""Sides of eyes by the first word of a field, which may be a number of ioHub (`EyeTrackerConstants`)."""
+"""Sides of eyes by the first of these words in a field, which may be a number of ioHub (`EyeTrackerConstants`)."""
 
 
 def read_export(
@@ -180,7 +180,8 @@ def read_export(
 
 def _of_one_eye(lines: Sequence[tuple[str, dict[str, str]]], eye: str | None) -> list[Line]:
     """The lines of an eye, of the right one in viewings of both; lines that name no eye, or both, are kept."""
-    sides = [_EYES.get(re.split(r"[\W_]", line.pop("eye").lower())[0], "") for _, line in lines]
+    words = [re.split(r"[\W_]", line.pop("eye").lower()) for _, line in lines]
+    sides = [next((_EYES[word] for word in each if word in _EYES), "") for each in words]
     both = {line["trial"] for (_, line), side in zip(lines, sides, strict=True) if side == "right"}
     dropped = [
         side != eye if eye else side == "left" and line["trial"] in both

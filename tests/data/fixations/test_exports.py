@@ -127,7 +127,7 @@ def test_viewings_are_told_apart(tmp_path):
     assert [len(each) for each in records] == [1, 2, 1, 1, 1]
 
 
-@pytest.mark.parametrize("names", [("21", "22"), ("LEFT_EYE", "RIGHT_EYE"), ("L", "R")])
+@pytest.mark.parametrize("names", [("21", "22"), ("EyeTrackerConstants.LEFT_EYE", "b'RIGHT'"), ("L", "R")])
 def test_fixations_of_both_eyes_are_those_of_one(tmp_path, names):
     """The right one where a viewing has both; b.png was seen by the left one alone."""
     left, right = names
