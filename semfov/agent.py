@@ -497,7 +497,7 @@ class ActivePerception(nn.Module):
         self,
         picture: PictureLike,
         *,
-        model: FixationDensity | None = None,
+        model: FixationDensity | str | PathLike[str] | None = None,
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
@@ -506,7 +506,7 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: a photograph, as for `search`.
-            model: a model that was fitted to the detector (`semfov fit`); None for the one that is shipped for it.
+            model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -516,7 +516,7 @@ class ActivePerception(nn.Module):
 
         Raises:
             InputError: no model is shipped for the detector, or the given one was fitted to another.
-            DataError: the file of the picture cannot be read.
+            DataError: the file of the picture or of the model cannot be read.
         """
         image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
         source = fspath(picture) if isinstance(picture, str | PathLike) else None

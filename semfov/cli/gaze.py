@@ -92,7 +92,10 @@ class _GazeJob:
             versions = [json.dumps(source.version()) for source in self.sources]
             folder = self.table.with_name(f"{self.table.name}.unfinished")
             self.finished = SceneResults(folder, key, versions.__getitem__)
-            self.outcomes |= {number: each["records"][0] for number, each in self.finished.items(len(versions))}
+            for number, each in self.finished.items(len(versions)):
+                (outcome,) = each["records"]
+                if "density" not in outcome or Path(outcome["density"]).exists():  # one that is gone is written again
+                    self.outcomes[number] = outcome
 
     def look(self, number: int) -> None:
         """Predict where people look in a picture, and write the density."""

@@ -241,6 +241,7 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("conf", "confidence", "conf_thres", "threshold", "score"), ("least", "confirm")),
     **dict.fromkeys(("class", "label", "query"), ("target",)),
     **dict.fromkeys(("model", "yolo"), ("detector",)),
+    "models": ("model",),
     **dict.fromkeys(("gpu", "cuda"), ("device",)),
     **dict.fromkeys(("fp16", "float16"), ("half",)),
     **dict.fromkeys(("output", "save", "csv", "json", "project"), ("out",)),

@@ -22,7 +22,7 @@ class Pictures:
         self.classes = classes
         self.ids = sorted(set(names))
         self._sizes: dict[int, tuple[int, int]] = {}
-        missing = [name for name in self.ids if not inside(self.root, name).is_file()]
+        missing = [name for name in self.ids if not self._path(name).is_file()]
         if missing:
             raise DataError(
                 f"{self.root}: expected {len(self.ids)} pictures, but {len(missing)} are missing, such as "
@@ -39,12 +39,12 @@ class Pictures:
         return len(self.ids)
 
     def __getitem__(self, index: int) -> Scene:
-        image = read_image(self._path(index))
+        image = read_image(self._path(self.ids[index]))
         return Scene(self.ids[index], self.ids[index], image, torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64))
 
     def digest(self, index: int) -> str:
         """Compute the sha256 of a file's content."""
-        path = self._path(index)
+        path = self._path(self.ids[index])
         check_regular(path, f"image {path}")
         try:
             return sha256(path)
@@ -54,7 +54,7 @@ class Pictures:
     def annotation(self, index: int) -> Annotation:
         """Return an annotation without objects, with the size of the picture."""
         if index not in self._sizes:
-            height, width = read_image(self._path(index)).shape[-2:]
+            height, width = read_image(self._path(self.ids[index])).shape[-2:]
             self._sizes[index] = width, height
         labels = torch.zeros(0, dtype=torch.int64)
         return Annotation(torch.zeros(0, 4), labels, labels.bool(), self._sizes[index])
@@ -63,5 +63,6 @@ class Pictures:
         """Return an empty list: no objects are known."""
         return []
 
-    def _path(self, index: int) -> Path:
-        return inside(self.root, self.ids[index])
+    def _path(self, name: str) -> Path:
+        """The file of a name; one's own folder may hold links to photographs elsewhere."""
+        return inside(self.root, name, links=True)

@@ -124,6 +124,10 @@ class FitDetectorConfig(FitConfig):
                 f"detector.name: expected nothing, as model already names the detector ({str(self.model)!r}), got "
                 f"{self.detector.name!r}"
             )
+        if not self.gaze.fixations and self.gaze != GazeModelFit():
+            raise InputError(
+                "gaze.fixations: expected a file beside other options of gaze (--gaze.fixations FILE), got none"
+            )
         # Photographs without the target are needed as negative examples.
         data = replace(self.data, max_target_area=None)
         return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))

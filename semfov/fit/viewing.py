@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema
 from semfov.runs.scene_run import digest_of, store_folder
-from semfov.runs.settings import Count, Settings
+from semfov.runs.settings import Count, Range, Settings
 from semfov.runs.store import SceneStore, looks_digest
 
 LONGEST = 20
@@ -51,15 +51,18 @@ class ViewingData(Settings):
     fixations: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
     sizes: tuple[str, ...] = ()
-    seconds: tuple[float, ...] = ()
+    seconds: tuple[Annotated[float, Range(0.1, 3600)], ...] = ()
     limit: Count | None = None
     cache: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check that every data set has its pictures."""
+        """Check that every data set has its pictures, and all or none of them a frame and a time."""
         super().__post_init__()
-        expected = f"a folder for each of {len(self.fixations)} files of fixations"
-        check(len(self.fixations) == len(self.pictures), "pictures", expected, f"{len(self.pictures)}")
+        number = len(self.fixations)
+        for name, what in {"pictures": "folder", "sizes": "frame", "seconds": "time"}.items():
+            given, expected = len(getattr(self, name)), f"a {what} for each of {number} files of fixations"
+            none = not number or (not given and name != "pictures")
+            check(none or given == number, name, expected, given)
 
     @property
     def fingerprint(self) -> list[str]:
@@ -188,7 +191,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
                 if kept is None:
                     kept = _packed(source.maps(scenes[index].image[None]))
                     store.write(digest, kept)
-                yield _unpacked(kept), people[str(name)]
+                yield _unpacked(kept, source.layers), people[str(name)]
 
         groups += _grouped(seen(), _at(data.seconds, number, 3.0), number)
     return groups
@@ -205,10 +208,11 @@ def _packed(features: FeatureMaps) -> dict[str, Tensor]:
     return halves | {"placed": torch.tensor(placed, dtype=torch.float64)}
 
 
-def _unpacked(tensors: Mapping[str, Tensor]) -> FeatureMaps:
+def _unpacked(tensors: Mapping[str, Tensor], layers: Sequence[str]) -> FeatureMaps:
+    """Maps in the order of `layers`, on which the first weights of a model depend; a file has them sorted by name."""
     width, height, across, down, left, top, *canvas = tensors["placed"].tolist()
     placement = Placement((int(width), int(height)), (across, down), (left, top))
-    maps = {name: each[None] for name, each in tensors.items() if name != "placed"}
+    maps = {name: tensors[name][None] for name in layers}
     return FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing())
 
 

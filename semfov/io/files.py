@@ -67,12 +67,14 @@ def _sweep(folder: Path) -> None:
                         Path(entry.path).unlink()
 
 
-def inside(folder: str | Path, name: str) -> Path:
-    """Join a folder and a file name that comes from elsewhere, and refuse names that lead out of the folder."""
+def inside(folder: str | Path, name: str, *, links: bool = False) -> Path:
+    """Join a folder and a name from elsewhere; refuses names that lead out of it, with `links` unless by a link."""
     folder = Path(folder)
     try:
         path = folder / name
-        lies = path.resolve().is_relative_to(folder.resolve()) and path.resolve() != folder.resolve()
+        resolved, within = path.resolve(), folder.resolve()
+        plain = not Path(name).anchor and ".." not in Path(name).parts
+        lies = (resolved.is_relative_to(within) or (links and plain)) and resolved != within
     except (OSError, ValueError, RuntimeError):
         lies = False
     if not lies:

@@ -148,7 +148,10 @@ def _read(path: Path) -> dict[str, Any]:
             raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}; {_AGAIN}")
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file; expected a folder of models that semfov fit wrote") from None
+        gaze, what = path.with_name("gaze.safetensors"), "a folder of models that semfov fit wrote"
+        if gaze.is_file():
+            what = f"{what} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
+        raise DataError(f"{path}: no such file; expected {what}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not a readable JSON file ({' '.join(str(error).split())}); {_AGAIN}") from None
     if not isinstance(record, dict):

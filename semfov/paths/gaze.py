@@ -62,14 +62,19 @@ class GazePrediction:
 
     @classmethod
     def of(
-        cls, detector: Detector, image: Tensor, *, model: FixationDensity | None = None, source: str | None = None
+        cls,
+        detector: Detector,
+        image: Tensor,
+        *,
+        model: FixationDensity | str | PathLike[str] | None = None,
+        source: str | None = None,
     ) -> Self:
         """Predict where people look in a picture, from one pass of a detector.
 
         Args:
             detector: the detector.
             image: `(3, H, W)`, RGB in [0, 1].
-            model: a model that was fitted to the detector; None for the one that is shipped for it.
+            model: a model that was fitted to the detector, or its file or folder; None for the one that is shipped.
             source: file of the picture.
 
         Returns:
@@ -77,7 +82,12 @@ class GazePrediction:
 
         Raises:
             InputError: no model is shipped for the detector, or the given one was fitted to another detector.
+            DataError: the file of the model is missing or damaged.
         """
+        if isinstance(model, str | PathLike):
+            model = FixationDensity.from_pretrained(model)
+        expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
+        check(model is None or isinstance(model, FixationDensity), "model", expected, type(model).__name__)
         if model is not None:
             model.check_compatible(detector)
         model = FixationDensity.for_detector(detector) if model is None else deepcopy(model)

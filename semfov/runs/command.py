@@ -287,6 +287,7 @@ def _setting_types(config: type[Any]) -> dict[str, Any]:
 def _is_list(hint: Any) -> bool:
     """Whether a type is a list of words, paths or numbers of any length."""
     item, *more = get_args(hint) or (None,)
+    item = get_args(item)[0] if get_origin(item) is Annotated else item
     words = item in (str, Path, float) or get_origin(item) is Literal
     return get_origin(hint) is tuple and more == [Ellipsis] and words
 

@@ -8,12 +8,14 @@ import torch
 from PIL import Image
 from torch.nn import functional as F
 
-from semfov import Detector
+from semfov import DataError, Detector, InputError
 from semfov.cli.main import main
 from semfov.data.fixations import by_picture, read_table
 from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
+from semfov.io.manifest import Manifest
 from semfov.paths import GazePrediction
+from tests.small import rand
 
 
 class Colours(Detector):
@@ -100,10 +102,21 @@ def test_a_command_that_is_stopped_has_written_the_pictures_so_far_and_continues
 def test_a_model_of_ones_own(run, photos, tmp_path):
     torch.manual_seed(1)
     other = FixationDensity({"backbone8": 3}, centre=-torch.rand(39, 52))
-    other.save(tmp_path / "own.safetensors")
-    shipped, own = (run(photos / "0.png", *words)[1] for words in ([], ["--model", tmp_path / "own.safetensors"]))
+    other.save(tmp_path / "own/gaze.safetensors")
+    models = [], ["--model", tmp_path / "own/gaze.safetensors"], ["--model", tmp_path / "own"]
+    shipped, own, folder = (run(photos / "0.png", *words)[1] for words in models)
     assert "entropy" in own
     assert own != shipped
+    assert own == folder
+    assert "did you mean --model?" in run(photos / "0.png", "--models", tmp_path / "own")[2]
+    with pytest.raises(DataError, match=r"semfov gaze --model .*own/gaze\.safetensors"):
+        Manifest.read(tmp_path / "own")
+    detector = Colours("colours", ("cup",), (416, 416), stride=32).eval()
+    image = rand(3, 60, 80)
+    by_path = GazePrediction.of(detector, image, model=str(tmp_path / "own/gaze.safetensors"))
+    torch.testing.assert_close(by_path.density, GazePrediction.of(detector, image, model=other).density)
+    with pytest.raises(InputError, match=r"model: expected .*from_pretrained"):
+        GazePrediction.of(detector, image, model=3)
 
 
 def test_the_seed_repeats_the_table(run, photos, tmp_path):
@@ -126,6 +139,22 @@ def test_the_density_of_one_picture(run, photos, tmp_path, name):
 def test_a_folder_gets_scanpaths_and_heat_maps(run, photos, tmp_path):
     assert run(photos, "--out", tmp_path / "new")[0] == 0
     assert sorted(each.name for each in (tmp_path / "new").iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
+
+
+def test_a_heat_map_that_is_gone_is_written_again(run, photos, tmp_path, monkeypatch):
+    made, out = GazePrediction.of, tmp_path / "new"
+
+    def stopped(detector, image, **options):
+        if options["source"].endswith("1.png"):
+            raise KeyboardInterrupt
+        return made(detector, image, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GazePrediction, "of", stopped)
+        assert run(photos, "--people", 2, "--out", out)[0] == 130
+    (out / "000-0.png").unlink()
+    assert run(photos, "--people", 2, "--out", out)[0] == 0
+    assert sorted(each.name for each in out.iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
 
 
 def test_a_damaged_picture_of_several_is_skipped(run, photos, tmp_path):

@@ -8,6 +8,7 @@ from PIL import Image
 
 from semfov.data.coco import CocoScenes
 from semfov.data.images import read_image
+from semfov.data.pictures import Pictures
 from semfov.errors import DataError, SemfovError
 from semfov.io.files import check_regular, clean, inside, replacing
 
@@ -53,6 +54,16 @@ def test_links_inside_the_root_and_to_the_root_are_followed(data, tmp_path):
     (tmp_path / "moved").symlink_to(root)
     found = CocoScenes(tmp_path / "moved", tmp_path / "instances.json", ("cat",), min_instances=0)
     assert found[0].size == (40, 30)
+
+
+def test_a_folder_of_links_to_photographs_is_read_and_names_that_lead_out_are_not(data):
+    root, _ = data
+    (root / "link.png").symlink_to(root.parent / "outside.png")
+    (root / "up").symlink_to(root.parent)
+    assert Pictures(root, ["link.png"], ())[0].size == (40, 30)
+    for name in ("../outside.png", "up/../outside.png", str(root.parent / "outside.png"), "."):
+        with pytest.raises(DataError, match="leads out of it"):
+            Pictures(root, [name], ())
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])

@@ -1,6 +1,7 @@
 """The fit of where people look, on fixations that were drawn from a known density."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from scipy.ndimage import gaussian_filter
 from torch.nn import functional as F
 
 from eval.human import main as compare
-from semfov import Detector, saliency
+from semfov import Detector, InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
 from semfov.detection import Candidates
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
 from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore, _folds
-from semfov.fit.gaze_model import _describe_viewing, _summary_of
+from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, _summary_of
+from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
     MapSource,
     ViewingData,
@@ -183,7 +185,7 @@ def test_folds_hold_out_each_picture_once():
 
 
 def test_pictures_are_looked_at_once(tmp_path):
-    """Maps of any names are read again."""
+    """Maps of any names are read again, in their order, on which the first weights of a model depend."""
     image, place = picture(3)
     Image.fromarray((image * 255).byte().permute(1, 2, 0).numpy()).save(tmp_path / "3.png")
     write_table(tmp_path / "people.csv", people(3, place, 2))
@@ -191,12 +193,33 @@ def test_pictures_are_looked_at_once(tmp_path):
 
     def maps(image):
         seen.append(image)
-        return covering({"itti-koch": image[:, :1]}, SIZE)
+        return covering({"red": image[:, :1], "itti-koch": image[:, 1:]}, SIZE)
 
     data = ViewingData(fixations=(tmp_path / "people.csv",), pictures=(tmp_path,), cache=tmp_path)
-    first, again = (look(data, MapSource(("itti-koch",), maps, {})) for _ in range(2))
+    first, again = (look(data, MapSource(("red", "itti-koch"), maps, {})) for _ in range(2))
     assert len(seen) == 1
     torch.testing.assert_close(first[0].features.maps, again[0].features.maps)
+    assert [*first[0].features.maps] == [*again[0].features.maps] == ["red", "itti-koch"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"seconds": (-1.0,)}, r"seconds\[0\]: expected a number from 0.1"),
+        ({"seconds": (0.05,)}, r"seconds\[0\]"),
+        ({"seconds": (3.0, 5.0)}, "seconds: expected a time for each of 1 files"),
+        ({"sizes": ("800x600", "640x480")}, "sizes: expected a frame"),
+        ({"pictures": ()}, "pictures: expected a folder"),
+    ],
+)
+def test_a_time_and_a_folder_are_given_for_each_file_of_fixations(given, told):
+    with pytest.raises(InputError, match=told):
+        ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
+
+
+def test_settings_of_gaze_without_fixations_are_refused():
+    with pytest.raises(InputError, match=r"--gaze\.fixations FILE"):
+        FitDetectorConfig(model=Path("yolov3-tiny"), gaze=GazeModelFit(seconds=(3.0,))).named()
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The density of people's fixations, read out of the feature maps that a detector computes anyway."""
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -120,6 +121,24 @@ class FixationDensity(Pretrained):
         self.register_buffer("start", torch.tensor([[0.5, 0.5], [0.12, 0.12]]))
         self.register_buffer("duration", torch.tensor([[5.3, 0.55]]))
         self.register_buffer("pause", torch.tensor(40.0))
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
+        """Load a model that is shipped with the package, one that `save` wrote, or that of a folder of `semfov fit`.
+
+        Args:
+            name_or_path: name of a shipped model, or path of a file or of a folder that holds `gaze.safetensors`.
+
+        Returns:
+            The model, in `eval` mode.
+
+        Raises:
+            InputError: no model of that name is shipped.
+            DataError: the file is missing, damaged or of another kind.
+        """
+        fitted = Path(name_or_path, "gaze.safetensors")
+        shipped = (cls.shipped / f"{name_or_path}.safetensors").is_file()
+        return super().from_pretrained(fitted if fitted.is_file() and not shipped else name_or_path)
 
     @classmethod
     def for_detector(cls, detector: Detector) -> Self:
