@@ -42,6 +42,12 @@ def fill(folder: Path) -> dict[str, object]:
         for each, person in enumerate(("someone", "another"))
     ]
     write_table(folder / "fixations.csv", people)
+    (folder / "VIEWED").mkdir(exist_ok=True)
+    for number in range(5):
+        _save(scenes[number].image, folder / f"VIEWED/{number}.jpg", (160, 120))
+    at = np.array([[80.0, 60], [30, 40], [120, 90]])
+    viewings = [Fixations(f"{number}.jpg", each, at + number, (160, 120)) for number in range(5) for each in "ab"]
+    write_table(folder / "viewing.csv", viewings)
     (folder / "neon").mkdir(exist_ok=True)
     (folder / "neon/fixations.csv").write_text(
         "recording id,fixation id,duration [ms],fixation x [px],fixation y [px]\nr1,1,250,800,600\nr1,2,310,900,500\n"

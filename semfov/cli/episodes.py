@@ -288,7 +288,7 @@ def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:
 def _worth_starting(processes: int | None, tasks: int, seconds: float, start: float) -> int:
     """The number of processes for tasks of some seconds; 1 where starting them would take longer than they save.
 
-    >>> worth_starting(2, 7, 0.5, 4.0), worth_starting(2, 99, 0.5, 4.0)
+    >>> _worth_starting(2, 7, 0.5, 4.0), _worth_starting(2, 99, 0.5, 4.0)
     (1, 2)
     """
     most = min(available_cores() if processes is None else processes, tasks)

@@ -118,7 +118,7 @@ def _loader(name: str) -> Callable[..., Detector]:
 def _comes_from(module: object, package: str) -> bool:
     """Tell whether the class of an object, or a class that it inherits from, is defined in a package.
 
-    >>> comes_from(nn.Linear(1, 1), "torch.nn"), comes_from(nn.Linear(1, 1), "torchvision")
+    >>> _comes_from(nn.Linear(1, 1), "torch.nn"), _comes_from(nn.Linear(1, 1), "torchvision")
     (True, False)
     """
     return any(f"{kind.__module__}.".startswith(f"{package}.") for kind in type(module).__mro__)

@@ -385,4 +385,4 @@ class _FolderFit:
             whole = whole and all((out / figure).is_file() for figure in record["figures"])
         except Exception:  # a damaged record is no problem, as the part can be fitted again
             return None
-        return PartResult(part, record["report"], record["figures"]) if whole else None
+        return PartResult(part, record["report"], tuple(record["figures"])) if whole else None
