@@ -76,7 +76,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     folder = folder_of(home)
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
-    folder.inputs.results["windows"] = replace(fitted, part=part)
+    folder.inputs.results["windows"] = fitted._replace(part=part)
     _manifest_of(folder).write(home / "models")
     agent = ActivePerception.from_pretrained(home / "models")
     assert all(torch.equal(tensor, model.state_dict()[name]) for name, tensor in agent.windows.state_dict().items())
