@@ -165,12 +165,10 @@ def _trigamma(x: Tensor) -> Tensor:
 
 
 def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
-    """Whether the maximum of each row has a precision of at least `precision`; → `(rows,)`; → `(rows,)`.
+    """Whether the maximum of each row has a precision of at least `precision`; → `(rows,)`.
 
     The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
     exceeds A Σ exp(g) + K/2.
-
-    Shapes: → `(rows,)`.
     """
     reaches = 1 - total <= rows.shape[-1] / (2 * precision)
     level = total.new_tensor(precision).digamma()
