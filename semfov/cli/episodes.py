@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import sys
 import time
 from abc import ABC, abstractmethod
@@ -22,7 +21,7 @@ from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
-from semfov.cli.results import STDOUT, ResultsFile, kind_of
+from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.cli.truth import read_truth
@@ -227,16 +226,7 @@ class _PictureFiles:
             written = [*written, write_page(self.job.options.report, f"semfov: {self.job.title}", episodes)]
         options = self.job.options
         written = [*written, *(folder for folder in (options.crops, options.labels) if folder is not None)]
-        if written:
-            print("written:", *(f"  {path}" for path in written), sep="\n")
-        if self.finished is None:
-            return
-        self.finished.flush()
-        if complete:
-            shutil.rmtree(self.finished.path.parent, ignore_errors=True)
-        else:
-            count = f"{len(self.rows)} of {len(self.job.sources)} pictures were looked at"
-            print(f"{count}; the same command continues", file=sys.stderr)
+        tell_written(written, self.finished, None if complete else f"{len(self.rows)} of {len(self.job.sources)}")
 
 
 def look_at_pictures(job: PictureJob, stream: TextIO) -> list[dict[str, Any]]:

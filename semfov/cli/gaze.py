@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from tqdm import tqdm
 from semfov.agents.picture import open_picture
 from semfov.cli.agent import check_device, class_names
 from semfov.cli.options import GazeOptions
+from semfov.cli.results import tell_written
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.fixations import Fixations, write_table
@@ -127,16 +127,7 @@ class _GazeJob:
         if self.options.report is not None and outcomes:
             parts = [each["part"] for each in outcomes]
             written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
-        if written:
-            print("written:", *(f"  {path}" for path in written), sep="\n")
-        if self.finished is None:
-            return
-        self.finished.flush()
-        if complete:
-            shutil.rmtree(self.finished.path.parent, ignore_errors=True)
-        else:
-            count = f"{len(outcomes)} of {len(self.sources)} pictures were looked at"
-            print(f"{count}; the same command continues", file=sys.stderr)
+        tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
 
 
 def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Outcome:

@@ -1,9 +1,12 @@
-"""Files of results: JSON, JSON lines, CSV, GeoJSON and COCO, written while pictures are looked at."""
+"""Files of results: JSON, JSON lines, CSV, GeoJSON and COCO, written while pictures are looked at, and their list."""
 
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -12,6 +15,7 @@ from semfov.errors import check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.conversion import COLUMNS
+from semfov.runs.results import SceneResults
 
 _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
 """Ends of the names of files of results."""
@@ -139,3 +143,16 @@ def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
         {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
         for row in [*rows, *({"class": name} for name in missing)]
     ]
+
+
+def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:
+    """List the files of a command; what it has finished is kept until it is done, else it says which part that is."""
+    if files:
+        print("written:", *(f"  {path}" for path in files), sep="\n")
+    if finished is None:
+        return
+    finished.flush()
+    if part is None:
+        shutil.rmtree(finished.path.parent, ignore_errors=True)
+    else:
+        print(f"{part} pictures were looked at; the same command continues", file=sys.stderr)
