@@ -169,14 +169,15 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_code_runs_as_printed(given):
-    """The blocks in their order, with frames of the video and with fixations of people."""
+def test_code_runs_as_printed(given, capsys):
+    """The blocks in their order, with frames of the video and with a file of people's fixations."""
     names = dict(given)
     blocks = re.findall(r"```python\n(.*?)```", README, re.S)
     assert len(blocks) >= 5
     for block in blocks:
         assert len([line for line in block.splitlines() if line]) <= 5
         exec(compile(block, "README.md", "exec"), names)
-    assert names["scanpath"].classes[names["scanpath"].target] == "cup"
+    assert {each.target for each in names["people"]} == {"cup"}
+    assert "sequence score" in capsys.readouterr().out
     for name in ("cup.html", "people.png"):
         assert Path(name).is_file()
