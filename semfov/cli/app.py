@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from semfov.agent import ActivePerception
+from semfov.agents.episode import on_cpu
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
@@ -99,10 +100,10 @@ def _grid_of(agent: ActivePerception, image: Tensor) -> Grid:
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
     """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
     fovea, grid, index = agent.fovea, _grid_of(agent, image), class_index(target, agent.classes[1:], "target")
-    strategy, mapper = fovea.searching, fovea.exploring.observer
+    mapper, strategy, image = fovea.exploring.observer, on_cpu(fovea.searching), image.to(agent.eye.sensor.like)
     with torch.inference_mode():
-        looks = LiveLooks(agent.eye, agent.eye.open(image[None]), grid, index)
-        beside = None if mapper is strategy.observer else mapper
+        looks = LiveLooks(agent.eye, agent.eye.open(image[None]), grid, index, device=torch.device("cpu"))
+        beside = None if mapper is fovea.searching.observer else on_cpu(mapper)
         trace = Trace(grid, agent.classes, index, beside, agent.eye.detector.least)
         policy, order = strategy.policy(index, grid), torch.tensor([[*cells]])
         for step in rollout(looks, strategy.observer, policy, order[:, 0], Given(order), most=len(cells)):

@@ -14,6 +14,8 @@ from PIL import Image
 from semfov.cli.app import _Calls, _look_at_cells
 from semfov.cli.main import main
 from semfov.data import read_image
+from tests.pretended import a_gpu
+from tests.small import rand
 
 NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
@@ -35,6 +37,16 @@ def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, phot
         assert looked.agent.cells.tolist() == cells[:count]
     assert "before it" in looked.describe()
     assert "before it" not in _look_at_cells(agent, image, "wine glass", [3]).describe()
+
+
+def test_looks_at_cells_beside_a_gpu_are_those_on_the_cpu(agent):
+    image = rand(3, 120, 160)
+    here = _look_at_cells(agent, image, "wine glass", [3, 7])
+    with a_gpu():
+        there = _look_at_cells(agent.to("cuda"), image, "wine glass", [3, 7])
+    assert there.advice == here.advice
+    assert there.record.presence is not None
+    torch.testing.assert_close(there.record.presence, here.record.presence, rtol=1e-3, atol=1e-4)
 
 
 def test_without_gradio_it_is_said_how_to_install_it(monkeypatch, capsys):
