@@ -84,12 +84,10 @@ def as_images(
     color: Color = "rgb",
     white: White | None = None,
 ) -> Tensor:
-    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`; → `(B, 3, H, W)`; → `(B, 3, H, W)`.
+    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`; → `(B, 3, H, W)`.
 
     >>> as_images(torch.rand(2, 3, 8, 9)).shape
     torch.Size([2, 3, 8, 9])
-
-    Shapes: → `(B, 3, H, W)`.
     """
     pixels = as_pixels(images, argument=argument, color=color, white=white)
     whole, pixels = not pixels.is_floating_point(), _in_unit(pixels, like, argument)
@@ -189,12 +187,10 @@ def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = Tr
 
 
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
-    """Convert points to a tensor; tensors stay as they are, other numbers become float64; → `(..., 2)`; → `(..., 2)`.
+    """Convert points to a tensor; tensors stay as they are, other numbers become float64; → `(..., 2)`.
 
     >>> as_points((320, 240))
     tensor([320., 240.], dtype=torch.float64)
-
-    Shapes: → `(..., 2)`.
     """
     if isinstance(points, Tensor):
         return points

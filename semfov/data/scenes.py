@@ -189,12 +189,10 @@ def _layout(generator: np.random.Generator) -> list[_Item]:
 
 
 def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Random clouds and a faint texture, in a random tint; → `(H, W, 3)`; → `(H, W, 3)`.
+    """Random clouds and a faint texture, in a random tint; → `(H, W, 3)`.
 
     The clouds are a sum of random grids, one for each octave, whose amplitude halves with the scale. All arithmetic is
     in integers, so every machine composes the same bits.
-
-    Shapes: → `(H, W, 3)`.
     """
     from PIL import Image
 

@@ -55,14 +55,12 @@ class CloseUp:
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
-    """Decide by thresholds which searches end with this step; target `(A,)` → `(A,)`; target `(A,)` → `(A,)`.
+    """Decide by thresholds which searches end with this step; target `(A,)` → `(A,)`.
 
     A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
     probable as the most probable one (`_NEARLY`) and probable enough itself. A search gives up if no remaining cell is
     probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
     then absent, unless the image holds it with a probability of at least `_ABSENT`.
-
-    Shapes: target `(A,)` → `(A,)`.
     """
     looked = place_known(step.belief.probability(target), step.visited, thresholds.place)
     left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)

@@ -193,7 +193,7 @@ def _searches(
 
 
 def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
-    r"""Compute the training loss after a look; goal `(E, X·Y)`; goal `(E, X·Y)`.
+    r"""Compute the training loss after a look; goal `(E, X·Y)`.
 
     .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
               + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
@@ -206,8 +206,6 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
     The cell a is the next one to fixate, and b is the most probable fixated cell. Both are selected because of their
     high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
     they have a term of their own.
-
-    Shapes: goal `(E, X·Y)`.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)

@@ -306,10 +306,7 @@ def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> 
 def _explore_curves(
     run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig
 ) -> dict[str, dict[str, FloatArray]]:
-    """Measure the share of cells that exploration strategies classify correctly; → `(P, shifts+1)`; → `(P, shifts+1)`.
-
-    Shapes: → `(P, shifts+1)`.
-    """
+    """Measure the share of cells that exploration strategies classify correctly; → `(P, shifts+1)`."""
     curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
     for index in track(scenes, "exploring", "scene"):
         grid = run.grid(index)

@@ -235,7 +235,7 @@ def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, sur
 
 
 def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
-    r"""Fit both logistic regressions by penalised maximum likelihood; chosen `(N,)`; chosen `(N,)`.
+    r"""Fit both logistic regressions by penalised maximum likelihood; chosen `(N,)`.
 
     .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \qquad
               \lambda = 10^{-4}
@@ -247,8 +247,6 @@ def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None)
               + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right), \qquad \kappa = 10
 
     This is the maximum a posteriori estimate for normal distributions around :math:`w'_0` and :math:`b'_0`.
-
-    Shapes: chosen `(N,)`.
     """
     phi = closer.features[chosen].double()
     if len(phi) < 2:

@@ -90,12 +90,10 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
 
 
 def _error_of(bins: Tensor) -> Tensor:
-    """Expected calibration error from the sums of `reliability`; bins `(3, bins)`; bins `(3, bins)`.
+    """Expected calibration error from the sums of `reliability`; bins `(3, bins)`.
 
     >>> _error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
     tensor(0.1500)
-
-    Shapes: bins `(3, bins)`.
     """
     count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)

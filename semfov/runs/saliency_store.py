@@ -70,10 +70,7 @@ class SaliencyStore(SceneStore):
 def saliency_table(
     name: str, view: _SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
-    """Saliency of every cell of a photograph; image `(3, H, W)` → `(X·Y, X·Y)`; image `(3, H, W)` → `(X·Y, X·Y)`.
-
-    Shapes: image `(3, H, W)` → `(X·Y, X·Y)`.
-    """
+    """Saliency of every cell of a photograph; image `(3, H, W)` → `(X·Y, X·Y)`."""
     model = SALIENCY_CLASSES[name]()
     with one_thread(), torch.inference_mode():
         if view == "picture":

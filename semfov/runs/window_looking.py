@@ -104,10 +104,7 @@ def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None
 
 
 def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -> Tensor:
-    """Compare objects with the annotated ones, class by class; → `(M,)`; → `(M,)`.
-
-    Shapes: → `(M,)`.
-    """
+    """Compare objects with the annotated ones, class by class; → `(M,)`."""
     verdicts = torch.zeros(len(objects), dtype=torch.long)
     for label in objects.labels.unique().tolist():
         mine = (objects.labels == label).nonzero()[:, 0]

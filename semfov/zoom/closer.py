@@ -31,13 +31,11 @@ _SMALLEST = 1e-4
 
 
 def closer_window(lattice: Lattice, box: Tensor) -> Window:
-    """The window that shows a box closely, with its surroundings; box `(4,)`; box `(4,)`.
+    """The window that shows a box closely, with its surroundings; box `(4,)`.
 
     It is three times as large as the longer side of the box (`semfov.sensor.glimpse.window_around`), but its
     magnification is at most one octave above that of the last level: pictures show no more beyond it. In a photograph
     it is twice as large, and at least 0.6 of the longer side: it shows other places, too.
-
-    Shapes: box `(4,)`.
     """
     context, least = _AROUND, PART
     if lattice.levels > 1:

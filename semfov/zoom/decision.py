@@ -79,15 +79,13 @@ class SearchFacts:
         return any(look.found >= DETECTION_SCORE for look in self.looks)
 
     def case(self, ahead: float) -> Tensor:
-        """Facts about the search for `GlimpseEvidence.anywhere`; → `(10,)`; → `(10,)`.
+        """Facts about the search for `GlimpseEvidence.anywhere`; → `(10,)`.
 
         As features of scores: the highest and the second highest score of the target in a look, the highest in a look
         of the last level, the score in the overview, the highest of a detection whose best class is the target, and the
         value of the best look that is left. As a logarithm: the number of looks of the last level, side by side over
         the picture, that are still expected to show the target. Then the share of the picture that is left to see. As
         logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
-
-        Shapes: → `(10,)`.
         """
         looks = self.looks
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)

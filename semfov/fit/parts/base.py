@@ -64,8 +64,7 @@ class PartInputs:
 
     def settings(self, kind: type[_Config], **own: Any) -> _Config:
         """The settings of a part: those of the whole fit by their names, except its `own`."""
-        of_all = {each.name for each in fields(self.config)} - {"gaze"}  # a weight in the fit of target evidence
-        names = of_all & {each.name for each in fields(kind)}
+        names = {each.name for each in fields(self.config)} & {each.name for each in fields(kind)}
         return kind(**{name: getattr(self.config, name) for name in names} | own)
 
     def model(self, name: str) -> FolderModel | None:

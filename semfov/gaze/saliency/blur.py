@@ -11,15 +11,13 @@ _TILE = 24
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
-    r"""Weights of a Gaussian kernel; → `(2r+1,)`; → `(2r+1,)`.
+    r"""Weights of a Gaussian kernel; → `(2r+1,)`.
 
     .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
 
     The number of taps is made odd by rounding up. This is OpenCV's kernel for floats where no size is given. The
     weights are computed by Kornia. The blur is not, because Kornia's takes more than twice as long on a CPU
     (`benchmarks.pyramid`).
-
-    Shapes: → `(2r+1,)`.
     """
     check(sigma > 0, "sigma", "a positive number of pixels", sigma)
     # Imported when first needed: Kornia takes a quarter of a second.

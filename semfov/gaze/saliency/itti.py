@@ -40,15 +40,13 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 
 def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
-    r"""Even and odd Gabor filters without response to a uniform image; → `(2n, 9, 9)`; → `(2n, 9, 9)`.
+    r"""Even and odd Gabor filters without response to a uniform image; → `(2n, 9, 9)`.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
 
     The mean is subtracted, and the absolute values are scaled to sum to 1. At 0° the wave runs along x, and vertical
     bars give the largest response.
-
-    Shapes: → `(2n, 9, 9)`.
     """
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
     y, x = place[:, None], place[None, :]

@@ -76,10 +76,8 @@ def _opponencies(image: Tensor, intensity: Tensor, visible: Tensor) -> Tensor:
 
 
 def anchor(channels: Tensor) -> Tensor:
-    """Subtract the first pixel from every channel; channels `(B, C, H, W)`; channels `(B, C, H, W)`.
+    """Subtract the first pixel from every channel; channels `(B, C, H, W)`.
 
     Contrasts do not depend on it. The contrasts of a uniform image are then exactly 0, without rounding errors.
-
-    Shapes: channels `(B, C, H, W)`.
     """
     return channels - channels[..., :1, :1]

@@ -81,13 +81,11 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
 
 
 def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
-    """Label fixations by fitted clusters; points `(n, 2)` → `(n,)`; points `(n, 2)` → `(n,)`.
+    """Label fixations by fitted clusters; points `(n, 2)` → `(n,)`.
 
     >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
     >>> bool(labels[0] == labels[1] != labels[2])
     True
-
-    Shapes: points `(n, 2)` → `(n,)`.
     """
     return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 
