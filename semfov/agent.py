@@ -565,14 +565,9 @@ class ActivePerception(nn.Module):
         check_thresholds(confirm, give_up)
         check_whole(0 if closer is None else closer, "closer", 0, 100)
         sought, found = numbers[0] if numbers and one else None, () if one else numbers
-        settings: dict[str, Any] = {"rate": rate, "start": start, "seed": seed, "confirm": confirm, "give_up": give_up}
-        settings |= {
-            "closer": closer,
-            "color": color,
-            "white": white,
-            "how": lookup(how, get_args(How), "kind of look"),
-        }
-        return LivePerception(self.fovea, self.zoom, sought, found, **settings)
+        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer, "color": color}
+        settings |= {"how": lookup(how, get_args(How), "kind of look"), "rate": rate, "start": start, "seed": seed}
+        return LivePerception(self.fovea, self.zoom, sought, found, white=white, **settings)
 
     def _kind(
         self, picture: OpenedPicture, how: How, shifts: int | None, duration: float | None, **wanted: bool

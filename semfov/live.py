@@ -35,11 +35,8 @@ class LivePerception:
         rate: rate at which evidence fades, per frame; None takes 0.1 for a fovea and 0.03 for windows.
         start: first cell of a fovea; None draws one at random.
         seed: seed of the generator that draws the start and breaks ties.
-        confirm: least probability for `found`; None takes that of the model.
-        give_up: probability below which a look is not worth a frame; None takes that of the model.
-        closer: largest number of closer looks in ln 2 / rate frames; None takes 2 for a fovea, and 100 for windows.
-        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
         white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
+        **settings: `confirm`, `give_up`, `closer` and `color`, as for `ActivePerception.live`.
 
     Attributes:
         how: the kind of look; `auto` before the first frame.
@@ -66,11 +63,8 @@ class LivePerception:
         rate: float | None = None,
         start: int | None = None,
         seed: int = 0,
-        confirm: float | None = None,
-        give_up: float | None = None,
-        closer: int | None = None,
-        color: Color = "rgb",
         white: White | None = None,
+        **settings: Any,
     ) -> None:
         check(how != "head", "how", "'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, "
               "and for a panoramic frame search or find_all of semfov.Panorama(frame)", how)  # fmt: skip
@@ -82,15 +76,11 @@ class LivePerception:
         self._start, self._canvas = start, windows.eye.detector.input_size
         evidence = windows.evidence
         self._photographs = start is None and evidence is not None and evidence.photograph is not None
-        settings: dict[str, Any] = {
-            "color": lookup(color, get_args(Color), "order of channels"),
-            **without_none(confirm=confirm, give_up=give_up, closer=closer),
-        }
+        lookup(settings.get("color", "rgb"), get_args(Color), "order of channels")
+        given, (slow, fast) = without_none(**settings), (_WINDOW_RATE, _FOVEA_RATE) if rate is None else (rate, rate)
         self._episodes: dict[str, Episode[Any]] = {
-            "fovea": FoveaEpisode(
-                fovea, target, rate=_FOVEA_RATE if rate is None else rate, start=start, seed=seed, **settings
-            ),
-            "windows": windows.episode(target, targets, rate=_WINDOW_RATE if rate is None else rate, **settings),
+            "fovea": FoveaEpisode(fovea, target, rate=fast, start=start, seed=seed, **given),
+            "windows": windows.episode(target, targets, rate=slow, **given),
         }
         self._check_start()
 

@@ -33,7 +33,7 @@ from semfov.episode import LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Choice, Greedy, drawn_by
+from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath, Stimulus, Trace
 from semfov.paths.stimulus import in_bytes
@@ -168,6 +168,7 @@ class FoveaEpisode(Episode[Scanpath]):
         closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
         viewed: where people look in the picture; the gaze then moves as theirs does (`semfov.gaze.Viewer`).
+        cells: cells to look at one after the other, in place of those that the policy chooses.
 
     Attributes:
         ends: function from a step to the number of its outcome (`semfov.decision.OUTCOMES`), 0 to go on.
@@ -196,6 +197,7 @@ class FoveaEpisode(Episode[Scanpath]):
         closer: int = MOST_CLOSER,
         color: Color = "rgb",
         viewed: GazePrediction | None = None,
+        cells: Sequence[int] | None = None,
     ) -> None:
         super().__init__(("background", *agent.eye.detector.classes), target, (), limits, rate)
         usual = agent.exploring if target is None else agent.searching
@@ -212,6 +214,8 @@ class FoveaEpisode(Episode[Scanpath]):
         self.thresholds = None if usually is None else usually.changed(give_up=fading).changed(confirm, give_up)
         self.ends: Callable[[Step], Tensor] | None = None
         self.to_goal = False
+        self._cells = None if cells is None else torch.tensor([[*cells]])
+        start, shifts = (start, shifts) if cells is None else (cells[0], len(cells) - 1)
         self._most = sys.maxsize if shifts is None else shifts + 1
         columns, rows = agent.cells
         self._first = _first_cell(cell_at(start, agent.cells), seed, columns * rows)
@@ -234,7 +238,9 @@ class FoveaEpisode(Episode[Scanpath]):
         self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target, device=torch.device("cpu"))
         first, viewed = torch.tensor([start]), self.viewed
         choice: Choice = Greedy(drawn_by(generator, len(grid), self._looks.like))
-        if viewed is not None:
+        if self._cells is not None:
+            choice = Given(self._cells)
+        elif viewed is not None:
             choice = Viewer(viewed.model, viewed.terms, grid, first, generator)
         self._steps: Iterator[Step] = rollout(
             self._looks,

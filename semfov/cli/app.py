@@ -18,17 +18,15 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from semfov.agent import ActivePerception
-from semfov.agents.episode import on_cpu
+from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
 from semfov.data.classes import class_index
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
-from semfov.episode import LiveLooks, rollout
 from semfov.errors import DataError, InputError, SemfovError
-from semfov.gaze.choice import Given
-from semfov.paths import GazeRecord, Scanpath, Stimulus, Trace, detections_in_words
+from semfov.paths import GazeRecord, Scanpath, detections_in_words
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
@@ -99,19 +97,14 @@ def _grid_of(agent: ActivePerception, image: Tensor) -> Grid:
 
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
     """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
-    fovea, grid, index = agent.fovea, _grid_of(agent, image), class_index(target, agent.classes[1:], "target")
-    mapper, strategy, image = fovea.exploring.observer, on_cpu(fovea.searching), image.to(agent.eye.sensor.like)
+    episode = FoveaEpisode(agent.fovea, class_index(target, agent.classes[1:], "target"), closer=0, cells=cells)
     with torch.inference_mode():
-        looks = LiveLooks(agent.eye, agent.eye.open(image[None]), grid, index, device=torch.device("cpu"))
-        beside = None if mapper is fovea.searching.observer else on_cpu(mapper)
-        trace = Trace(grid, agent.classes, index, beside, agent.eye.detector.least)
-        policy, order = strategy.policy(index, grid), torch.tensor([[*cells]])
-        for step in rollout(looks, strategy.observer, policy, order[:, 0], Given(order), most=len(cells)):
-            trace.add(step)
-        step = trace.steps[-1]
-        left = step.values[0].masked_fill(step.visited[0], -torch.inf)
-        record = trace.scanpath(stimulus=Stimulus.of(agent.eye, image[None]))
+        episode.open(image[None].to(agent.eye.sensor.like))
+        while episode.look() is not None:
+            pass
         own = agent.search(image, target, how="fovea", start=cells[0], shifts=len(cells) - 1, closer=0)
+    record = episode.record()
+    left = record.values[-1].index_fill(0, record.cells, -torch.inf)
     return _OwnLooks(record, int(left.argmax()), own)
 
 
