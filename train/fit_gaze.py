@@ -23,7 +23,8 @@ from semfov.fit.gaze_model import GazeModelFit, fit_gaze_model, gaze_report, sum
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import SingleName
-from semfov.runs.setup import detector_options, prepare_worker
+from semfov.runs.setup import detector_options
+from semfov.runs.workers import prepare_worker
 from train.outputs import model_path, write_outputs
 
 

@@ -8,19 +8,11 @@ from typing import Any
 
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.samples import Sampler, Samples
-from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import run_tasks
 
-_process: dict[str, Sampler] = {}
 
-
-def _prepare(kind: type[Sampler], config: Any, folder: Path) -> None:
-    prepare_worker()
-    _process["sampler"] = kind(config, folder)
-
-
-def _run_shard(shard: int) -> bytes:
-    return pack_tensors(vars(_process["sampler"].sample(shard)))
+def _run_shard(sampler: Sampler, shard: int) -> bytes:
+    return pack_tensors(vars(sampler.sample(shard)))
 
 
 def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:
@@ -34,8 +26,8 @@ def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] =
         _run_shard,
         todo,
         where=config.where,
-        setup=_prepare,
-        settings=(kind, config, folder),
+        make=kind,
+        settings=(config, folder),
         title=title,
         unit="shard",
     )

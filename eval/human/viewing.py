@@ -30,8 +30,9 @@ from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, seque
 from semfov.runs.config import DetectorConfig, SaliencyModel
 from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.settings import Count, Whole
-from semfov.runs.setup import detector_options, prepare_worker
+from semfov.runs.setup import detector_options
 from semfov.runs.tables import plus_minus, table
+from semfov.runs.workers import prepare_worker
 
 _Array = NDArray[np.float64]
 

@@ -28,8 +28,9 @@ from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
 from semfov.runs.command import command
 from semfov.runs.settings import Range
-from semfov.runs.setup import make_detector, make_scenes, prepare_worker
+from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.tables import table
+from semfov.runs.workers import prepare_worker
 from train.outputs import model_path, write_outputs
 
 

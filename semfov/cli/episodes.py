@@ -9,7 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing, redirect_stdout, suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -38,7 +38,6 @@ from semfov.report import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
-from semfov.runs.setup import prepare_worker
 from semfov.runs.workers import available_cores, run_tasks
 
 
@@ -125,20 +124,10 @@ def _numbers(part: object) -> dict[str, Any]:
     return {name: value for name, value in vars(part).items() if type(value) in (bool, int, float, str)}
 
 
-_process: dict[str, PictureJob] = {}
-
-
-def _prepare(kind: type[PictureJob], options: PictureOptions) -> None:
-    """Make the job in a process that works for another one; the process that was called has made it."""
-    job = _process.get("job")
-    if type(job) is not kind or job.options != options:
-        prepare_worker()
-        with redirect_stdout(io.StringIO()):  # the process that was called has said it
-            _process["job"] = kind(options)
-
-
-def _outcome(number: int) -> PictureOutcome | SemfovError:
-    return _process["job"].outcome(number)
+def _make_again(kind: type[PictureJob], options: PictureOptions) -> PictureJob:
+    """The job, in a process that works for another one."""
+    with redirect_stdout(io.StringIO()):  # the process that was called has said it
+        return kind(options)
 
 
 def _check_places(files: Sequence[Path | None]) -> None:
@@ -291,7 +280,6 @@ def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tu
     if not job.several:
         yield 0, job.outcome(0)
         return
-    _process["job"] = job
     left, where = [number for number in range(len(job.sources)) if number not in before], job.options.where
     if left and where != 1 and (where is None or isinstance(where, int)):
         # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
@@ -299,15 +287,14 @@ def _outcomes(job: PictureJob, before: dict[int, PictureOutcome]) -> Iterator[tu
         first = left.pop(0)
         yield first, job.outcome(first)
         where = _worth_starting(where, len(left), time.process_time() - start, start)
-    done = run_tasks(
-        _outcome,
+    yield from run_tasks(
+        PictureJob.outcome,
         left,
         where=where,
-        setup=_prepare,
+        make=_make_again,
         settings=(type(job), job.options),
+        made=job,
         title="pictures",
         unit="picture",
         hidden=job.options.quiet,
     )
-    with closing(done):
-        yield from done

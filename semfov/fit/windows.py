@@ -43,9 +43,9 @@ from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Count, Range, Share, Whole
-from semfov.runs.setup import make_detector, prepare_worker, split_photographs
+from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.window_looking import TileSize
-from semfov.runs.workers import run_tasks
+from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -185,18 +185,9 @@ def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, 
             return Scattered(scenes, size=ground, sides=(tile // 15, tile // 3), count=count, seed=seed)
 
 
-_process: dict[str, MosaicFit] = {}
-
-
-def _prepare_fit_process(config: FitZoomConfig) -> None:
-    """Build the eye, the pictures and the store once in this process."""
-    prepare_worker()
-    _process["fit"] = MosaicFit(config)
-
-
-def _look(task: tuple[str, int]) -> bytes:
+def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
     """Look at all windows of a picture that are not in the store yet; returns what the store has of it."""
-    (kind, index), fit = task, _process["fit"]
+    kind, index = task
     pictures = fit.pictures[kind]
     glances = StoredGlances(fit.eye, pictures, index, fit.store)
     glances.see(windows_of(pictures, index, glances.lattice))
@@ -244,7 +235,7 @@ class MosaicFit:
         todo = [(kind, n) for kind in dict.fromkeys(kinds) for n in range(len(self.pictures[kind]))]
         config, store = self.config, self.store
         done = run_tasks(
-            _look, todo, where=config.where, setup=_prepare_fit_process, settings=(config,),
+            _look, todo, where=config.where, make=MosaicFit, settings=(config,),
             title="looking", unit="picture",
         )  # fmt: skip
         with closing(done):

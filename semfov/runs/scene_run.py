@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +16,6 @@ from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord, SceneResults
-from semfov.runs.setup import prepare_worker
 from semfov.runs.store import versions
 from semfov.runs.workers import run_tasks
 
@@ -106,8 +104,8 @@ def finish(run: SceneRun, title: str) -> None:
         _outcomes_of,
         todo,
         where=run.config.where,
-        setup=_prepare_process,
-        settings=(type(run), run.config),
+        make=type(run),
+        settings=(run.config,),
         title=title,
         unit="scene",
     )
@@ -126,16 +124,6 @@ def digest_of(what: object) -> str:
     return hashlib.sha256(json.dumps(what, sort_keys=True, default=Pretrained.digest).encode()).hexdigest()
 
 
-_process: dict[str, SceneRun] = {}
-
-
-def _prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
-    """Build the run in this process, once."""
-    prepare_worker()
-    _process["run"] = make(config)
-
-
-def _outcomes_of(index: int) -> tuple[list[ResultRecord], dict[str, float], bytes | None]:
+def _outcomes_of(run: SceneRun, index: int) -> tuple[list[ResultRecord], dict[str, float], bytes | None]:
     """Run all episodes of a scene; returns their records, the seconds of each stage, and what was stored."""
-    run = _process["run"]
     return *run.outcomes(index), run.stored(index)

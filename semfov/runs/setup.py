@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import logging
-import multiprocessing
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, TypeVar
-
-import torch
 
 from semfov.belief import MapEvidence, TargetEvidence, Verification
 from semfov.data.coco import CocoScenes
@@ -157,23 +151,3 @@ def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:
     model = kind.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
-
-
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Numbers of two settings of glibc's malloc (malloc.h)."""
-
-
-def prepare_worker() -> None:
-    """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
-
-    Only worker processes are silenced: the main process has logged the same messages already.
-    """
-    torch.set_num_threads(1)
-    # Otherwise glibc would return and request memory at every look. Dask's workers return memory at once, by a variable
-    # of the environment, which also takes away glibc's own rule.
-    with suppress(OSError, AttributeError):  # other systems have no such setting
-        setting = ctypes.CDLL(None).mallopt
-        setting(_MMAP_THRESHOLD, 31 << 20)
-        setting(_TRIM_THRESHOLD, 1 << 30)
-    if multiprocessing.parent_process() is not None:
-        logging.getLogger("semfov").setLevel(logging.ERROR)

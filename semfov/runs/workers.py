@@ -1,5 +1,6 @@
 """Runs tasks in this process, in processes of this machine, or in any executor, such as a cluster's."""
 
+import ctypes
 import logging
 import multiprocessing
 import os
@@ -9,7 +10,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
@@ -17,7 +18,9 @@ from logging import getLogger
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+
+import torch
 
 from semfov.errors import InputError, SemfovError
 from semfov.io.code import package_digest
@@ -69,6 +72,27 @@ def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Execut
             executor.shutdown(wait=False)
 
 
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Numbers of two settings of glibc's malloc (malloc.h)."""
+
+
+def prepare_worker() -> None:
+    """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
+
+    Only worker processes are silenced: the main process has logged the same messages already.
+    """
+    torch.set_num_threads(1)
+    # Otherwise glibc would return and request memory at every look. Dask's workers return memory at once, by a variable
+    # of the environment, which also takes away glibc's own rule.
+    with suppress(OSError, AttributeError):  # other systems have no such setting
+        setting = ctypes.CDLL(None).mallopt
+        setting(_MMAP_THRESHOLD, 31 << 20)
+        setting(_TRIM_THRESHOLD, 1 << 30)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)
+
+
+_Made = TypeVar("_Made")
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
@@ -97,18 +121,20 @@ def available_cores() -> int:
 
 
 def run_tasks(
-    function: Callable[[_Task], _Result],
+    function: Callable[[_Made, _Task], _Result],
     tasks: Sequence[_Task],
     *,
     where: Where,
-    setup: Callable[..., None],
+    make: Callable[..., _Made],
     settings: tuple[object, ...],
     title: str,
     unit: str,
     hidden: bool = False,
+    made: _Made | None = None,
 ) -> Generator[tuple[_Task, _Result], None, None]:
-    """Run `function(task)` for every task, and yield tasks and results in any order; a bar shows the progress.
+    """Run `function(made, task)` for every task, and yield tasks and results in any order; a bar shows the progress.
 
+    Each process makes `made` once, by `make(*settings)`; this one does not where it is given.
     Results come back to this process, which stores them: workers need not see its folders. Close the generator if you
     stop early: that ends the work.
     """
@@ -118,14 +144,16 @@ def run_tasks(
     with closing(task_bar(len(tasks), title, unit, hidden=hidden)) as bar:
         if isinstance(processes, int):
             if processes <= 1 or len(tasks) == 1:
-                setup(*settings)
+                if made is None:
+                    prepare_worker()
+                    made = make(*settings)
                 for task in tasks:
-                    yield task, function(task)
+                    yield task, function(made, task)
                     bar.update()
             else:
-                yield from _in_processes(_Job(function, setup, settings), tasks, processes, title, bar)
+                yield from _in_processes(_Job(function, make, settings), tasks, processes, title, bar)
             return
-        job = _Job(function, setup, settings, package_digest())
+        job = _Job(function, make, settings, package_digest())
         if isinstance(processes, Executor):
             yield from _results(processes, job, tasks, lambda _: bar.update())
         else:
@@ -143,17 +171,17 @@ def shared_processes() -> Iterator[None]:
             _shared.reset(before)
 
 
-class _Job(Generic[_Task, _Result]):
-    """A function with its setup, for workers that may have had other jobs; `code` is checked if it is given."""
+class _Job(Generic[_Made, _Task, _Result]):
+    """A function and what it needs made, for workers that may have had other jobs; `code` is checked if it is given."""
 
     def __init__(
         self,
-        function: Callable[[_Task], _Result],
-        setup: Callable[..., None],
+        function: Callable[[_Made, _Task], _Result],
+        make: Callable[..., _Made],
         settings: tuple[object, ...],
         code: str | None = None,
     ) -> None:
-        self.function, self.setup, self.settings, self.code = function, setup, settings, code
+        self.function, self.make, self.settings, self.code = function, make, settings, code
         self.folder = Path.cwd()
 
     def __call__(self, task: _Task) -> _Result:
@@ -161,19 +189,18 @@ class _Job(Generic[_Task, _Result]):
         with _turn:
             if self.code is not None and package_digest() != self.code:
                 raise SemfovError("a worker has another version of semfov; install the same version on all machines")
-            preparation = (self.setup, self.settings)
-            if _ready != [preparation]:
+            if [each[:2] for each in _ready] != [(self.make, self.settings)]:
                 _ready.clear()
                 if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
                     os.chdir(self.folder)
-                self.setup(*self.settings)
-                _ready.append(preparation)
-            return self.function(task)
+                prepare_worker()
+                _ready.append((self.make, self.settings, self.make(*self.settings)))
+            return self.function(_ready[0][2], task)
 
 
 _turn = threading.Lock()
-_ready: list[tuple[Callable[..., None], tuple[object, ...]]] = []
-"""The setup that this process has had."""
+_ready: list[tuple[Callable[..., Any], tuple[object, ...], Any]] = []
+"""What this process has made, behind what made it."""
 
 
 def _results(

@@ -11,6 +11,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -28,16 +29,17 @@ ROOT = Path(__file__).parents[2]
 
 TASKS = """
 import os, time
+from functools import partial
 from pathlib import Path
 
-offset = None
+made = []
 
-def prepare(value):
-    global offset
-    assert offset is None, "prepared twice"
-    offset = value
+def make(value):
+    assert not made, "made twice"
+    made.append(value)
+    return value
 
-def work(task):
+def work(offset, task):
     number, folder, seconds = task
     Path(folder, f"{os.getpid()}.worker").touch()
     time.sleep(seconds)
@@ -45,8 +47,13 @@ def work(task):
 """
 
 
-def results(function, tasks, where, *, setup=id, settings=(0,)):
-    run = run_tasks(function, tasks, where=where, setup=setup, settings=settings, title="testing", unit="task")
+def of_task(function, _, task):
+    return function(task)
+
+
+def results(function, tasks, where, *, make=id, settings=(0,)):
+    one = partial(of_task, function)
+    run = run_tasks(one, tasks, where=where, make=make, settings=settings, title="testing", unit="task")
     return dict(run)
 
 
@@ -104,8 +111,8 @@ def test_a_process_is_prepared_again_for_other_settings():
     seen = []
     with ThreadPoolExecutor(1) as pool:
         for settings in ((1,), (1,), (2,)):
-            results(operator.neg, [5], pool, setup=seen.append, settings=settings)
-            results(operator.neg, [6], pool, setup=seen.append, settings=settings)
+            results(operator.neg, [5], pool, make=seen.append, settings=settings)
+            results(operator.neg, [6], pool, make=seen.append, settings=settings)
     assert seen == [1, 2]
 
 
@@ -133,7 +140,7 @@ def process_and_setting(_):
 
 
 def with_setting(value):
-    return results(process_and_setting, range(4), 2, setup=set_to, settings=(value,))
+    return results(process_and_setting, range(4), 2, make=set_to, settings=(value,))
 
 
 @pytest.mark.slow
@@ -213,9 +220,7 @@ def test_a_cluster_that_loses_a_worker_and_its_scheduler_gives_what_one_process_
         first = stack.enter_context(scheduler(port, tmp_path))
         both = [stack.enter_context(worker(port, tmp_path)) for _ in range(2)]
         address = f"tcp://127.0.0.1:{port}"
-        run = run_tasks(
-            tasks.work, todo, where=address, setup=tasks.prepare, settings=(7,), title="testing", unit="task"
-        )
+        run = run_tasks(tasks.work, todo, where=address, make=tasks.make, settings=(7,), title="testing", unit="task")
         for task, result in run:
             assert task not in got
             got[task] = result

@@ -31,10 +31,7 @@ class Config(Settings):
     """
     folder: Path = Path("x")
 
-def setup(folder):
-    pass
-
-def work(task):
+def work(_, task):
     folder = Path(sys.argv[-1])
     with replacing(folder / f"{task}.result") as temporary:
         (folder / f"{os.getpid()}.worker").touch()
@@ -42,7 +39,7 @@ def work(task):
 
 def main(config):
     for _ in run_tasks(
-        work, [0, 1, 2], where=2, setup=setup, settings=(config.folder,), title="sleeping", unit="nap"
+        work, [0, 1, 2], where=2, make=str, settings=(config.folder,), title="sleeping", unit="nap"
     ):
         pass
 
