@@ -19,7 +19,6 @@ from semfov.report.episode import Data, jpeg_uri
 from semfov.report.page import colour_steps, filled, json_script, page_path
 from semfov.viz.style import COLOURS, overlay_colours
 
-_FOLDER = Path(__file__).parent
 _WIDTH, _QUALITY = 960, 80
 _MOST_STEPS = 12
 """Largest number of fixations of the slider."""
@@ -46,14 +45,13 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
     }
     contents = {
         "title": escape(title),
-        "program": (_FOLDER / "gaze.js").read_text(encoding="utf-8"),
         "data": json_script(data),
         "facts": "".join(
             f'<section class="facts-of" id="facts-{number}">{each["facts"]}</section>'
             for number, each in enumerate(parts)
         ),
     }
-    return filled("gaze.html", contents)
+    return filled("gaze", contents)
 
 
 def _picture(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:

@@ -1,10 +1,7 @@
-"use strict";
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
-  const find = (id) => document.getElementById(id);
   const GAZE = "#0072B2", TARGET = "#B84700", FOUND = "#00795A", OTHER = "#1F4E79", TRUTH = "#E69F00";
-  let episode, fixation = 0, chosenClass = 0, wantedClass = null, playing = null;
-  let stepped = false; // The page opens with the result: nothing is yet to come before the reader steps.
+  let episode, fixation = 0, chosenClass = 0, wantedClass = null;
 
   // Elements: names and texts are set as text, never as markup.
   function make(namespace, tag, attributes = {}, children = []) {
@@ -29,6 +26,7 @@
   }
   // Episodes in large pictures have looks. Their pictures and tables are in the page, and need only be chosen.
   const steps = () => episode.looks ?? episode.fixations;
+  const word = () => episode.looks ? "look" : "fixation";
   const short = (value) => value === null ? "none" : Number(value.toPrecision(3)).toString();
   const place = (cell) => `column ${cell % episode.grid[0]}, row ${Math.floor(cell / episode.grid[0])}`;
   function colour(scale, share) {
@@ -192,7 +190,7 @@
     for (const look of article.querySelectorAll(".look")) look.hidden = Number(look.dataset.look) !== fixation;
     for (const drawn of article.querySelectorAll("g[data-look]")) {
       drawn.classList.toggle("now", Number(drawn.dataset.look) === fixation);
-      drawn.classList.toggle("later", stepped && Number(drawn.dataset.look) > fixation);
+      drawn.classList.toggle("later", control.stepped && Number(drawn.dataset.look) > fixation);
     }
     const frames = [box(now.box, { class: "under" }), box(now.box, { class: "over" })];
     article.querySelector(".chosen").replaceChildren(...frames);
@@ -201,14 +199,9 @@
 
   // Controls.
   function show() {
-    const last = steps().length - 1;
-    find("fixation").value = fixation;
-    find("fixation").setAttribute("aria-valuetext", `${episode.looks ? "look" : "fixation"} ${fixation} of ${last}`);
-    find("number").textContent = `${fixation} of ${last}`;
-    find("back").disabled = fixation === 0;
-    find("forward").disabled = fixation === last;
+    fixation = control.at;
     if (episode.looks) showLook();
-    else showFixation(last);
+    else showFixation(steps().length - 1);
   }
   function showFixation(last) {
     const now = episode.fixations[fixation];
@@ -224,19 +217,9 @@
     const end = fixation === last ? ` The end: ${episode.summary}.` : "";
     find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${sure}${end}`;
   }
-  function go(number) {
-    const wanted = Math.min(Math.max(number, 0), steps().length - 1);
-    if (wanted === fixation && stepped) return;
-    stepped = true;
-    fixation = wanted;
-    show();
-  }
   function open(number) {
     if (episode?.maps) wantedClass = episode.maps[chosenClass].label;
     episode = report.episodes[number];
-    fixation = 0;
-    stepped = false;
-    find("fixation").max = steps().length - 1;
     find("episode-views").hidden = Boolean(episode.looks);
     for (const article of document.querySelectorAll(".large")) article.hidden = article.id !== episode.article;
     if (episode.maps) {
@@ -244,51 +227,31 @@
       find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
       find("class").value = chosenClass;
     }
-    const word = episode.looks ? "look" : "fixation";
-    find("word").textContent = word[0].toUpperCase() + word.slice(1);
-    find("back").setAttribute("aria-label", `Previous ${word}`);
-    find("forward").setAttribute("aria-label", `Next ${word}`);
+    find("word").textContent = word()[0].toUpperCase() + word().slice(1);
+    find("back").setAttribute("aria-label", `Previous ${word()}`);
+    find("forward").setAttribute("aria-label", `Next ${word()}`);
     for (const told of document.querySelectorAll("[data-about]")) {
       told.parentElement.hidden = !episode[told.dataset.about];
       told.textContent = episode[told.dataset.about] ?? "";
     }
-    show();
-  }
-  function stop() {
-    clearInterval(playing);
-    playing = null;
-    find("play").textContent = "Play";
-  }
-  function play() {
-    if (playing !== null) return stop();
-    if (fixation === steps().length - 1) go(0);
-    find("play").textContent = "Pause";
-    playing = setInterval(() => {
-      go(fixation + 1);
-      if (fixation === steps().length - 1) stop();
-    }, 1000);
+    control.start();
   }
 
-  document.documentElement.classList.add("scripted");
   if (!report.episodes.length) {
     find("viewer").hidden = true;
     return;
   }
+  const control = stepper({ last: () => steps().length - 1, show, word, pause: 1000 });
   find("episode-choice").hidden = report.episodes.length < 2;
   find("episode").replaceChildren(...report.episodes.map((each, index) => html("option", { value: index }, `${each.name}: ${each.summary}`)));
-  find("episode").addEventListener("change", (event) => { stop(); open(Number(event.target.value)); });
+  find("episode").addEventListener("change", (event) => { control.stop(); open(Number(event.target.value)); });
   find("class").addEventListener("change", (event) => { chosenClass = Number(event.target.value); show(); });
-  find("fixation").addEventListener("input", (event) => { stop(); go(Number(event.target.value)); });
-  find("back").addEventListener("click", () => { stop(); go(fixation - 1); });
-  find("forward").addEventListener("click", () => { stop(); go(fixation + 1); });
-  find("play").addEventListener("click", play);
   // The list of objects: a row shows its object and the look that brought it, and a head sorts by its column.
   function pick(row) {
     const article = find(episode.article), same = `[data-object="${row.dataset.object}"]`;
     for (const each of article.querySelectorAll(".picked")) each.classList.remove("picked");
     for (const each of article.querySelectorAll(same)) each.classList.add("picked");
-    stop();
-    go(Number(row.dataset.look));
+    control.go(Number(row.dataset.look));
   }
   function sort(head) {
     const column = head.cellIndex, down = head.getAttribute("aria-sort") === "ascending";
@@ -304,18 +267,7 @@
     if (head) return sort(head);
     if (row) return pick(row);
     const chosen = event.target.closest(".window");
-    if (!chosen) return;
-    stop();
-    go(Number(chosen.dataset.look));
-  });
-  document.addEventListener("keydown", (event) => {
-    // Lists and the slider use these keys themselves.
-    if (event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
-    const moves = { ArrowLeft: fixation - 1, ArrowRight: fixation + 1, Home: 0, End: steps().length - 1 };
-    if (!(event.key in moves)) return;
-    event.preventDefault();
-    stop();
-    go(moves[event.key]);
+    if (chosen) control.go(Number(chosen.dataset.look));
   });
   open(0);
 })();

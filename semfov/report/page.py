@@ -89,7 +89,6 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     }
     contents = {
         "title": escape(title),
-        "program": (_FOLDER / "page.js").read_text(encoding="utf-8"),
         "data": json_script(data),
         "sections": sections,
         "about": _about_html(episodes),
@@ -100,14 +99,19 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         ),
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
-    return filled("page.html", contents)
+    return filled("page", contents)
 
 
 def filled(name: str, contents: dict[str, str]) -> str:
-    """The page of a template: the head of all pages, the template, and the contents of their placeholders."""
-    template = "".join((_FOLDER / each).read_text(encoding="utf-8") for each in ("head.html", name))
-    parts = {"style": (_FOLDER / "page.css").read_text(encoding="utf-8"), **contents}
+    """The page of a template: head, controls, foot and script of all pages, its own, and contents of placeholders."""
+
+    def text(*files: str) -> str:
+        return "".join((_FOLDER / file).read_text(encoding="utf-8") for file in files)
+
+    parts = {"style": text("page.css"), "steps": text("steps.html"), "program": text("steps.js", f"{name}.js")}
+    parts |= contents
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
+    template = text("head.html", f"{name}.html", "foot.html")
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
 
 

@@ -1,0 +1,61 @@
+"use strict";
+// The controls of a page of steps: a slider, buttons, keys, and playing. `last` gives the number of the last step,
+// `show` draws the step that `steps.at` tells, and `word` names one.
+const find = (id) => document.getElementById(id);
+document.documentElement.classList.add("scripted");
+
+function stepper({ last, show, word, pause }) {
+  const steps = { at: 0, stepped: false, draw, go, start, stop };
+  let playing = null;
+  function draw() {
+    find("fixation").max = last();
+    find("fixation").value = steps.at;
+    find("fixation").setAttribute("aria-valuetext", `${word()} ${steps.at} of ${last()}`);
+    find("number").textContent = `${steps.at} of ${last()}`;
+    find("back").disabled = steps.at === 0;
+    find("forward").disabled = steps.at === last();
+    show();
+  }
+  function move(number) {
+    const wanted = Math.min(Math.max(number, 0), last());
+    if (wanted === steps.at && steps.stepped) return;
+    Object.assign(steps, { at: wanted, stepped: true });
+    draw();
+  }
+  function go(number) {
+    stop();
+    move(number);
+  }
+  // The page opens with the result: nothing is yet to come before the reader steps.
+  function start(number = 0) {
+    Object.assign(steps, { at: Math.min(number, last()), stepped: false });
+    draw();
+  }
+  function stop() {
+    clearInterval(playing);
+    playing = null;
+    find("play").textContent = "Play";
+  }
+  function play() {
+    if (playing !== null) return stop();
+    if (steps.at === last()) move(0);
+    find("play").textContent = "Pause";
+    playing = setInterval(() => {
+      move(steps.at + 1);
+      if (steps.at === last()) stop();
+    }, pause);
+  }
+  find("fixation").addEventListener("input", (event) => go(Number(event.target.value)));
+  find("back").addEventListener("click", () => go(steps.at - 1));
+  find("forward").addEventListener("click", () => go(steps.at + 1));
+  find("play").addEventListener("click", play);
+  document.addEventListener("keydown", (event) => {
+    // Lists and the slider use these keys themselves.
+    if (event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
+    const moves = { ArrowLeft: steps.at - 1, ArrowRight: steps.at + 1, Home: 0, End: last() };
+    if (!(event.key in moves)) return;
+    event.preventDefault();
+    go(moves[event.key]);
+  });
+  return steps;
+}
