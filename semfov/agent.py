@@ -20,6 +20,7 @@ from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
+from semfov.data.fixations import Fixations
 from semfov.data.inputs import Color
 from semfov.data.tone import White
 from semfov.data.windowed import ChosenBands
@@ -498,6 +499,7 @@ class ActivePerception(nn.Module):
         picture: PictureLike,
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
+        seen: Fixations | None = None,
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
@@ -507,6 +509,8 @@ class ActivePerception(nn.Module):
         Args:
             picture: a photograph, as for `search`.
             model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
+            seen: fixations; the prediction then knows only what the agent's fovea has shown at them, a pass for each
+                (`semfov.saliency.features_so_far`). None for the sharp picture.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -515,12 +519,12 @@ class ActivePerception(nn.Module):
             The density of fixations, from which scanpaths are drawn.
 
         Raises:
-            InputError: no model is shipped for the detector, or the given one was fitted to another.
+            InputError: no model is shipped for the detector, the given one is another's, or a sensor for `seen` bends it.
             DataError: the file of the picture or of the model cannot be read.
         """
         image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(self.eye.detector, image, model=model, source=source)
+        return GazePrediction.of(self.eye, image, model=model, source=source, seen=seen)
 
     def live(
         self,

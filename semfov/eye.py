@@ -1,5 +1,6 @@
 """The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,10 +12,12 @@ from semfov.data.inputs import ImageLike, PointLike, as_image, as_points, as_pos
 from semfov.detection.crops import merge_crops
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector, check_images
+from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.placement import Placement, letterbox
 from semfov.errors import check, check_shape
 from semfov.io.state import StatedModule
 from semfov.sensor.base import Sensor
+from semfov.sensor.foveation import Foveation
 from semfov.sensor.glimpse import glimpse, window_around
 
 
@@ -168,6 +171,24 @@ class Eye(StatedModule):
         """
         points = _points(fixations, view)
         return self.detect(view, points, self.foveated(view, points))
+
+    def features(self, view: View, fixations: PointLike, layers: Sequence[str] | None = None) -> FeatureMaps:
+        """Look from fixations, and keep feature maps of the passes.
+
+        Args:
+            view: the opened image.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+            layers: names of the maps, as for `Detector.features`.
+
+        Returns:
+            The maps by name, a batch of F over the canvas, with the detections.
+
+        Raises:
+            InputError: the shape of `fixations` is wrong, the detector has no such map, or the sensor bends the image.
+        """
+        expected = "a Foveation, whose views are the image itself"
+        check(isinstance(self.sensor, Foveation), "sensor", expected, type(self.sensor).__name__)
+        return self.detector.canvas_features(self.foveated(view, fixations), view.placement, layers)
 
     def close_up(self, image: Tensor, box: Tensor) -> Detections:
         """Look closely at a place: enlarge a window around it to the detector's input, and detect.

@@ -189,7 +189,22 @@ class Detector(StatedModule, ABC):
 
             semfov.load_detector("yolox-nano").features(images).maps["backbone8"]
         """
-        canvas, placement = self.fit(images)
+        return self.canvas_features(*self.fit(images), layers)
+
+    def canvas_features(self, canvas: Tensor, placement: Placement, layers: Sequence[str] | None = None) -> FeatureMaps:
+        """Detect objects in images that are fitted into the input already, and keep feature maps of the same pass.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+            placement: placement of the images on it.
+            layers: names of the maps, as for `features`.
+
+        Returns:
+            The maps by name, with the detections.
+
+        Raises:
+            InputError: the detector hides its feature maps, or has no map of this name.
+        """
         candidates, maps = self.propose_with_features(canvas, layers)
         detections = select(candidates.precise(), placement, self.selection, self.background)
         return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, detections)

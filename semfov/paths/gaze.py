@@ -20,7 +20,9 @@ from torch.nn import functional as F
 from semfov.data.fixations import Fixations, write_table
 from semfov.detection.detector import Detector
 from semfov.errors import check, check_number, check_whole
+from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
 from semfov.paths.stimulus import reduced_copy
 
@@ -63,27 +65,32 @@ class GazePrediction:
     @classmethod
     def of(
         cls,
-        detector: Detector,
+        looking: Detector | Eye,
         image: Tensor,
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
         source: str | None = None,
+        seen: Fixations | None = None,
     ) -> Self:
         """Predict where people look in a picture, from one pass of a detector.
 
         Args:
-            detector: the detector.
+            looking: the detector, or an eye with it.
             image: `(3, H, W)`, RGB in [0, 1].
             model: a model that was fitted to the detector, or its file or folder; None for the one that is shipped.
             source: file of the picture.
+            seen: fixations at which the eye has looked, in any size of the picture; the prediction then knows only what
+                the fovea has shown. None for the sharp picture.
 
         Returns:
             The prediction.
 
         Raises:
-            InputError: no model is shipped for the detector, or the given one was fitted to another detector.
+            InputError: no model is shipped for the detector, or the given one was fitted to another detector; or the
+                frame of `seen` has other proportions, or the sensor of the eye bends the picture.
             DataError: the file of the model is missing or damaged.
         """
+        detector = looking.detector if isinstance(looking, Eye) else looking
         if isinstance(model, str | PathLike):
             model = FixationDensity.from_pretrained(model)
         expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
@@ -91,19 +98,23 @@ class GazePrediction:
         if model is not None:
             model.check_compatible(detector)
         model = FixationDensity.for_detector(detector) if model is None else deepcopy(model)
+        size = int(image.shape[-1]), int(image.shape[-2])
         with torch.no_grad():
-            features = detector.features(image[None], [*model.layers])
-            terms = model.to(image).terms(features, (image.shape[-2], image.shape[-1]))
-        size = features.placement.size
+            if seen is None:
+                features = detector.features(image[None], [*model.layers])
+            else:
+                check(isinstance(looking, Eye), "looking", "an eye, for what it has seen", type(looking).__name__)
+                _check_frame(seen, size, "seen")
+                points = torch.from_numpy(seen.resized(size).points).to(image)
+                views = looking.features(looking.open(image[None]), points, [*model.layers])
+                features = features_so_far(views, points, points[None])
+            terms = model.to(image).terms(features, size[::-1])
         return cls(model.cpu(), {name: each.cpu() for name, each in terms.items()}, size, reduced_copy(image), source)
 
     @cached_property
     def density(self) -> Tensor:
         """Probability of a fixation in each pixel of the picture, `(H, W)`, with sum 1."""
-        log = self._log()
-        size = self.size[::-1]
-        over = F.interpolate(log[None, None], size, mode="bilinear", align_corners=False)[0, 0]
-        return (over - over.logsumexp((0, 1))).exp()
+        return self._over_pixels(self._log())
 
     @cached_property
     def cells(self) -> Tensor:
@@ -227,6 +238,24 @@ class GazePrediction:
             given = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
         return torch.stack([*given.values()]).sum(0).flatten(1).softmax(1).mean(0).view_as(self.cells)
 
+    def next_density(self, scanpath: Fixations) -> Tensor:
+        """Probability of a viewer's next fixation in each pixel of the picture, after the fixations so far.
+
+        What is known of the picture is the same as for `density`: all of it, or with `agent.gaze(picture,
+        seen=scanpath)` what a fovea has shown at these fixations.
+
+        Args:
+            scanpath: the fixations so far, in any size of the picture.
+
+        Returns:
+            `(H, W)`, with sum 1.
+
+        Raises:
+            InputError: the frame of the fixations has other proportions.
+        """
+        _check_frame(scanpath, self.size, "scanpath")
+        return self._over_pixels(self.given([scanpath], len(scanpath)).log())
+
     def compare(self, people: Sequence[Fixations]) -> dict[str, float]:
         """Compare the density with fixations of people in the same picture, all but the first of each person.
 
@@ -244,10 +273,8 @@ class GazePrediction:
         check(len(people) > 0, "people", "fixations of at least one person", "none")
         pictures = sorted({each.picture for each in people})
         check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-        width, height = self.size
         for each in people:
-            same = abs(each.size[0] * height - each.size[1] * width) <= max(width, height) + max(each.size)
-            check(same, "people", f"fixations in a frame with the proportions of {width} × {height}", each.size)
+            _check_frame(each, self.size, "people")
         from semfov.metrics.scanpath.density import compare_density
 
         return compare_density(self, people)
@@ -362,6 +389,18 @@ class GazePrediction:
         ]
         return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
 
+    def _over_pixels(self, log: Tensor) -> Tensor:
+        """Probability in each pixel, `(H, W)`, by a log density over the cells, up to a constant."""
+        over = F.interpolate(log[None, None], self.size[::-1], mode="bilinear", align_corners=False)[0, 0]
+        return (over - over.logsumexp((0, 1))).exp()
+
     def _log(self) -> Tensor:
         """Log density over the cells, up to a constant."""
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
+
+
+def _check_frame(fixations: Fixations, size: tuple[int, int], name: str) -> None:
+    """Refuse fixations in a frame of other proportions than those of `(width, height)`, up to rounding."""
+    width, height = size
+    same = abs(fixations.size[0] * height - fixations.size[1] * width) <= max(width, height) + max(fixations.size)
+    check(same, name, f"fixations in a frame with the proportions of {width} × {height}", fixations.size)

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.nn import functional as F
 
-from semfov import InputError
+from semfov import Detector, Eye, Foveation, InputError, foveate
 from semfov.data.fixations import Fixations, read_table
+from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
 from semfov.metrics.scanpath import auc, correlation, nss
 from semfov.paths import GazePrediction
+from semfov.sensor import LogPolar
 from tests.small import rand
 
 
@@ -97,6 +100,51 @@ def test_the_next_fixation_of_viewers_is_the_mean_of_their_densities(gaze):
     torch.testing.assert_close(mean, each.mean(0))
     assert float(mean.sum()) == pytest.approx(1, abs=1e-5)
     torch.testing.assert_close(gaze.given(paths, 90), gaze.cells)
+
+
+def test_the_next_density_is_over_the_pixels(gaze):
+    path = gaze.scanpaths(1, seed=3)[0]
+    density = gaze.next_density(path)
+    assert float(density.sum()) == pytest.approx(1, abs=1e-5)
+    log = gaze.given([path], len(path)).log()
+    over = F.interpolate(log[None, None], (78, 104), mode="bilinear")[0, 0].flatten().softmax(0)
+    torch.testing.assert_close(density.flatten(), over)
+    torch.testing.assert_close(gaze.next_density(path.resized((208, 156))), density)
+    with pytest.raises(InputError, match="scanpath: .* proportions"):
+        gaze.next_density(Fixations("a.png", "1", np.array([[5.0, 5.0]]), (100, 100)))
+
+
+class Colours(Detector):
+    """Its only feature map is the picture itself, in pixels of 2."""
+
+    def propose(self, canvas):
+        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
+
+    def propose_with_features(self, canvas, layers=None):
+        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 2)}
+
+
+def test_what_a_fovea_has_seen_is_known_alone():
+    """After one look, the picture is what the fovea has shown; between two, each half is that of its own look."""
+    torch.manual_seed(0)
+    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
+    model, image = FixationDensity({"backbone8": 3}).eval(), rand(3, 60, 80).float()
+    eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
+    points = np.array([[12.0, 30.0], [68.0, 30.0]])
+
+    def predicted(points):
+        return GazePrediction.of(eye, image, model=model, seen=Fixations("a", "1", points, (80, 60))).terms["map"][0]
+
+    views = [foveate(image[None], torch.from_numpy(each).float(), sigma=8.0, growth=1.0)[0] for each in points]
+    for each, view in zip(points, views, strict=True):
+        torch.testing.assert_close(predicted(each[None]), GazePrediction.of(eye, view, model=model).terms["map"][0])
+    halves = torch.cat([views[0][..., :40], views[1][..., 40:]], -1)
+    torch.testing.assert_close(predicted(points), GazePrediction.of(eye, halves, model=model).terms["map"][0])
+    seen = Fixations("a", "1", points, (80, 60))
+    with pytest.raises(InputError, match="looking: expected an eye"):
+        GazePrediction.of(detector, image, model=model, seen=seen)
+    with pytest.raises(InputError, match="sensor: expected a Foveation"):
+        GazePrediction.of(Eye(LogPolar(8.0), detector), image, model=model, seen=seen)
 
 
 def test_files_hold_what_was_predicted(gaze, tmp_path):
