@@ -519,7 +519,7 @@ class ActivePerception(nn.Module):
             The density of fixations, from which scanpaths are drawn.
 
         Raises:
-            InputError: no model is shipped for the detector, the given one is another's, or a sensor for `seen` bends it.
+            InputError: no model is shipped for the detector, the given one is another's, or the fovea bends it.
             DataError: the file of the picture or of the model cannot be read.
         """
         image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,10 +20,11 @@ from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Maps, Scores, joined
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Maps, Scores, joined
 from semfov.fit.viewing import MapSource, Viewed, ViewingData, covering, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
-from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.io.code import modules_digest
 from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
@@ -80,24 +81,23 @@ def compare_viewing(config: ViewingConfig) -> None:
     drawn: dict[str, list[dict[str, float]]] = {}
     for name, source in made.items():
         opened = source()
-        groups, store = look(config, opened), FoldStore(config.out, {**opened.what, "data": data})
+        groups, store = cache(partial(look, config, opened)), FoldStore(config.out, {**opened.what, "data": data})
         folds = [Fold(groups, number, config.folds) for number in numbers]
         own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
         rows[name] = joined([store.scores(name, fold, own) for fold in _bar(folds, name)])
         if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
             alone = replace(fit, saccade_epochs=0)
-            splits[f"{name}: half of the people, scored by the others"] = _by_people(
-                store, name, groups, alone, config.folds
-            )
             if len(config.fixations) > 1:
                 lone = [Fold(groups, number, config.folds, only=0) for number in numbers]
                 scores = [store.scores(f"{name} first data set", fold, alone) for fold in _bar(lone, "first data set")]
                 splits[f"{name}: the first data set alone"] = joined(scores)
+            splits[f"{name}: half of the people, scored by the others"] = _by_people(
+                store, name, groups, alone, config.folds
+            )
             if config.sequences:
-                drawn |= _sequences(name, groups, [store.model(name, fold, fit) for fold in folds], config)
-    plain = [_without_maps(group) for group in groups]
-    store = FoldStore(config.out, {"data": data})
+                drawn |= _sequences(name, store, folds, config)
+    plain, store = cache(lambda: [_without_maps(group) for group in groups()]), FoldStore(config.out, {"data": data})
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
         folds = [Fold(plain, number, config.folds) for number in numbers]
@@ -146,16 +146,19 @@ def _without_maps(group: Viewed) -> Viewed:
     return Viewed(covering({"none": zeros}, (height, width)), group.people, group.seconds, group.source)
 
 
-def _by_people(store: FoldStore, name: str, groups: Sequence[Viewed], fit: GazeFit, count: int) -> Scores:
+def _by_people(store: FoldStore, name: str, groups: Groups, fit: GazeFit, count: int) -> Scores:
     """Scores by half of the people on held-out pictures, of models that were fitted to the other half."""
-    scored = []
-    for number in range(count):
-        halves = []
-        for part in (0, 1):
-            order = [sorted({p.subject for some in group.people for p in some}, key=_in_order) for group in groups]
-            halves.append([g.by(every[(number + part) % 2 :: 2]) for g, every in zip(groups, order, strict=True)])
-        scored.append(store.scores(f"{name} half of the people", Fold(halves[0], number, count), fit, judges=halves[1]))
-    return joined(scored)
+
+    def half(part: int) -> list[Viewed]:
+        order = [sorted({p.subject for some in group.people for p in some}, key=_in_order) for group in groups()]
+        return [group.by(every[part % 2 :: 2]) for group, every in zip(groups(), order, strict=True)]
+
+    file = f"{name} half of the people"
+    folds = [Fold(cache(partial(half, number)), number, count) for number in range(count)]
+    judges = [partial(half, number + 1) for number in range(count)]
+    return joined(
+        [store.scores(file, fold, fit, judges=by) for fold, by in zip(_bar(folds, file), judges, strict=True)]
+    )
 
 
 def _in_order(subject: str) -> tuple[int, str]:
@@ -219,26 +222,34 @@ SEQUENCES = ("sequence score", "MultiMatch", "ScanMatch", "time delay embedding"
 
 
 def _sequences(
-    name: str, groups: Sequence[Viewed], models: Sequence[FixationDensity], config: ViewingConfig
+    name: str, store: FoldStore, folds: Sequence[Fold], config: ViewingConfig
 ) -> dict[str, list[dict[str, float]]]:
     """Measures of drawn scanpaths and of people against the other people, on held-out pictures of the first data set.
 
     A drawn scanpath has the first fixation and the length of a person's, and is compared with all others' but theirs.
     """
-    group = groups[0]
-    step = max(1, len(group) // config.sequences)
+    number = len(config.people(0))
     rows: dict[str, list[dict[str, float]]] = {name: [], PEOPLE: []}
-    for picture in tqdm(range(0, len(group), step), desc="sequences", unit="picture"):
-        model = models[picture % config.folds]  # the fold that holds it out
-        terms = {"map": maps_of(model, group, [picture])[0], CENTRE: model.centre_bias(group.size)[None]}
-        paths = group.paths[picture]
-        generator = torch.Generator().manual_seed(picture)
-        start = torch.stack([path[0] for path in paths])
-        made = model.sample(terms, group.size, start, max(map(len, paths)), generator)
-        people = [path.double().numpy() for path in paths]
-        drawn = [one[: len(path)].double().numpy() for one, path in zip(made, paths, strict=True)]
-        rows[name].append(beside_others(drawn, people, group.size))
-        rows[PEOPLE].append(beside_others(people, people, group.size))
+    what = {"name": name, "fit": config.fit.plain(), "folds": config.folds, "code": modules_digest(__name__)}
+    for picture in tqdm(range(0, number, max(1, number // config.sequences)), desc="sequences", unit="picture"):
+
+        def measured(picture: int = picture) -> dict[str, Tensor]:
+            fold = folds[picture % config.folds]  # the one that holds it out
+            model = store.model(name, fold, config.fit)
+            places = [(group, place) for group in fold.groups if group.source == 0 for place in range(len(group))]
+            group, place = places[picture]
+            terms = {"map": maps_of(model, group, [place])[0], CENTRE: model.centre_bias(group.size)[None]}
+            paths = group.paths[place]
+            start, longest = torch.stack([path[0] for path in paths]), max(map(len, paths))
+            made = model.sample(terms, group.size, start, longest, torch.Generator().manual_seed(picture))
+            people = [path.double().numpy() for path in paths]
+            drawn = [one[: len(path)].double().numpy() for one, path in zip(made, paths, strict=True)]
+            measures = (beside_others(each, people, group.size) for each in (drawn, people))
+            return {row: torch.tensor([*each.values()]) for row, each in zip(rows, measures, strict=True)}
+
+        kept = store.kept(f"{name} sequences {picture}", {**what, "picture": picture}, measured)
+        for row, several in rows.items():
+            several.append(dict(zip(SEQUENCES, kept[row].tolist(), strict=True)))
     return rows
 
 

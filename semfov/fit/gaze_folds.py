@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,9 @@ Maps = Literal["features", "none", "other people"]
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
 
+Groups = Callable[[], Sequence[Viewed]]
+"""Gives the pictures, by data set and size."""
+
 CENTRE = "centre bias"
 ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
 """Rows by the terms of their models, without and with the scanpath."""
@@ -41,28 +45,47 @@ def _folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int
 class Fold:
     """The pictures of one of `count` folds, which are held out, and the others, to which models are fitted.
 
-    With `only`, models are fitted to one data set, and scored on all.
+    With `only`, models are fitted to one data set, and scored on all. The pictures are looked at when they are needed.
     """
 
-    def __init__(self, groups: Sequence[Viewed], number: int, count: int, only: int | None = None) -> None:
-        self.groups, self.number, self.count, self.only = groups, number, count, only
+    def __init__(self, groups: Groups, number: int, count: int, only: int | None = None) -> None:
+        self._groups, self.number, self.count, self.only = groups, number, count, only
+
+    @property
+    def groups(self) -> Sequence[Viewed]:
+        """The pictures, by data set and size."""
+        return self._groups()
+
+    @cached_property
+    def _split(self) -> list[tuple[list[int], list[int]]]:
+        """For each group the other pictures and those held out."""
         before: dict[int, int] = {}
         split = []
-        for group in groups:
+        for group in self.groups:
             first = before.get(group.source, 0)
-            split.append(_folds(len(group), count, number, first))
+            split.append(_folds(len(group), self.count, self.number, first))
             before[group.source] = first + len(group)
-        self.held = [held for _, held in split]
-        self.fitted = self._of(only, [fitted for fitted, _ in split])
-        self.centres = {
-            source: log_centre(groups, self._of(source, [fitted for fitted, _ in split]))
-            for source in {group.source for group in groups}
-        }
-        """Log density of the centre bias of each data set."""
+        return split
 
-    def _of(self, source: int | None, pictures: Sequence[list[int]]) -> list[list[int]]:
-        pairs = zip(self.groups, pictures, strict=True)
-        return [some if source in (None, group.source) else [] for group, some in pairs]
+    @property
+    def held(self) -> list[list[int]]:
+        """The pictures of each group that are held out."""
+        return [held for _, held in self._split]
+
+    @property
+    def fitted(self) -> list[list[int]]:
+        """The pictures of each group that models are fitted to."""
+        return self._of(self.only)
+
+    @cached_property
+    def centres(self) -> dict[int, Tensor]:
+        """Log density of the centre bias of each data set."""
+        return {source: log_centre(self.groups, self._of(source)) for source in {each.source for each in self.groups}}
+
+    def _of(self, source: int | None) -> list[list[int]]:
+        """The other pictures of each group of one data set, or of all."""
+        pairs = zip(self.groups, self._split, strict=True)
+        return [fitted if source in (None, group.source) else [] for group, (fitted, _) in pairs]
 
     def fit(self, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
         """The model that is fitted to the other pictures; that of given maps has oculomotor biases alone."""
@@ -82,14 +105,14 @@ class Fold:
         return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
 
     def scores(
-        self, model: FixationDensity, fit: GazeFit, maps: Maps = "features", judges: Sequence[Viewed] | None = None
+        self, model: FixationDensity, fit: GazeFit, maps: Maps = "features", judges: Groups | None = None
     ) -> Scores:
         """Scores on the held-out pictures with and without each term, and of the centre bias of each data set.
 
         `judges` are the same pictures viewed by other people, whose fixations are predicted.
         """
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, some in zip(self.groups, judges or self.groups, self.held, strict=True):
+        for group, seen, some in zip(self.groups, (judges or self._groups)(), self.held, strict=True):
             known = maps_of(model, group, some) if maps == "features" else self.given(maps, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
             found = {CENTRE: score(bias, seen, self.given("none", group, some), some, conditional=False)[0]}
@@ -103,7 +126,7 @@ class Fold:
 
 
 class FoldStore:
-    """Models of folds and their scores in a folder, each computed once.
+    """Models of folds, their scores and what else is computed of them in a folder, each computed once.
 
     A change of the data, of the settings or of the program computes them anew.
     """
@@ -114,8 +137,8 @@ class FoldStore:
 
     def model(self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
         """The model of a fold, read or fitted."""
-        key, path = self._place(name, fold, fit, maps)
-        path = path.with_name(f"{path.stem} model.safetensors")
+        file, what = self._place(name, fold, fit, maps)
+        key, path = digest_of({**self.what, **what}), self.folder / f"{file} model.safetensors"
         try:
             model = FixationDensity.from_pretrained(path)
             if model.metadata.get("key") == key:
@@ -128,21 +151,33 @@ class FoldStore:
         return model
 
     def scores(
-        self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features", judges: Sequence[Viewed] | None = None
+        self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features", judges: Groups | None = None
     ) -> Scores:
         """The scores of a fold, read or computed."""
-        key, path = self._place(name, fold, fit, maps)
-        kept = read_tensors(path, key)
-        if kept is None:
+
+        def computed() -> dict[str, Tensor]:
             scores = fold.scores(self.model(name, fold, fit, maps), fit, maps, judges)
-            write_tensors(path, key, {f"{row}/{source}": each for (row, source), each in scores.items()})
-            return scores
+            return {f"{row}/{source}": each for (row, source), each in scores.items()}
+
+        kept = self.kept(*self._place(name, fold, fit, maps), computed)
         return {(row, int(source)): kept[f"{row}/{source}"] for row, source in (key.rsplit("/", 1) for key in kept)}
 
-    def _place(self, name: str, fold: Fold, fit: GazeFit, maps: Maps) -> tuple[str, Path]:
-        what = {"name": name, "fit": fit.plain(), "fold": [fold.number, fold.count, fold.only], "maps": maps}
-        path = self.folder / f"{name} fold {fold.number + 1} of {fold.count}.safetensors"
-        return digest_of({**self.what, **what}), path
+    def kept(
+        self, name: str, what: Mapping[str, object], compute: Callable[[], dict[str, Tensor]]
+    ) -> dict[str, Tensor]:
+        """Tensors that depend on `what`, read from the file of this name, or computed and written."""
+        key, path = digest_of({**self.what, **what}), self.folder / f"{name}.safetensors"
+        kept = read_tensors(path, key)
+        if kept is None:
+            kept = compute()
+            write_tensors(path, key, kept)
+        return kept
+
+    def _place(self, name: str, fold: Fold, fit: GazeFit, maps: Maps) -> tuple[str, dict[str, object]]:
+        """The name of a fold's files, and what they depend on."""
+        what: dict[str, object] = {"name": name, "fit": fit.plain()}
+        what |= {"fold": [fold.number, fold.count, fold.only], "maps": maps}
+        return f"{name} fold {fold.number + 1} of {fold.count}", what
 
 
 def joined(scored: Sequence[Scores]) -> Scores:

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, write_table
 from semfov.detection.detector import Detector
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
@@ -102,12 +102,13 @@ class GazePrediction:
         with torch.no_grad():
             if seen is None:
                 features = detector.features(image[None], [*model.layers])
-            else:
-                check(isinstance(looking, Eye), "looking", "an eye, for what it has seen", type(looking).__name__)
+            elif isinstance(looking, Eye):
                 _check_frame(seen, size, "seen")
                 points = torch.from_numpy(seen.resized(size).points).to(image)
                 views = looking.features(looking.open(image[None]), points, [*model.layers])
                 features = features_so_far(views, points, points[None])
+            else:
+                raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
             terms = model.to(image).terms(features, size[::-1])
         return cls(model.cpu(), {name: each.cpu() for name, each in terms.items()}, size, reduced_copy(image), source)
 

@@ -129,7 +129,7 @@ def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
 def test_people_are_predicted_by_the_others(group):
     """A density of other people predicts better than a centre bias, and is not that of a person's own fixations."""
     fit = GazeFit(saccade_epochs=1)
-    fold = Fold([group], 0, 4)
+    fold = Fold(lambda: [group], 0, 4)
     scored = fold.scores(fold.fit(fit, "other people"), fit, "other people")
     assert _summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
     alone = group.by({"0"})
@@ -141,12 +141,12 @@ def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monke
     assert {each.subject for some in others.people for each in some} == {"3", "4", "5"}
     fit = GazeFit(epochs=2, units=4, saccade_epochs=0)
     store = FoldStore(tmp_path, {"data": "drawn"})
-    fold = Fold([half], 1, 4)
-    first = store.scores("halves", fold, fit, judges=[others])
+    fold = Fold(lambda: [half], 1, 4)
+    first = store.scores("halves", fold, fit, judges=lambda: [others])
     assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
     monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
     monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
-    again = store.scores("halves", fold, fit, judges=[others])
+    again = store.scores("halves", fold, fit, judges=lambda: [others])
     assert all(torch.equal(first[key], again[key]) for key in first)
 
 

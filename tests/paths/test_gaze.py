@@ -110,7 +110,7 @@ def test_the_next_density_is_over_the_pixels(gaze):
     over = F.interpolate(log[None, None], (78, 104), mode="bilinear")[0, 0].flatten().softmax(0)
     torch.testing.assert_close(density.flatten(), over)
     torch.testing.assert_close(gaze.next_density(path.resized((208, 156))), density)
-    with pytest.raises(InputError, match="scanpath: .* proportions"):
+    with pytest.raises(InputError, match=r"scanpath: .* proportions"):
         gaze.next_density(Fixations("a.png", "1", np.array([[5.0, 5.0]]), (100, 100)))
 
 
