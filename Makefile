@@ -2,6 +2,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+GRADIO := build/gradio
+INSTALL := install --quiet --require-hashes --requirement
+LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes --no-annotate \
+	--custom-compile-command "make constraints"
 # The tests of a file stay together: what they share is made once.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
@@ -13,26 +17,28 @@ NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 	$(patsubst %,tests/zoom/test_%.py,belief certainty modules networks survey)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test numeric lab test-all test-quick gpu coverage mutation docs lint types constraints clean
+.PHONY: help setup search test numeric lab app test-all test-quick gpu coverage mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types and the tests of the library"
 	@echo "make lab         the tests of studies, fits for studies, benchmarks and the site"
+	@echo "make app         the page on which to try an agent out, in Chromium"
 	@echo "make test-quick  the tests that take no more than a second each"
 	@echo "make test-all    all of these, with the tests that repeat others at length"
 	@echo "make gpu         on a machine with a GPU: the tests that use one, and a page of benchmarks"
 	@echo "make coverage    the tests, and which lines and branches they reach"
 	@echo "make mutation    change the library's formulas one by one, and list the changes that no test notices (hours)"
 	@echo "make docs        set up, then build the site in build/site"
-	@echo "make constraints write the versions of this environment down as those that are tested"
+	@echo "make constraints write the tested versions anew, after a change of the dependencies"
 	@echo "make clean       remove the environment, the site and run outputs"
 
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/python -m pip $(INSTALL) constraints.txt
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
 search: $(STAMP)
@@ -63,6 +69,18 @@ numeric: $(STAMP)
 lab: $(STAMP)
 	$(PYTEST) -m "lab and not long"
 
+# Gradio needs an older Pillow than the other tests, so it lies in an environment of its own, on top of theirs. Its own
+# warnings are not errors.
+app: $(GRADIO)/.installed
+	$(GRADIO)/bin/python -m pytest -W default -k telephone tests/cli/test_app.py
+
+$(GRADIO)/.installed: $(STAMP) .ci/app.txt
+	$(BIN)/python -m venv $(GRADIO)
+	$(BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))" \
+		>"$$($(GRADIO)/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/tests.pth"
+	$(GRADIO)/bin/python -m pip $(INSTALL) .ci/app.txt
+	@touch $@
+
 test-all: lint types
 	$(PYTEST) -m ""
 
@@ -84,12 +102,18 @@ coverage: $(STAMP)
 
 # Where graphs are traced, mutants cannot be switched. What has been run is kept in mutants/: call it again to go on.
 mutation: $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[mutation]"
+	$(BIN)/python -m pip install --quiet --no-build-isolation --editable ".[mutation]"
 	TORCHDYNAMO_DISABLE=1 OMP_NUM_THREADS=1 $(BIN)/mutmut run
 	$(BIN)/python -m benchmarks.mutation
 
+# For all platforms, with the digests of all files. Versions stay as they are, but for NEWEST=--upgrade.
 constraints: $(STAMP)
-	$(BIN)/python .ci/constraints.py
+	$(BIN)/python -m pip install --quiet uv
+	$(LOCK) $(NEWEST) --extra dev pyproject.toml --output-file constraints.txt
+	cp constraints.txt .ci/app.txt
+	echo gradio | $(LOCK) - --output-file .ci/app.txt
+	cp constraints.txt .ci/build.txt
+	printf "build\nhatchling\n" | $(LOCK) - --output-file .ci/build.txt
 
 clean:
 	rm -rf $(VENV) .cache build dist mutants runs

@@ -20,9 +20,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 RECIPES = dict(
     re.findall(r"^([\w-]+):(.*\n(?:\t.*\n)*)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 )
-PINS = dict(
-    line.split("==") for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines() if line[0] != "#"
-)
+LOCKS = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("constraints.txt", ".ci/app.txt", ".ci/build.txt")}
+PINS = {name: dict(re.findall(r"^([\w.-]+)==([\w.]+)", text, re.MULTILINE)) for name, text in LOCKS.items()}
 
 
 def read(path):
@@ -50,13 +49,31 @@ def test_citation_and_changelog_have_the_version_of_the_package():
     "requirement", sorted({str(each): each for each in required("dev")}.values(), key=str), ids=str
 )
 def test_pins_of_the_tests_are_within_the_bounds_for_users(requirement):
-    assert PINS[canonicalize_name(requirement.name)] in requirement.specifier
+    assert PINS["constraints.txt"][canonicalize_name(requirement.name)] in requirement.specifier
 
 
-def test_make_setup_installs_the_pinned_versions():
+@pytest.mark.parametrize("name", LOCKS)
+def test_each_pinned_version_has_digests_and_no_registry(name):
+    lines = [line for line in LOCKS[name].replace("\\\n", "").splitlines() if line[0] != "#"]
+    pin = r"[\w.-]+==[\w.]+( ; [\w<>='. ()]+)?(\s+--hash=sha256:[0-9a-f]{64})+"
+    assert [line for line in lines if not re.fullmatch(pin, line.strip())] == []
+
+
+def test_what_is_installed_before_tests_and_releases_is_checked_against_digests():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert '--constraint constraints.txt --editable ".[dev]"' in makefile
     assert "$(STAMP): pyproject.toml constraints.txt" in makefile
+    assert {"constraints.txt", ".ci/app.txt"} <= set(re.findall(r"pip \$\(INSTALL\) (.*)", makefile))
+    assert "\nINSTALL := install --quiet --require-hashes --requirement\n" in makefile
+    release = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
+    assert "install --require-hashes --requirement .ci/build.txt && python -m build --no-isolation" in release
+    assert all(PINS[".ci/app.txt"].get(each.name, "6") in each.specifier for each in required("app"))
+
+
+def test_actions_are_pinned_by_commit():
+    for path in (ROOT / ".github/workflows").glob("*.yml"):
+        used = re.findall(r"uses: (.*)", path.read_text(encoding="utf-8"))
+        assert used
+        assert [each for each in used if not re.match(r"[\w./-]+@[0-9a-f]{40} # v", each)] == []
 
 
 def test_the_oldest_versions_are_the_lower_bounds():
