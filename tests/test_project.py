@@ -20,7 +20,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 RECIPES = dict(
     re.findall(r"^([\w-]+):(.*\n(?:\t.*\n)*)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 )
-LOCKS = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("constraints.txt", ".ci/app.txt", ".ci/build.txt")}
+LOCKS = {
+    name: (ROOT / name).read_text(encoding="utf-8") for name in ("constraints.txt", ".ci/app.txt", ".ci/build.txt")
+}
 PINS = {name: dict(re.findall(r"^([\w.-]+)==([\w.]+)", text, re.MULTILINE)) for name, text in LOCKS.items()}
 
 
@@ -55,7 +57,7 @@ def test_pins_of_the_tests_are_within_the_bounds_for_users(requirement):
 @pytest.mark.parametrize("name", LOCKS)
 def test_each_pinned_version_has_digests_and_no_registry(name):
     lines = [line for line in LOCKS[name].replace("\\\n", "").splitlines() if line[0] != "#"]
-    pin = r"[\w.-]+==[\w.]+( ; [\w<>='. ()]+)?(\s+--hash=sha256:[0-9a-f]{64})+"
+    pin = r"[\w.-]+==[\w.]+( ; [\w<>=!'. ()]+)?(\s+--hash=sha256:[0-9a-f]{64})+"
     assert [line for line in lines if not re.fullmatch(pin, line.strip())] == []
 
 

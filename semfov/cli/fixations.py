@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
-from semfov.data.fixations.reading import frame_of, json_reader
-from semfov.errors import InputError, SemfovError, check, printable
+from semfov.data.fixations.reading import PictureSizes, frame_of, json_reader
+from semfov.errors import DataError, InputError, SemfovError, check, printable
 
 
 def check_fixations(options: CheckOptions) -> int:
@@ -19,13 +20,15 @@ def check_fixations(options: CheckOptions) -> int:
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
     given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
     given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
+    folder = Path(given.pop("picture")) if "picture" in given and Path(given["picture"]).is_dir() else None
+    sizes = None if folder is None else PictureSizes(folder)
     wrong = False
     for name in options.files:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of what the lines below say
-                records = read_fixations(Path(name), **given)
-            lines = suspicions(records)
+                records = _records(Path(name), given, sizes)
+            lines = suspicions(records, sizes)
         except TypeError:
             raise InputError(f"picture: expected a file whose reader takes {', '.join(given)}, got {name}") from None
         except SemfovError as error:
@@ -34,12 +37,22 @@ def check_fixations(options: CheckOptions) -> int:
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
             continue
-        kind = json_reader(Path(name))[0] if name.lower().endswith(".json") else None
+        kind = json_reader(name)[0] if name.lower().endswith(".json") else None
         usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
         print(f"{printable(name)}: {_content(records, usual)}")
         print(*(f"  suspicious: {line}" for line in lines), sep="\n") if lines else print("  nothing is suspicious")
         wrong = wrong or bool(lines)
     return 1 if wrong else 0
+
+
+def _records(path: Path, given: Mapping[str, Any], sizes: PictureSizes | None) -> list[Fixations]:
+    """The records of a file; where it has no frames, they are the pictures."""
+    try:
+        return read_fixations(path, **given)
+    except DataError as error:
+        if sizes is None or "size" in given or "give size=" not in str(error):
+            raise
+        return read_fixations(path, **given, size=sizes)
 
 
 def _content(records: list[Fixations], usual: str) -> str:

@@ -272,7 +272,8 @@ class CheckOptions(Settings):
     Args:
         files: tables, ASC files of EyeLink, or JSON files of fixations.
         size: width and height of the frame, `1920,1080`, where the file has none.
-        picture: name of the picture, where the file has none.
+        picture: name of the picture, where the file has none; or the folder of the pictures that it names, whose sizes
+            are compared with the frames, and are the frames where the file has none.
         subject: name of the person, where the file has none.
         quiet: print errors alone; the exit code tells whether anything is suspicious.
     """

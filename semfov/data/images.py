@@ -165,8 +165,6 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
             bits = tags.get(258, (1,))
             if 2 in tags.get(339, ()) and max(bits) == 8:  # Pillow would read -1 as 255
                 raise DataError(f"image {Path(path)}: expected 8 bits without a sign, got some with one; convert it")
-            if 2 in tags.get(339, ()) and max(bits) == 8:  # Pillow would read -1 as 255
-                raise DataError(f"image {Path(path)}: expected 8 bits without a sign, got some with one; convert it")
             size = math.prod(side) * max(tags.get(277, 1), len(bits)) * max(bits) // 8
             for count in tags.get(325 if 322 in tags else 279, ()):
                 check_tile(size, count, f"image {Path(path)}")

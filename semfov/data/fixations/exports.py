@@ -80,10 +80,10 @@ _EXPORTS = (
             ("image", "imagename", "picture"), ("recordingsessionlabel", "datafile"), ("trialindex", "triallabel")),
 )  # fmt: skip
 
-_OURS = ("picture", "subject", "target", "trial")
+OURS = ("picture", "subject", "target", "trial")
 _GONE = ("", ".", "nan", "none", "null", "na")  # lost, or not a number
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
-"""Sides of eyes by the first of these words in a field, which may be a number of ioHub (`EyeTrackerConstants`)."""
+"""Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
 
 
 def read_export(
@@ -137,7 +137,7 @@ def read_export(
     """
     named = dict(columns or {})
     for name in named:
-        lookup(name, _OURS, "column")
+        lookup(name, OURS, "column")
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     where, header, rows = of_source(source)
     by_key = {_key(name): name for name in reversed(header)}
@@ -159,7 +159,7 @@ def read_export(
             continue
         line |= {name: given for name, given in default.items() if given is not None}
         line["subject"] = line["subject"] or (Path(where).stem if len(header) and "." in where else "1")
-        who = tuple(line[name] for name in _OURS)
+        who = tuple(line[name] for name in OURS)
         viewing, before = viewing + (who != before), who
         line["trial"] = f"{line['trial']} {viewing}"
         key = line.pop("number") or None

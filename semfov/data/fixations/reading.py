@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.data.fixations.exports import is_export, read_export
+from semfov.data.fixations.exports import OURS, is_export, read_export
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import of_source, read_table
+from semfov.data.large import picture_size
+from semfov.data.sources import picture_files
 from semfov.errors import DataError, InputError, check
 from semfov.io.files import check_regular, read_text
 
@@ -22,7 +24,7 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
 
     Files `.asc` are those of EyeLink (`read_eyelink`), files `.json` those of COCO-Search18, OSIE, or Ruarte and
     others. Other files are tables, as this library writes them (`read_table`) or as the programs of eye trackers export
-    them (`read_export`), which the columns tell.
+    them (`read_export`), which the columns tell, unless `columns` names those of the points.
 
     Args:
         source: the file or table.
@@ -46,7 +48,7 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     if kind == ".asc":
         return read_eyelink(source, **options)
     if kind == ".json":
-        name, reader = json_reader(Path(source))
+        name, reader = json_reader(source)
         if "size" in options and reader is not read_osie:
             has = f"none for {source}, a file of {name}, whose frame is that of each trial"
             check(reader is read_cocosearch, "size", has, options["size"])
@@ -56,21 +58,55 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
         except DataError as error:
             raise DataError(f"{error}; it was read as a file of {name}") from None
     _, header, _ = of_source(source)
-    ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or "columns" in options
+    ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header}
+    ours = ours or not {*(options.get("columns") or ())} <= {*OURS}
     return read_export(source, **options) if is_export(header) and not ours else read_table(source, **options)
 
 
-def json_reader(path: Path) -> tuple[str, Callable[..., list[Fixations]]]:
-    """The data set that a file of JSON has the form of, and its reader."""
+_BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
+"""How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""
+
+
+def json_reader(path: str | PathLike[str]) -> tuple[str, Callable[..., list[Fixations]]]:
+    """The data set that a file of JSON has the form of, as it begins, and its reader."""
     check_regular(path)
     try:
-        content = json.loads(read_text(path))
-    except (OSError, ValueError, RecursionError) as error:
+        begins = _BEGINNING.match(read_text(path))
+    except (OSError, UnicodeError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
-    if isinstance(content, list):
+    if begins is None:
+        raise DataError(f"{path}: expected JSON, a list or an object, got other text; correct or replace the file")
+    trials, people = begins.groups()
+    if trials:
         return "COCO-Search18", read_cocosearch
-    people = isinstance(content, dict) and any(isinstance(each, list) for each in content.values())
     return ("OSIE", read_osie) if people else ("Ruarte and others", read_ruarte)
+
+
+class PictureSizes(Mapping[str, tuple[int, int]]):
+    """`(width, height)` of the pictures in a folder, by names as tables have them: with any path, and any ending."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files: dict[str, Path] = {}
+        for path in picture_files(folder, recursive=True):
+            for name in (path.stem, path.name, path.relative_to(folder).as_posix()):
+                self._files[name.lower()] = path
+        self._sizes: dict[Path, tuple[int, int]] = {}
+
+    def __getitem__(self, name: str) -> tuple[int, int]:
+        whole = name.lower().replace("\\", "/")
+        last = whole.rpartition("/")[2]
+        path = next((self._files[each] for each in (whole, last, Path(last).stem) if each in self._files), None)
+        if path is None:
+            raise KeyError(name)
+        if path not in self._sizes:
+            self._sizes[path] = picture_size(path)
+        return self._sizes[path]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
 
 def frame_of(text: str) -> tuple[int, int]:

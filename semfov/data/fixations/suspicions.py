@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 
 import numpy as np
@@ -20,14 +20,15 @@ _FAR = 0.5
 _MANY = 20  # fixations from which on shares tell something
 _BAR, _LEVEL = 0.06, 0.03  # shares of a side that is empty where a picture was letterboxed, and where it was not
 _MOST_OUTSIDE, _MOST_REPEATED, _MOST_ALIKE, _MOST_SHORT = 0.1, 0.02, 0.02, 0.1  # shares of the fixations
+STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 _SHORT, _LONG = 50.0, 5000.0  # milliseconds
 
 
-def suspicions(fixations: Sequence[Fixations]) -> list[str]:
+def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]] | None = None) -> list[str]:
     """What is suspicious in fixations, in plain lines; none where nothing is.
 
     - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
-      or many outside it.
+      or many outside it; with `sizes`, frames of other proportions than those of their pictures.
     - A letterbox: bars at two opposite sides without fixations, while the others reach the border.
     - Points that repeat the one before, records that occur twice, and many fixations at one same point, such as what
       a tracker writes during a blink.
@@ -36,6 +37,7 @@ def suspicions(fixations: Sequence[Fixations]) -> list[str]:
 
     Args:
         fixations: the records.
+        sizes: `(width, height)` of the pictures by their names.
 
     Returns:
         The lines.
@@ -55,6 +57,8 @@ def suspicions(fixations: Sequence[Fixations]) -> list[str]:
         found.append(f"{outside.mean():.0%} of the fixations lie outside their frame (check its size and the origin)")
     if looks is None:
         found += _letterbox(points, sides)
+    if sizes is not None:
+        found += _pictures(records, sizes)
     return [*found, *_repeats(records, points), *_durations(records)]
 
 
@@ -102,6 +106,23 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
             width = f"{min(bars):.0%} of the frame at the {name}"
             return [f"no {places} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
+
+
+def _pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Pictures that are not there, and those whose proportions are not those of the frame."""
+    frames = {(each.picture, each.size) for each in records}
+    unknown = sorted({picture for picture, _ in frames if picture not in sizes})
+    number = len({each.picture for each in records})
+    found = [f"{len(unknown)} of {number} pictures are not there, such as {unknown[0]}"] if unknown else []
+    known = sorted((picture, size, sizes[picture]) for picture, size in frames if picture in sizes)
+    other = [each for each in known if abs(each[1][0] * each[2][1] / (each[1][1] * each[2][0]) - 1) > STRETCH]
+    if other:
+        (name, (width, height), (across, down)), count = other[0], len({each[0] for each in other})
+        found.append(
+            f"{count} of {number} pictures have other proportions than their frames, such as {name}, {across} × {down} "
+            f"in {width} × {height}: was it letterboxed on a screen? (Fixations.in_picture)"
+        )
+    return found
 
 
 def _repeats(records: Sequence[Fixations], points: _Array) -> list[str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semfov.data.fixations.reading import read_fixations
 from semfov.data.fixations.record import Fixations, FixationValues
-from semfov.data.fixations.suspicions import warn_outside
+from semfov.data.fixations.suspicions import STRETCH, warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.conditional import auc, nss
@@ -24,7 +24,6 @@ from semfov.paths import GazeRecord
 
 _CELLS = 8
 _LONGEST = 64
-_STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 
 _Measure = Callable[[FixationValues, Sequence[FixationValues]], float]
 
@@ -119,7 +118,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
         stretch = (each.size[0] * size[1]) / (each.size[1] * size[0])
         got = f"{each.size[0]} × {each.size[1]} of {each.subject!r}"
         expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
-        check(abs(stretch - 1) <= _STRETCH, "people", expected, got)
+        check(abs(stretch - 1) <= STRETCH, "people", expected, got)
     records = [each.resized(size) for each in (ours, *people)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
+from semfov.errors import DataError
 
 SIZE = (800, 600)
 
@@ -106,6 +108,39 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
         assert "frames of 1024 × 768; " in capsys.readouterr().out
 
 
+def test_pictures_of_a_folder_are_compared_with_the_frames_by_their_names(tmp_path, capsys):
+    (tmp_path / "viewed" / "more").mkdir(parents=True)
+    for name, size in (("a.png", (800, 600)), ("B.PNG", (640, 480)), ("more/c.png", (400, 600))):
+        Image.new("L", size).save(tmp_path / "viewed" / name)
+    records = people(3)
+    table, command = tmp_path / "t.csv", ["check", str(tmp_path / "t.csv"), "--picture", str(tmp_path / "viewed")]
+    write_table(table, [replace(one, picture=name) for one, name in zip(records, ("a.png", "b", "x\\a"), strict=True)])
+    assert main(command) == 0  # of the same proportions, whatever their size
+    write_table(table, [replace(one, picture=name) for one, name in zip(records, ("a", "C:/c.jpg", "d"), strict=True)])
+    assert main(command) == 1
+    shown = capsys.readouterr().out
+    assert "1 of 3 pictures are not there, such as d\n" in shown
+    assert "1 of 3 pictures have other proportions than their frames, such as C:/c.jpg, 400 × 600 in 800 × 600" in shown
+    # Without a frame in the table, the pictures are the frames.
+    table.write_text("picture,subject,x,y\nb,1,600,400\nc,1,390,590\n")
+    assert main(command) == 0
+    assert "frames of 400 × 600, 640 × 480" in capsys.readouterr().out
+
+
+def test_columns_of_an_export_are_taken_with_its_units(tmp_path):
+    path = tmp_path / "report.csv"
+    path.write_text(
+        "CURRENT_FIX_X,CURRENT_FIX_Y,CURRENT_FIX_DURATION,stimulus,who\n40,.,200,a.jpg,7\n40,30,250,a.jpg,7\n"
+    )
+    names = {"picture": "stimulus", "subject": "who"}
+    (record,) = read_fixations(path, columns=names, size=(80, 60))
+    assert (record.picture, record.subject, record.durations.tolist()) == ("a.jpg", "7", [250])
+    path.write_text(path.read_text().replace("40,.,200,a.jpg,7\n", ""))
+    named = {**names, "x": "CURRENT_FIX_X", "y": "CURRENT_FIX_Y"}
+    (record,) = read_fixations(path, columns=named, size=(80, 60))
+    assert (record.points.tolist(), record.durations) == ([[40, 30]], None)
+
+
 def test_a_file_tells_its_reader(tmp_path):
     records = people(3)
     write_table(tmp_path / "a.csv", records)
@@ -116,3 +151,10 @@ def test_a_file_tells_its_reader(tmp_path):
         read = read_fixations(tmp_path / name)
         assert all(np.allclose(one.points, other.points) for one, other in zip(read, records, strict=True))
     assert read_fixations(tmp_path / "d.asc")[0].points.tolist() == [[5.5, 3.5]]
+    for text, said in (
+        ("3", "expected JSON, a list or an object"),
+        ('{"a": [', "as JSON.*it was read as a file of OSIE"),
+    ):
+        (tmp_path / "e.json").write_text(text)
+        with pytest.raises(DataError, match=said):
+            read_fixations(tmp_path / "e.json")

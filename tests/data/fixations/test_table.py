@@ -25,6 +25,10 @@ def test_tables_of_spreadsheets(tmp_path, encoding, separator, end):
     text = TABLE.replace(",", separator).replace("\n", end)
     (tmp_path / "t.csv").write_bytes(text.encode(encoding))
     assert points_of(read_table(tmp_path / "t.csv")) == POINTS
+    other = text.replace("a.jpg", "一.jpg").replace("picture", "一张照片")  # its first byte is 0 in some encodings
+    (tmp_path / "t.csv").write_bytes(other.encode(encoding))
+    records = read_table(tmp_path / "t.csv", columns={"picture": "一张照片"})
+    assert (records[0].picture, points_of(records)) == ("一.jpg", POINTS)
     if separator != ",":
         (tmp_path / "t.csv").write_bytes(text.replace(".5", ",5").replace(".25", ",25").encode(encoding))
         records = read_table(tmp_path / "t.csv")
