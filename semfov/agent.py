@@ -27,7 +27,7 @@ from semfov.data.windowed import ChosenBands
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, check, check_number, check_options, check_whole, lookup
+from semfov.errors import InputError, check, check_number, check_options, check_whole, checked_keywords, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -271,6 +271,7 @@ class ActivePerception(nn.Module):
         known = not foveal and self.windows is not None and self.windows.photograph is not None
         return open_picture(picture).kind(how, self.eye.detector.input_size, every=every, photographs=known)
 
+    @checked_keywords
     def search(
         self,
         picture: PictureLike,
@@ -341,8 +342,7 @@ class ActivePerception(nn.Module):
             The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
 
         Raises:
-            InputError: the class is unknown (the message suggests the nearest names), or an argument does not fit the
-                kind of look.
+            InputError: the class is unknown (nearest names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
         check_thresholds(confirm, give_up)
@@ -369,6 +369,7 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.search(opened.large, targets[0], **without_none(closer=closer), **arguments)
 
+    @checked_keywords
     def find_all(
         self,
         picture: PictureLike,
@@ -412,8 +413,7 @@ class ActivePerception(nn.Module):
             The record with its objects: a `ZoomPath`, a `Scanpath` or a `HeadPath`.
 
         Raises:
-            InputError: a class is unknown (the message suggests the nearest names), or an argument does not fit the
-                kind of look.
+            InputError: a class is unknown (nearest names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
@@ -431,6 +431,7 @@ class ActivePerception(nn.Module):
         aim = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
 
+    @checked_keywords
     def explore(
         self,
         picture: PictureLike,
@@ -494,6 +495,7 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
+    @checked_keywords
     def gaze(
         self,
         picture: PictureLike,
@@ -509,7 +511,7 @@ class ActivePerception(nn.Module):
         Args:
             picture: a photograph, as for `search`.
             model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
-            seen: fixations; the prediction then knows only what the agent's fovea has shown at them, a pass for each
+            seen: fixations, a pass for each; the prediction then knows only what the agent's fovea has shown at them
                 (`semfov.saliency.features_so_far`). None for the sharp picture.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
@@ -526,6 +528,7 @@ class ActivePerception(nn.Module):
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
         return GazePrediction.of(self.eye, image, model=model, source=source, seen=seen)
 
+    @checked_keywords
     def live(
         self,
         target: _Targets = None,
@@ -547,15 +550,13 @@ class ActivePerception(nn.Module):
         Args:
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
             how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
-            rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1 for a fovea and 0.03 for
-                windows (`semfov.agents.FoveaEpisode`, `semfov.agents.WindowEpisode`).
+            rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1, and 0.03 for windows.
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
-            give_up: probability below which a look is not worth a frame; None takes that of the belief alone, which a
-                belief that fades can reach, or with rate 0 that of `search`.
-            closer: largest number of closer looks, 0 to 100, in the time until half of the evidence is forgotten
-                (ln 2 / rate frames); None takes 2 for a fovea, and 100 for windows.
+            give_up: probability below which a look is not worth a frame; None takes that of the belief alone, as a
+                belief that fades can reach it, or with rate 0 that of `search`.
+            closer: largest number of closer looks, 0 to 100, in ln 2 / rate frames; None takes 2, and 100 for windows.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.
 

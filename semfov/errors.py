@@ -2,10 +2,12 @@
 
 import math
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from functools import wraps
+from inspect import signature
 from numbers import Integral, Real
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,6 +15,22 @@ from torch import Tensor
 _ROUNDING = 1e-3
 
 _Name = TypeVar("_Name", bound=str)
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+
+_SCORES = ("conf", "confidence", "min_score", "score", "score_threshold", "threshold")
+_OTHER_WORDS = {
+    "grid": ("cells", "columns", "rows"),
+    "picture": ("file", "image", "img", "path", "photo", "source"),
+    "target": ("class_name", "classes", "cls", "label", "labels", "name", "query", "targets", "what"),
+    "passes": ("budget", "glimpses", "iterations", "looks", "max_passes", "max_steps", "n", "steps"),
+    "shifts": ("fixations", "max_fixations", "n_fixations", "num_fixations", "saccades"),
+    "seconds": ("max_seconds", "time", "time_limit", "timeout"),
+    "on_look": ("callback", "on_step"),
+    "least": _SCORES,
+    "confirm": _SCORES,
+}
+"""What others, and other libraries, call an option."""
 
 
 def printable(text: str) -> str:
@@ -261,7 +279,18 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
-            cells = name in ("columns", "rows", "cells") and "grid" in names
-            near = ["grid"] if cells else get_close_matches(name, names, n=3)
-            hint = f"; did you mean {' or '.join(f'{each}=' for each in near)}?" if near else ""
-            raise InputError(f"{name}: expected an option of {what}, got an unknown one{hint}")
+            near = [each for each in names if name in _OTHER_WORDS.get(each, ())] or get_close_matches(name, names)
+            hint = f"did you mean {' or '.join(f'{each}=' for each in near)}?" if near else f"known: {', '.join(names)}"
+            raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
+
+
+def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """A method that refuses keywords that it does not have with the nearest ones, where Python names none."""
+    known = [*signature(function).parameters][1:]
+
+    @wraps(function)
+    def call(*given: _Given.args, **options: _Given.kwargs) -> _Result:
+        check_options(options, known, function.__name__)
+        return function(*given, **options)
+
+    return call

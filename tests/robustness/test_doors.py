@@ -294,6 +294,22 @@ def test_invalid_arguments_of_a_search_are_refused_by_name(name, value, agent):
 
 
 @pytest.mark.parametrize(
+    ("method", "name", "remedy"),
+    [
+        ("search", "pases", "did you mean passes="),
+        ("search", "conf", "did you mean confirm="),
+        ("find_all", "threshold", "did you mean least="),
+        ("explore", "max_steps", "did you mean passes="),
+        ("live", "colour", "did you mean color="),
+        ("gaze", "degrees", "known: picture, model, color, white, bands"),
+    ],
+)
+def test_unknown_keywords_are_refused_with_the_near_ones(method, name, remedy, agent):
+    with pytest.raises(SemfovError, match=f"^{name}: expected an option of {method}, got an unknown one; {remedy}"):
+        getattr(agent, method)(PIXELS, "cup", **{name: 1})
+
+
+@pytest.mark.parametrize(
     ("call", "message"),
     [
         (
