@@ -195,7 +195,7 @@ class ActivePerception(nn.Module):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *given: Any, **options: Any) -> Self:
         """The agent with the parts that a function makes from the options of a constructor, ready for use."""
-        known = [*signature(make).parameters, *loader_options()]
+        known = [each for each in (*signature(make).parameters, *loader_options()) if each != "options"]
         check_options(options, known, "the agent or of semfov.load_detector")
         return cls(**make(*given, **options)).eval().requires_grad_(False)
 

@@ -350,7 +350,7 @@ def test_invalid_grids_are_refused(grid):
         (ActivePerception.recommended, {"columns": 12}, r"columns: expected an option of .*; did you mean grid=\?$"),
         (ActivePerception.from_pretrained, {"sigmas": 50.0}, r"sigmas: .*; did you mean sigma=\?$"),
         (ActivePerception.published, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
-        (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one$"),
+        (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one; known: name, sensor,"),
         (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
         (

@@ -39,7 +39,7 @@ def test_unknown_names_are_refused_with_the_known_ones(name):
     ("model", "options", "refused"),
     [
         ("yolov3-tiny", {"treshold": 0.1}, "treshold: .* for yolov3-tiny.*; did you mean threshold="),
-        ("yolov3-tiny", {"processor": {}}, "processor: .* for yolov3-tiny, got an unknown one$"),
+        ("yolov3-tiny", {"processor": {}}, "processor: .* for yolov3-tiny, got an unknown one; known: weights"),
         ("yolox-nano", {"runtime": "torch"}, "runtime: .* for yolox-nano"),
         ("mine.onnx", {"inputsize": 320}, "inputsize: .* for mine.onnx, .*; did you mean input_size="),
         ("torchvision:ssd300_vgg16", {"revision": "main"}, "revision: .* for torchvision:ssd300_vgg16"),
