@@ -342,7 +342,7 @@ class ActivePerception(nn.Module):
             The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
 
         Raises:
-            InputError: the class is unknown (nearest names are suggested), or an argument does not fit the kind of look.
+            InputError: the class is unknown (near names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
         check_thresholds(confirm, give_up)

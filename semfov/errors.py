@@ -256,7 +256,7 @@ def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
     names = list(known)
     if name in names:
         return names[names.index(name)]
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    near = get_close_matches(str(name), names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names)}"
     raise InputError(f"unknown {what} {name!r}; {hint}")
 

@@ -12,7 +12,7 @@ import numpy as np
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
 from semfov.data.fixations.reading import PictureSizes, frame_of, json_reader
-from semfov.errors import DataError, InputError, SemfovError, check, printable
+from semfov.errors import DataError, SemfovError, check, printable
 
 
 def check_fixations(options: CheckOptions) -> int:
@@ -29,8 +29,6 @@ def check_fixations(options: CheckOptions) -> int:
                 warnings.simplefilter("ignore")  # of what the lines below say
                 records = _records(Path(name), given, sizes)
             lines = suspicions(records, sizes)
-        except TypeError:
-            raise InputError(f"picture: expected a file whose reader takes {', '.join(given)}, got {name}") from None
         except SemfovError as error:
             if len(options.files) == 1:
                 raise

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import Line, Origin, Size, Units, of_source, records_of
-from semfov.errors import DataError, check, lookup
+from semfov.data.fixations.table import Line, Origin, Size, Units, named_columns, of_source, records_of
+from semfov.errors import DataError, check
 
 
 class _Export(NamedTuple):
@@ -135,9 +135,7 @@ def read_export(
     >>> record.subject, record.points.tolist(), record.durations.tolist()
     ('ann', [[639.5, 179.5]], [240.0])
     """
-    named = dict(columns or {})
-    for name in named:
-        lookup(name, OURS, "column")
+    named = named_columns(columns, OURS)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     where, header, rows = of_source(source)
     by_key = {_key(name): name for name in reversed(header)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from inspect import signature
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import of_source, read_table
 from semfov.data.large import picture_size
 from semfov.data.sources import picture_files
-from semfov.errors import DataError, InputError, check
+from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import check_regular, read_text
 
 
@@ -46,7 +47,7 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     """
     kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
     if kind == ".asc":
-        return read_eyelink(source, **options)
+        return _read(read_eyelink, source, options)
     if kind == ".json":
         name, reader = json_reader(source)
         if "size" in options and reader is not read_osie:
@@ -54,13 +55,22 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
             check(reader is read_cocosearch, "size", has, options["size"])
             options = {"screen": options["size"], **{key: each for key, each in options.items() if key != "size"}}
         try:
-            return reader(source, **options)
+            return _read(reader, source, options)
         except DataError as error:
             raise DataError(f"{error}; it was read as a file of {name}") from None
     _, header, _ = of_source(source)
     ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header}
     ours = ours or not {*(options.get("columns") or ())} <= {*OURS}
-    return read_export(source, **options) if is_export(header) and not ours else read_table(source, **options)
+    return _read(read_export if is_export(header) and not ours else read_table, source, options)
+
+
+def _read(reader: Callable[..., list[Fixations]], source: Any, options: dict[str, Any]) -> list[Fixations]:
+    """The records that a reader gives, if it has these options."""
+    known = [*signature(reader).parameters][1:]
+    check_options(
+        options, known, f"{reader.__name__}, which reads {source if isinstance(source, str | PathLike) else 'it'}"
+    )
+    return reader(source, **options)
 
 
 _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')

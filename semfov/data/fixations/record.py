@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.errors import check
+from semfov.errors import InputError, check
 
 _Array = NDArray[np.float64]
 _Size = tuple[int, int]
@@ -35,7 +37,7 @@ class Letterbox:
     def __post_init__(self) -> None:
         """Check the sizes."""
         for name, size in (("screen", self.screen), ("picture", self.picture)):
-            check(min(size) > 0, name, "a width and a height above 0", size)
+            _check_size(name, size)
 
     @property
     def scale(self) -> float:
@@ -94,6 +96,24 @@ class Letterbox:
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
+def _check_size(name: str, size: Any) -> None:
+    fits = isinstance(size, tuple | list | np.ndarray) and len(size) == 2
+    check(
+        fits and all(isinstance(side, Real) and 0 < float(side) < np.inf for side in size),
+        name,
+        "a width and a height above 0",
+        size,
+    )
+
+
+def _array(name: str, values: Any) -> _Array:
+    """Numbers of any kind as doubles."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{name}: expected numbers, got {type(values).__name__}") from None
+
+
 def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
     """Convert points to pixels of the same frame at another size.
 
@@ -146,11 +166,14 @@ class Fixations:
     found: bool | None = None
 
     def __post_init__(self) -> None:
-        """Check that the arrays belong together."""
+        """Check that the arrays belong together; lists and tensors become arrays."""
+        for name in ("points", "durations"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _array(name, value))
         shape = self.points.shape
         check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
         check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
-        check(min(self.size) > 0, "size", "a width and a height above 0", self.size)
+        _check_size("size", self.size)
         if self.durations is not None:
             check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
             lasting = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())

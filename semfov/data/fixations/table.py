@@ -73,8 +73,8 @@ def read_table(
     two viewings of a picture by one person apart, and with it the lines of scanpaths may alternate. Without it the
     lines of a scanpath must follow each other.
 
-    Fields are separated by commas, semicolons or tabs, and numbers may have a decimal comma in the last two, as
-    spreadsheets write them.
+    Fields are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma in all but the first,
+    as spreadsheets write them.
 
     Args:
         source: the file, or a `pandas.DataFrame`.
@@ -100,9 +100,7 @@ def read_table(
     """
     lookup(units, get_args(Units), "unit")
     lookup(origin, get_args(Origin), "origin")
-    named = dict(columns or {})
-    for name in named:
-        lookup(name, (*_COLUMNS, *_SIZE, *_MORE), "column")
+    named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     where, header, rows = of_source(source)
     by_lower = {name.lower(): name for name in reversed(header)}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
@@ -126,19 +124,28 @@ def records_of(where: str, lines: Sequence[Line], size: Size | None, units: Unit
     return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
 
 
+def named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
+    """The names of columns in a source by ours, of which some are known."""
+    fits = columns is None or (isinstance(columns, Mapping) and all(isinstance(each, str) for each in columns.values()))
+    check(fits, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
+    return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
+
+
 def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
     """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
     frame = hasattr(source, "to_dict") and hasattr(source, "columns")
     if not frame and not isinstance(source, str | PathLike):
         expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
         raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
+    where = "the table" if frame else str(source)
     header, rows = _of_frame(source) if frame else _of_file(Path(source))
-    return "the table" if frame else str(source), header, rows
+    return where, header, rows
 
 
 def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     """Names of the columns of a `pandas.DataFrame`, and its rows as text; missing values are empty."""
     header = [str(name) for name in frame.columns]
+    _check_different("the table", header)
     rows = []
     for number, row in enumerate(frame.itertuples(index=False, name=None)):
         # A column of whole numbers in which one is missing is one of floats.
@@ -159,16 +166,14 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
         before = _BEFORE.match(text)
         text = text[before.end() :] if before else text
         first = text.partition("\n")[0]
-        separator = max(",;\t", key=first.count)
+        separator = max(",;\t|", key=first.count)
         table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         lines = [(f"line {table.line_num}", line) for line in table]
     except (OSError, UnicodeError, csv.Error) as error:
         remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
         raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
     header = [(name or "").strip() for name in table.fieldnames or ()]
-    again = sorted({name for name in header if header.count(name) > 1 and name})
-    if again:
-        raise DataError(f"{path}: expected columns of different names, got several named {', '.join(again)}")
+    _check_different(str(path), header)
     rows = []
     for place, line in lines:
         if None in line:
@@ -180,6 +185,12 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
             values = [value.replace(",", ".") if _is_decimal(value) else value for value in values]
         rows.append((place, dict(zip(header, values, strict=True))))
     return header, rows
+
+
+def _check_different(where: str, header: Sequence[str]) -> None:
+    again = sorted({name for name in header if header.count(name) > 1 and name})
+    if again:
+        raise DataError(f"{where}: expected columns of different names, got several named {', '.join(again)}")
 
 
 def _is_decimal(text: str) -> bool:
@@ -292,6 +303,7 @@ def _frame(where: str, place: str, line: Mapping[str, str], size: Size | None) -
         check(line["picture"] in size, "size", f"a size of {line['picture']!r}", "none")
         sides = [*size[line["picture"]]]
     else:
+        check(isinstance(size, tuple | list | np.ndarray), "size", "(width, height) in pixels", size)
         sides = [*size]
     whole = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
     if not whole:

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas
 import pytest
+import torch
 
 from semfov.data.fixations import Fixations, read_cocosearch, read_fixations, read_table, write_table
 from semfov.errors import DataError, InputError
@@ -18,7 +19,7 @@ def points_of(records):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32-be"])
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_tables_of_spreadsheets(tmp_path, encoding, separator, end):
     """With a byte order mark, semicolons or tabs, and decimal commas where these do not separate."""
@@ -221,3 +222,42 @@ def test_people_of_a_column_of_floats_have_whole_numbers():
     fixed = {"x": 1, "y": 2, "width": 80, "height": 60}
     people = pandas.DataFrame({"picture": ["a", "b"], "subject": [7.0, None], **fixed})
     assert [each.subject for each in read_table(people)] == ["7", ""]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"columns": ["picture"]}, "^columns: expected names of the source by ours"),
+        ({"columns": {"x": 2}}, "^columns: expected names of the source by ours"),
+        ({"size": "80x60"}, r"^size: expected \(width, height\)"),
+        ({"size": 80}, r"^size: expected \(width, height\)"),
+        ({"units": None}, "^unknown unit None; known: pixels, fractions"),
+        ({"sizes": {}}, "^sizes: expected an option of read_table, .* did you mean size="),
+        ({"picture": "a.jpg"}, "^picture: expected an option of read_table, .* known: columns, size, units, origin"),
+    ],
+)
+def test_arguments_of_other_kinds_are_refused_by_name(tmp_path, given, said):
+    (tmp_path / "t.csv").write_text(TABLE)
+    with pytest.raises(InputError, match=said):
+        read_fixations(tmp_path / "t.csv", **given)
+
+
+def test_columns_of_one_name_are_refused_in_files_and_frames(tmp_path):
+    frame = pandas.DataFrame([["a", 1, 1, 9, 2]], columns=["picture", "subject", "x", "x", "y"])
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    for source in (frame, tmp_path / "t.csv"):
+        with pytest.raises(DataError, match="expected columns of different names, got several named x"):
+            read_table(source, size=(80, 60))
+
+
+def test_a_record_takes_lists_and_tensors_and_refuses_what_is_no_size():
+    for points in ([[1, 2.5]], torch.tensor([[1, 2.5]]), ((1, 2.5),)):
+        assert Fixations("a.jpg", "1", points, (80, 60), [200]).resized((160, 120)).points.tolist() == [[2.5, 5.5]]
+    for given, said in (
+        (([["a", "b"]], (80, 60)), "points: expected numbers, got list"),
+        (([1, 2], (80, 60)), r"points: expected \(n, 2\)"),
+        (([[1, 2]], "80x60"), "size: expected a width and a height above 0, got 80x60"),
+        (([[1, 2]], (80, float("nan"))), "size: expected a width and a height above 0"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Fixations("a.jpg", "1", *given)
