@@ -9,12 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, Scanpath
+from semfov import ActivePerception, EmbeddedScenes, Eye, FovealObservationModel, Foveation, Grid, Scanpath
 from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence
-from semfov.belief.observers import Semantic
-from semfov.belief.observers.base import Look
+from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
-from semfov.data.scenes import EmbeddedScenes
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig

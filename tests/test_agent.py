@@ -6,15 +6,13 @@ import pickle
 import pytest
 import torch
 
-from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, HeadAgent, ZoomAgent
+from semfov import ActivePerception, Detections, FovealObservationModel, Foveation, Grid, HeadAgent, ZoomAgent, saliency
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, Target
 from semfov.decision import confirms
-from semfov.detection import Detections
 from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
-from semfov.gaze import saliency
 from semfov.gaze.policies import KL, NonPredictive, Predictive, Random
 from semfov.io.state import without_settings
 from semfov.paths import GazePrediction
@@ -338,12 +336,6 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
     assert growth == 1 or error < other / 2
 
 
-@pytest.mark.parametrize("grid", [(0, 5), (5, -1), (5, 1.5), (5,), (5, 5, 5), (201, 1)])
-def test_invalid_grids_are_refused(grid):
-    with pytest.raises(InputError, match=r"^grid: expected"):
-        ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)
-
-
 @pytest.mark.parametrize(
     ("make", "options", "refused"),
     [
@@ -412,7 +404,10 @@ def test_the_kind_of_look_follows_from_the_picture(agent):
         agent.search(small, "red", how="zoom")
 
 
-def test_parts_that_were_fitted_for_another_sensor_are_refused():
+def test_grids_and_parts_that_do_not_suit_are_refused():
+    for grid in [(0, 5), (5, -1), (5, 1.5), (5,), (5, 5, 5), (201, 1)]:
+        with pytest.raises(InputError, match=r"^grid: expected"):
+            ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)
     settings = Eye(Foveation(40.0, growth=1.0), Coloured(), reference=160.0).settings()
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     model.metadata.update(sensor=settings["sensor"])

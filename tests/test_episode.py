@@ -7,12 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import FovealObservationModel, Foveation, Grid, InputError
-from semfov.belief import TargetEvidence
+from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, InputError, Selection, TargetEvidence
 from semfov.belief.observers import Semantic, Target
-from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
-from semfov.eye import Eye
 from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from

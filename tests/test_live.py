@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import ActivePerception, Eye, Foveation, Grid
+from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.agents import FoveaEpisode
-from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.episode import Forgetting
-from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
 from tests.small import Coloured, tensors
 

@@ -32,10 +32,6 @@ PIP = [line for line, words in COMMANDS.items() if words[0] == "pip"]
 MAKE = [line for line, words in COMMANDS.items() if words[0] == "make"]
 
 
-def test_it_has_few_lines():
-    assert len(README.splitlines()) <= 150
-
-
 def test_links_lead_somewhere():
     links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
     assert len(links) > 5
@@ -47,16 +43,12 @@ def test_links_lead_somewhere():
             assert heading in [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles], link
 
 
-def test_images_are_small():
+def test_it_is_short_and_so_are_its_images():
+    assert len(README.splitlines()) <= 150
     for link in re.findall(r"!\[[^]]+\]\(([^)]+)\)", README):
         assert (ROOT / link).stat().st_size < 300_000
         with Image.open(ROOT / link) as picture:
             assert max(picture.size) <= 1000
-
-
-def test_every_command_is_covered_by_a_test():
-    assert set(SEMFOV) | set(OWN) | set(MAKE) | set(PIP) == set(LINES)
-    assert len(SEMFOV) >= 3
 
 
 def test_pip_installs_only_this_package_and_its_dependencies():
@@ -74,7 +66,9 @@ def test_make_has_the_target(line):
     assert {"search": "-m eval.search", "test": "-m pytest"}[COMMANDS[line][1]] in dry.stdout
 
 
-def test_programs_named_in_the_text_exist():
+def test_commands_are_covered_and_programs_exist():
+    assert set(SEMFOV) | set(OWN) | set(MAKE) | set(PIP) == set(LINES)
+    assert len(SEMFOV) >= 3
     named = set(re.findall(r"python -m ([\w.]+)", README))
     assert len(named) > 2
     assert [name for name in named if importlib.util.find_spec(name) is None] == []

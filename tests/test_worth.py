@@ -5,12 +5,9 @@ import math
 import pytest
 import torch
 
-from semfov import ActivePerception, Foveation, Grid
+from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence
 from semfov.agents.fovea import _WORTH
-from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Semantic
-from semfov.errors import InputError
-from semfov.eye import Eye
 from semfov.gaze.policies import Closer, Gain, NonPredictive, Random
 from tests.small import Coloured
 

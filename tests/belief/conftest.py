@@ -8,9 +8,8 @@ import scipy.ndimage
 import scipy.special
 import torch
 
-from semfov import Detections, Grid
+from semfov import Detections, Grid, MapEvidence
 from semfov.belief.evidence import Gathered
-from semfov.belief.map_evidence import MapEvidence
 
 
 def array(tensor):

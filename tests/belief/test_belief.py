@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from semfov import Detections, Grid, InputError
-from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
+from semfov import Detections, DirichletBelief, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.belief import dirichlet_belief
 from semfov.belief.observers import AnyOf, LearnedMap, Semantic, Target
 from tests import small
@@ -250,14 +249,10 @@ def test_beliefs_and_looks_of_another_observer_do_not_fade(kind):
 
 
 @pytest.mark.parametrize("kind", ["target"])
-def test_a_belief_about_one_target_gives_its_probability_for_any_class(kind):
+def test_a_belief_about_one_target_has_no_other_classes(kind):
     belief = seen(OBSERVERS[kind]())
     assert torch.equal(belief.probability(3), belief.present)
     assert torch.equal(belief.probability(torch.tensor([1, 2])), belief.present)
-
-
-@pytest.mark.parametrize("kind", ["target"])
-def test_a_belief_about_one_target_is_refused_where_all_classes_are_needed(kind):
     belief = seen(OBSERVERS[kind]())
     with pytest.raises(InputError, match=rf"all classes \(DirichletBelief\), got {type(belief).__name__}"):
         dirichlet_belief(belief)

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from semfov import Detections, Grid
+from semfov import Detections, Grid, InputError
 from semfov.belief.look_features import LOOK_FEATURES, class_features, highest_score, look_features, nothing_seen
-from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
 FIXATIONS = GRID.centres[[0, 9, 20, 5]]

@@ -8,9 +8,8 @@ import scipy.ndimage
 import torch
 from torch import nn
 
+from semfov import MapEvidence, TargetEvidence
 from semfov.belief.evidence import READOUT, blur, logarithm, nearness, network
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.target_evidence import TargetEvidence
 
 
 class Recorder(nn.Module):

@@ -11,10 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import Detections, Grid
+from semfov import Detections, Grid, InputError
 from semfov.belief import fuse, fusion, likelihoods
 from semfov.belief.observers import Semantic
-from semfov.errors import InputError
 
 positive = st.floats(0.05, 20.0)
 score_lists = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=6).filter(lambda values: max(values) > 1e-3)
@@ -104,12 +103,6 @@ def test_product_and_sum_by_hand():
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_likelihoods_of_another_number_of_classes_are_refused(rule):
-    with pytest.raises(InputError, match=r"^likelihood: expected a tensor of shape \(..., 3\), got \(4, 2\)$"):
-        rule(torch.ones(4, 3), torch.ones(4, 2))
-
-
-@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
 @pytest.mark.parametrize(
     ("bad", "word"),
     [
@@ -125,15 +118,11 @@ def test_unusable_likelihoods_are_refused(rule, bad, word):
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_gradients(rule):
+def test_rules_have_gradients_and_compile_to_one_graph(rule):
     torch.manual_seed(2)
     beta = (torch.rand(3, 4, dtype=torch.float64) + 0.2).requires_grad_()
     likelihood = (torch.rand(3, 4, dtype=torch.float64) + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(rule, (beta, likelihood))
-
-
-@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_rules_compile_to_one_graph(rule):
     beta, likelihood = torch.rand(5, 4) + 0.1, torch.rand(5, 4)
     compiled = torch.compile(rule, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(beta, likelihood), rule(beta, likelihood))
@@ -150,7 +139,9 @@ def test_extreme_likelihoods_stay_finite():
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_numpy_arrays_are_refused_with_the_conversion(rule):
+def test_likelihoods_of_other_classes_or_of_numpy_are_refused(rule):
+    with pytest.raises(InputError, match=r"^likelihood: expected a tensor of shape \(..., 3\), got \(4, 2\)$"):
+        rule(torch.ones(4, 3), torch.ones(4, 2))
     beta, likelihood = np.ones(3), np.array([0.5, 0.2, 0.3])
     with pytest.raises(InputError, match=r"^beta: expected a tensor, got a NumPy array; give torch\.as_tensor\(beta\)"):
         rule(beta, torch.from_numpy(likelihood))

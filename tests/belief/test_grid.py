@@ -8,9 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.belief import Grid
+from semfov import Grid, InputError
 from semfov.belief.grid import check_cells
-from semfov.errors import InputError
 
 
 def overlap_by_loop(grid: Grid, size: tuple[int, int], box: list[float]) -> list[bool]:
@@ -48,13 +47,6 @@ def test_pixels_agree_with_cells():
     ys, xs = torch.meshgrid(torch.arange(9), torch.arange(12), indexing="ij")
     cells = grid.cell_of(torch.stack([xs, ys], -1).float())
     assert torch.equal(cells, image)
-
-
-def test_centres_and_edges():
-    grid = Grid(2, 2, (8, 4))
-    assert grid.centres.tolist() == [[1.5, 0.5], [5.5, 0.5], [1.5, 2.5], [5.5, 2.5]]
-    assert grid.edges[3].tolist() == [4, 2, 8, 4]
-    assert torch.equal(grid.cell_of(grid.centres), torch.arange(4))
 
 
 @pytest.mark.parametrize("rule", ["overlap", "centre", "box_centre"])
@@ -117,13 +109,6 @@ def test_batch_of_sizes_equals_single_grids():
     torch.testing.assert_close(batch.distance(fixation)[1], Grid(5, 4, sizes[1]).distance(fixation[1]))
 
 
-def test_distances_are_in_units_of_the_longer_side():
-    grid = Grid(2, 1, (200, 100))
-    assert grid.cell_distance.tolist() == [[0, 0.5], [0.5, 0]]
-    box = torch.tensor([[90.5, 40.5, 110.5, 60.5]])
-    assert grid.box_distance(box, torch.tensor([100.0, 80.0])).tolist() == [pytest.approx(0.15)]
-
-
 @pytest.mark.parametrize(
     "call",
     [
@@ -138,8 +123,16 @@ def test_bad_input(call):
         call()
 
 
-def test_an_image_may_be_as_small_as_a_pixel():
+def test_centres_edges_and_distances():
+    grid = Grid(2, 2, (8, 4))
+    assert grid.centres.tolist() == [[1.5, 0.5], [5.5, 0.5], [1.5, 2.5], [5.5, 2.5]]
+    assert grid.edges[3].tolist() == [4, 2, 8, 4]
+    assert torch.equal(grid.cell_of(grid.centres), torch.arange(4))
     assert Grid(2, 1, (1, 0.5)).centres.tolist() == [[-0.25, -0.25], [0.25, -0.25]]
+    grid = Grid(2, 1, (200, 100))
+    assert grid.cell_distance.tolist() == [[0, 0.5], [0.5, 0]]
+    box = torch.tensor([[90.5, 40.5, 110.5, 60.5]])
+    assert grid.box_distance(box, torch.tensor([100.0, 80.0])).tolist() == [pytest.approx(0.15)]
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5)])

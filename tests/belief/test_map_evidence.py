@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Grid
+from semfov import Grid, InputError, MapEvidence
 from semfov.belief.look_features import class_features
-from semfov.belief.map_evidence import MapEvidence
-from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
 

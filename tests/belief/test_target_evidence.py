@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Detections, Grid
-from semfov.belief import TargetEvidence
+from semfov import Detections, Grid, InputError, TargetEvidence
 from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target
-from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
 

@@ -15,15 +15,14 @@ import torch
 from PIL import Image
 from pycocotools.coco import COCO
 
+from semfov import DataError, read_image
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import _with_target
 from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth, read_truth
-from semfov.data import read_image
 from semfov.data.sources import picture_files
-from semfov.errors import DataError
 from tests.colours import write_network
 
 

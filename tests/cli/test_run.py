@@ -11,10 +11,9 @@ import torch
 from PIL import Image
 
 import semfov
-from semfov import DataError, InputError
+from semfov import DataError, InputError, read_image
 from semfov.cli.options import FindOptions
 from semfov.cli.search import _FindJob
-from semfov.data import read_image
 from semfov.gaze.policies import Random
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import digest_of

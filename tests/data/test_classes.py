@@ -12,12 +12,9 @@ def test_both_spellings_give_the_same_class(old, new):
     assert class_index(old, ("person", new)) == class_index(new, ("person", old)) == 2
 
 
-def test_the_same_class_twice_is_refused():
+def test_the_same_class_twice_and_several_in_one_text_are_refused():
     with pytest.raises(InputError, match="expected 2 different names"):
         class_indices(("sofa", "couch"))
-
-
-def test_several_classes_in_one_text_are_refused_with_the_list():
     with pytest.raises(InputError, match=r"; several classes are a list: \['cup', 'sofa'\]$"):
         class_numbers("cup, sofa", ("cup", "couch"))
 

@@ -11,9 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.data import CocoScenes, read_image
+from semfov import CocoScenes, DataError, InputError, read_image
 from semfov.data.coco import _other_form, _Packed, read_annotations
-from semfov.errors import DataError, InputError
 
 CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
 BOXES = [
@@ -46,20 +45,6 @@ def test_ids_may_be_strings(make_coco, coco_dict):
         annotation["image_id"] = str(annotation["image_id"])
     index, _ = read_annotations(make_coco(data=data))
     assert sorted(index.imgs) == ["10", "20", "30"]
-
-
-def test_a_missing_file_or_a_folder_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"no\.json: no such file; check data\.annotations"):
-        read_annotations(tmp_path / "no.json")
-    with pytest.raises(DataError, match="expected a file, got a folder"):
-        read_annotations(tmp_path)
-
-
-@pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 10_000])
-def test_a_file_that_is_not_json_is_refused(tmp_path, text):
-    (tmp_path / "a.json").write_bytes(text)
-    with pytest.raises(DataError, match=r"a\.json: not a JSON file"):
-        read_annotations(tmp_path / "a.json")
 
 
 MISSING = object()
@@ -111,7 +96,15 @@ def test_errors_name_the_entry_and_the_field(make_coco, coco_dict, where, value,
         read_annotations(make_coco(data=data))
 
 
-def test_a_json_list_is_refused(make_coco):
+def test_what_is_no_file_of_annotations_is_refused(tmp_path, make_coco):
+    with pytest.raises(DataError, match=r"no\.json: no such file; check data\.annotations"):
+        read_annotations(tmp_path / "no.json")
+    with pytest.raises(DataError, match="expected a file, got a folder"):
+        read_annotations(tmp_path)
+    for text in [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 10_000]:
+        (tmp_path / "a.json").write_bytes(text)
+        with pytest.raises(DataError, match=r"a\.json: not a JSON file"):
+            read_annotations(tmp_path / "a.json")
     with pytest.raises(DataError, match="expected an object with images, annotations and categories, got a list"):
         read_annotations(make_coco(data=[]))
 
@@ -162,13 +155,6 @@ def test_annotation_without_pixels(scenes):
     assert scenes.annotation(0).boxes.any()
 
 
-def test_iteration_and_index_errors(scenes):
-    assert [scene.id for scene in scenes] == [10, 20, 30]
-    assert scenes[-1].id == 30
-    with pytest.raises(IndexError):
-        scenes.annotation(3)
-
-
 def test_images_are_selected_by_number_of_boxes_and_area(photographs, make_coco):
     # 10: 8 boxes, one class has small boxes only; 20: 7 boxes; 30: 8 boxes, but its only class covers too much area
     boxes = [(10, "person", (i, 0, 2, 2)) for i in range(7)] + [(10, "tv", (0, 0, 40, 20))]
@@ -184,14 +170,6 @@ def test_images_are_selected_by_number_of_boxes_and_area(photographs, make_coco)
     assert CocoScenes(photographs, file, CLASSES, min_instances=1, max_target_area=None, limit=2).ids == [10, 20]
     with pytest.raises(DataError, match="none of 3 images has at least 9 boxes"):
         CocoScenes(photographs, file, CLASSES, min_instances=9)
-
-
-def test_selection_does_not_depend_on_the_detector(photographs, make_coco):
-    boxes = [(10, "person", (i, 0, 2, 2)) for i in range(4)] + [(10, "cat", (i, 9, 2, 2)) for i in range(4)]
-    scenes = CocoScenes(photographs, make_coco(boxes), ("cat",))
-    assert scenes.ids == [10]
-    assert scenes.annotation(0).labels.tolist() == [1] * 4
-    assert scenes.repairs == {"boxes of 'person', which the detector does not know, dropped": 4}
 
 
 def test_repairs_are_counted_and_reported_once(photographs, make_coco, caplog):
@@ -221,17 +199,15 @@ def test_repairs_are_counted_and_reported_once(photographs, make_coco, caplog):
     ]
 
 
-def test_boxes_without_area_in_single_precision_are_dropped(photographs, make_coco):
+def test_boxes_that_are_dropped_are_counted(photographs, make_coco):
+    boxes = [(10, "person", (i, 0, 2, 2)) for i in range(4)] + [(10, "cat", (i, 9, 2, 2)) for i in range(4)]
+    scenes = CocoScenes(photographs, make_coco(boxes), ("cat",))
+    assert scenes.ids == [10]
+    assert scenes.annotation(0).labels.tolist() == [1] * 4
+    assert scenes.repairs == {"boxes of 'person', which the detector does not know, dropped": 4}
     scenes = CocoScenes(photographs, make_coco([(10, "cat", (30, 20, 1e-9, 5))]), CLASSES, **ALL)
     assert scenes.annotation(0).boxes.shape == (0, 4)
     assert scenes.repairs == {"boxes without area in the image, dropped": 1}
-
-
-def test_annotations_without_a_class_of_the_detector_are_refused(photographs, make_coco):
-    with pytest.raises(DataError, match=r"expected some of the detector's 2 classes .* got 'person', 'cat', 'tv'"):
-        CocoScenes(photographs, make_coco(BOXES), ("zebra", "cup"))
-    with pytest.raises(DataError, match="got none"):
-        CocoScenes(photographs, make_coco(categories=()), CLASSES)
 
 
 def test_a_missing_image_is_an_error_only_if_it_is_used(photographs, make_coco, coco_dict):
@@ -259,7 +235,11 @@ def test_pixels_of_a_rotated_photograph_fit_the_annotated_size(tmp_path, make_co
     assert np.array_equal((image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
 
 
-def test_an_image_of_another_size_than_annotated_is_refused(photographs, make_coco, coco_dict):
+def test_annotations_of_another_detector_or_image_size_are_refused(photographs, make_coco, coco_dict):
+    with pytest.raises(DataError, match=r"expected some of the detector's 2 classes .* got 'person', 'cat', 'tv'"):
+        CocoScenes(photographs, make_coco(BOXES), ("zebra", "cup"))
+    with pytest.raises(DataError, match="got none"):
+        CocoScenes(photographs, make_coco(categories=()), CLASSES)
     data = coco_dict(BOXES)
     data["images"][1]["width"] = 41
     scenes = CocoScenes(photographs, make_coco(data=data), CLASSES, **ALL)
@@ -280,7 +260,11 @@ def test_fingerprint_changes_with_annotations_and_settings(photographs, make_coc
     assert len({scenes.digest(i) for i in range(3)}) == 3
 
 
-def test_scenes_can_be_pickled(scenes):
+def test_scenes_are_iterated_indexed_and_pickled(scenes):
+    assert [scene.id for scene in scenes] == [10, 20, 30]
+    assert scenes[-1].id == 30
+    with pytest.raises(IndexError):
+        scenes.annotation(3)
     unpickled = pickle.loads(pickle.dumps(scenes))
     assert unpickled.fingerprint == scenes.fingerprint
     assert torch.equal(unpickled[0].boxes, scenes[0].boxes)

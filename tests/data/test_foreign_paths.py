@@ -6,10 +6,8 @@ import os
 import pytest
 from PIL import Image
 
-from semfov.data.coco import CocoScenes
-from semfov.data.images import read_image
+from semfov import CocoScenes, DataError, SemfovError, read_image
 from semfov.data.pictures import Pictures
-from semfov.errors import DataError, SemfovError
 from semfov.io.files import check_regular, clean, inside, replacing
 
 

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from semfov import DataError, SemfovError, read_image
 from semfov.data.gdal import _mosaic_text
-from semfov.data.images import read_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.raster import RasterPicture
-from semfov.errors import DataError, SemfovError
 from semfov.paths.georeference import georeference
 from tests.data.test_large import pixels
 from tests.data.test_raster import rasterio, write

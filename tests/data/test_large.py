@@ -12,11 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.data.images import read_image
+from semfov import DataError, InputError, read_image
 from semfov.data.large import _ArrayPicture, _MemoryPicture, open_large
 from semfov.data.raster import RasterPicture
 from semfov.data.tiff import TiffPicture
-from semfov.errors import DataError, InputError
 
 
 def pixels(height=150, width=230, seed=0):

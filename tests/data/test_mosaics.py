@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from semfov.data import EmbeddedScenes
+from semfov.data import Annotation, EmbeddedScenes
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation
 
 SCENES = EmbeddedScenes(("person", "cat", "cup"), count=5, seed=3)
 

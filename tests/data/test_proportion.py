@@ -10,11 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov import as_image
-from semfov.data.images import read_image
+from semfov import DataError, as_image, read_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.raster import RasterPicture
-from semfov.errors import DataError
 from tests.data.test_large import pixels
 
 

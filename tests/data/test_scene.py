@@ -41,13 +41,6 @@ def test_a_target_that_covers_exactly_the_limit_is_legal():
     assert legal_targets(scene, None) == [2, 5]
 
 
-def test_bad_arguments():
-    with pytest.raises(InputError, match="coverage"):
-        box_coverage(torch.zeros(1, 4), (4, 4), "mean")
-    with pytest.raises(InputError, match="boxes"):
-        box_coverage(torch.zeros(4, 3), (4, 4))
-
-
 def test_size_is_width_and_height():
     assert Scene(1, "a", torch.zeros(3, 4, 6), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64)).size == (6, 4)
 
@@ -76,7 +69,11 @@ def test_a_scene_is_that_of_the_set():
     assert len({most.fingerprint, scenes.fingerprint, _crowded(scenes, 0.3).fingerprint}) == 3
 
 
-@pytest.mark.parametrize("share", [0.0, -0.1, 1.5, float("nan")])
-def test_a_share_outside_its_range_is_refused(share):
-    with pytest.raises(InputError, match="share: expected above 0"):
-        _crowded(EmbeddedScenes(("person",), count=2), share)
+def test_coverages_and_shares_out_of_range_are_refused():
+    with pytest.raises(InputError, match="coverage"):
+        box_coverage(torch.zeros(1, 4), (4, 4), "mean")
+    with pytest.raises(InputError, match="boxes"):
+        box_coverage(torch.zeros(4, 3), (4, 4))
+    for share in [0.0, -0.1, 1.5, float("nan")]:
+        with pytest.raises(InputError, match="share: expected above 0"):
+            _crowded(EmbeddedScenes(("person",), count=2), share)

@@ -133,12 +133,9 @@ def test_a_seed_gives_bit_identical_scenes_in_another_process(fresh, scenes):
     assert torch.equal(scenes[5].image, scenes[5].image)
 
 
-def test_digest_is_computed_from_the_pixels(scenes):
+def test_digests_are_of_the_pixels_whatever_the_number_of_scenes(scenes):
     pixels = (scenes[2].image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
     assert scenes.digest(2) == hashlib.sha256(pixels.tobytes()).hexdigest()
-
-
-def test_the_first_scenes_do_not_depend_on_the_number_of_scenes(scenes):
     few = EmbeddedScenes(CLASSES, count=2)
     assert few.digest(1) == scenes.digest(1)
     assert few.fingerprint != scenes.fingerprint
@@ -155,16 +152,13 @@ def test_objects_of_classes_unknown_to_the_detector_have_no_box():
         EmbeddedScenes(("zebra",))
 
 
-def test_bad_arguments():
+def test_bad_arguments_and_missing_files(monkeypatch):
     with pytest.raises(InputError, match="count"):
         EmbeddedScenes(CLASSES, count=0)
     with pytest.raises(InputError, match="seed"):
         EmbeddedScenes(CLASSES, seed=-1)
     with pytest.raises(IndexError):
         EmbeddedScenes(CLASSES, count=2)[2]
-
-
-def test_missing_packages_and_files_are_errors(monkeypatch):
     monkeypatch.setitem(module._FOLDERS, "skimage", "elsewhere")
     with pytest.raises(DataError, match=r"expected the photograph .* pip install"):
         EmbeddedScenes(CLASSES)

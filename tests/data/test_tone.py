@@ -5,10 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov import as_image, read_image
+from semfov import DataError, InputError, as_image, read_image
 from semfov.agents.picture import open_picture
 from semfov.data.large import open_large
-from semfov.errors import DataError, InputError
 from tests.data.test_large import pixels
 
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from semfov import ActivePerception, Eye, Foveation, Scanpath
-from semfov.belief import Belief
+from semfov import ActivePerception, Belief, DataError, Eye, Foveation, InputError, Scanpath
 from semfov.belief.observers import Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
-from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
 from tests.decision.test_rule import Nothing, Scripted, Square, cells
 from tests.decision.test_verifier import AT, FromScore

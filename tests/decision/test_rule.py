@@ -9,13 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Grid
-from semfov.belief import Belief
+from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid, InputError
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision, conclude, decide, goal_cells, strength, strongest
-from semfov.errors import InputError
-from semfov.eye import Eye
 from semfov.gaze.policies import NonPredictive, Random
 from tests.small import Coloured
 

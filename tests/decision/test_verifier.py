@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Detections, Grid
+from semfov import Detections, Grid, InputError
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
-from semfov.errors import InputError
 from tests.decision.test_rule import Known, random_looks
 from tests.small import iou
 

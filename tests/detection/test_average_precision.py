@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.detector_ap import SELECTIONS, average_precision
-from semfov.detection import Detector
-from semfov.detection.load import load_detector
+from semfov import Detector, load_detector
 
 pytestmark = [pytest.mark.long, pytest.mark.shared]
 

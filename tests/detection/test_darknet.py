@@ -102,15 +102,12 @@ def test_published_yolov3_tiny_equals_the_plain_implementation(tiny_weights):
         torch.testing.assert_close(a.double(), e, atol=2e-4, rtol=0)
 
 
-def test_gradient_reaches_the_image(small_cfg, write_weights):
+def test_gradient_reaches_the_image_and_the_network_compiles_to_a_single_graph(small_cfg, write_weights):
     network = Darknet(read_cfg(small_cfg)).double()
     read_weights(network, write_weights())
     image = torch.rand(1, 3, 8, 8, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: tuple(network(x)), (image,), fast_mode=True)
     assert torch.autograd.grad(sum(m.sum() for m in network(image)), network.layers[0].weight)[0].any()
-
-
-def test_compiles_to_a_single_graph(small_cfg):
     network, image = Darknet(read_cfg(small_cfg)).eval(), torch.rand(2, 3, 32, 64)
     compiled = torch.compile(network, fullgraph=True, backend="eager")
     for actual, expected in zip(compiled(image), network(image), strict=True):
@@ -132,12 +129,6 @@ def test_keeps_only_outputs_that_later_layers_need():
     network.run = run
     network(torch.zeros(1, 3, 32, 32))
     assert max(alive) <= 6
-
-
-@pytest.mark.parametrize("size", [(3, 32, 31), (3, 0, 32), (1, 32, 32)])
-def test_refuses_images_of_unsuitable_size(small_cfg, size):
-    with pytest.raises(InputError, match="image: expected"):
-        Darknet(read_cfg(small_cfg))(torch.zeros(1, *size))
 
 
 YOLO = "[yolo]\nmask=0\nanchors=1,2\nclasses=1\n"
@@ -176,15 +167,12 @@ def test_refuses_invalid_cfgs_with_an_error_of_one_line(text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_dropout_is_ignored():
+def test_dropout_is_ignored_and_masks_default_to_all_anchors():
     sections = _parse_cfg(NET + "[dropout]\nprobability=.5\n" + MAPS + YOLO)
     network, plain = Darknet(sections), Darknet([s for s in sections if s.kind != "dropout"])
     network.layers[1].load_state_dict(plain.layers[0].state_dict())
     image = torch.rand(1, 3, 4, 4)
     assert torch.equal(network(image)[0], plain(image)[0])
-
-
-def test_mask_defaults_to_all_anchors():
     section = Section("yolo", {"anchors": "1,2, 3,4", "classes": "1"})
     network = Darknet([*_parse_cfg(NET + MAPS.replace("6", "12")), section])
     assert network.heads[0].anchors == ((1.0, 2.0), (3.0, 4.0))
@@ -217,12 +205,9 @@ def test_published_networks_have_the_published_layers_and_sizes(name, layers, co
         assert head.channels == 255
 
 
-def test_lateral_connections_of_yolov3():
+def test_lateral_connections_and_heads_of_published_networks():
     routes = [s.integers("layers") for s in ARCHITECTURES["yolov3"]() if s.kind == "route"]
     assert routes == [(-4,), (-1, 61), (-4,), (-1, 36)]
-
-
-def test_heads_follow_the_number_of_classes():
     assert Darknet(ARCHITECTURES["yolov3-tiny"](classes=3)).heads[0].channels == 24
 
 
@@ -279,21 +264,6 @@ def test_values_are_converted_and_checked():
         section.numbers("word")
 
 
-@pytest.mark.parametrize("text", ["width=3", "[net]\nwidth 3", "[net"])
-def test_refuses_invalid_syntax(text):
-    with pytest.raises(DataError, match=r"cfg:\d: expected \[section\] or key=value"):
-        _parse_cfg(text)
-
-
-def test_refuses_unreadable_files(tmp_path):
-    with pytest.raises(DataError, match=r"cannot read the cfg .*missing.cfg"):
-        read_cfg(tmp_path / "missing.cfg")
-    binary = tmp_path / "binary.cfg"
-    binary.write_bytes(b"\x9f\xfe\x07\x9f")
-    with pytest.raises(DataError, match="a file that is not text"):
-        read_cfg(binary)
-
-
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -316,6 +286,18 @@ def test_refuses_damaged_weights_with_an_error_of_one_line(small_cfg, write_weig
     assert "\n" not in str(caught.value)
 
 
-def test_refuses_missing_weights(small_cfg, tmp_path):
+def test_refuses_what_cannot_be_read_or_has_an_unsuitable_size(small_cfg, tmp_path):
+    for size in [(3, 32, 31), (3, 0, 32), (1, 32, 32)]:
+        with pytest.raises(InputError, match="image: expected"):
+            Darknet(read_cfg(small_cfg))(torch.zeros(1, *size))
+    for text in ["width=3", "[net]\nwidth 3", "[net"]:
+        with pytest.raises(DataError, match=r"cfg:\d: expected \[section\] or key=value"):
+            _parse_cfg(text)
+    with pytest.raises(DataError, match=r"cannot read the cfg .*missing.cfg"):
+        read_cfg(tmp_path / "missing.cfg")
+    binary = tmp_path / "binary.cfg"
+    binary.write_bytes(b"\x9f\xfe\x07\x9f")
+    with pytest.raises(DataError, match="a file that is not text"):
+        read_cfg(binary)
     with pytest.raises(DataError, match=r"cannot read the weights .*missing"):
         read_weights(Darknet(read_cfg(small_cfg)), tmp_path / "missing.weights")

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from semfov.detection import Detections
-from semfov.errors import InputError
+from semfov import Detections, InputError
 
 
 def detections(counts: list[int], classes: int = 3, seed: int = 0) -> Detections:
@@ -32,21 +31,6 @@ def test_stack_pads_to_the_longest():
     torch.testing.assert_close(whole.scores[0, :2], parts[0].scores[0])
 
 
-def test_a_batch_can_be_indexed_by_image():
-    d = detections([2, 1, 3])
-    assert d[1:].count.tolist() == [1, 3]
-    assert d[0].count.item() == 2
-    assert d[torch.tensor([2, 0])].count.tolist() == [3, 2]
-
-
-def test_empty_detections_take_number_of_classes_and_dtype():
-    d = Detections.empty(2, 80, like=torch.zeros(1, dtype=torch.float64))
-    assert d.scores.shape == (2, 0, 81)
-    assert d.boxes.dtype == torch.float64
-    assert d.count.tolist() == [0, 0]
-    assert d.labels.shape == (2, 0)
-
-
 @pytest.mark.parametrize(
     ("boxes", "scores", "mask"),
     [
@@ -60,6 +44,15 @@ def test_refuses_tensors_of_inconsistent_shapes(boxes, scores, mask):
         Detections(boxes, scores, mask)
 
 
-def test_refuses_to_stack_an_empty_list():
+def test_batches_are_indexed_by_image_and_may_be_empty():
+    d = detections([2, 1, 3])
+    assert d[1:].count.tolist() == [1, 3]
+    assert d[0].count.item() == 2
+    assert d[torch.tensor([2, 0])].count.tolist() == [3, 2]
+    d = Detections.empty(2, 80, like=torch.zeros(1, dtype=torch.float64))
+    assert d.scores.shape == (2, 0, 81)
+    assert d.boxes.dtype == torch.float64
+    assert d.count.tolist() == [0, 0]
+    assert d.labels.shape == (2, 0)
     with pytest.raises(InputError, match="at least one"):
         Detections.stack([])

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from semfov import DataError, InputError, load_detector
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.darknet_onnx import _OUTPUTS
 from semfov.detection.export import _largest_difference, export_onnx, main
-from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
-from semfov.errors import DataError, InputError
 
 
 @pytest.mark.parametrize("static", [False, True])

@@ -2,12 +2,11 @@ import pytest
 import torch
 from torch import nn
 
-from semfov import ActivePerception
+from semfov import ActivePerception, DataError, InputError
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector, detector_name, load_detector
 from semfov.detection.placement import resize
 from semfov.detection.yolo import _RUNTIMES
-from semfov.errors import DataError, InputError
 
 
 def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
@@ -27,12 +26,6 @@ def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
     for runtime in _RUNTIMES:
         proposed = load_detector(small_cfg, **options, runtime=runtime).propose(image)
         torch.testing.assert_close(proposed.boxes.double(), exact.boxes, atol=1e-3, rtol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["yolov3-tinny", "nothing"])
-def test_unknown_names_are_refused_with_the_known_ones(name):
-    with pytest.raises(InputError, match=f"unknown detector '{name}'; .*yolov3-tiny"):
-        load_detector(name)
 
 
 @pytest.mark.parametrize(
@@ -214,6 +207,9 @@ def test_networks_of_ultralytics(cells):
         load_detector(cells, classes=["red", "green", "blue"])(torch.rand(1, 3, 64, 64))
 
 
-def test_unknown_modules_are_refused():
+def test_unknown_names_and_modules_are_refused_with_the_known_ones():
+    for name in ["yolov3-tinny", "nothing"]:
+        with pytest.raises(InputError, match=f"unknown detector '{name}'; .*yolov3-tiny"):
+            load_detector(name)
     with pytest.raises(InputError, match=r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear"):
         load_detector(nn.Linear(1, 1))

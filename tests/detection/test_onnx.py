@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 import torch
 
+from semfov import DataError, InputError, load_detector
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_heads import HEADS
 from semfov.detection.preprocessing import Preprocessing
-from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
 from tests.colours import write_network
 

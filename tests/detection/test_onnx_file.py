@@ -10,14 +10,9 @@ from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional as F
 from torchvision.ops import box_iou
 
-from semfov.detection.load import load_detector
+from semfov import DataError, InputError, load_detector
 from semfov.detection.onnx_file import read_settings, with_input_size
 from semfov.detection.onnx_session import OnnxSession
-from semfov.errors import DataError, InputError
-
-
-def test_settings_are_empty_without_file_and_metadata(tmp_path):
-    assert read_settings(tmp_path / "model.onnx", {}) == {"preprocessing": {}}
 
 
 def test_the_settings_file_overrides_the_metadata(tmp_path):
@@ -32,12 +27,6 @@ def test_the_settings_file_overrides_the_metadata(tmp_path):
     }
 
 
-def test_metadata_of_ultralytics(tmp_path):
-    metadata = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "stride": "32", "task": "detect"}
-    found = read_settings(tmp_path / "model.onnx", metadata)
-    assert found == {"classes": ["person", "dog"], "input_size": [640, 480], "preprocessing": {}}
-
-
 def test_numbers_are_names_and_words_that_yaml_changes_are_refused(make_onnx):
     """YAML reads the names `no` and `yes` as booleans; a name that is a number is meant as one."""
     values = {"output0": np.random.default_rng(0).random((1, 6, 84)).astype(np.float32)}
@@ -48,14 +37,17 @@ def test_numbers_are_names_and_words_that_yaml_changes_are_refused(make_onnx):
     assert load_detector(path, classes=["no", "cat"]).classes == ("no", "cat")
 
 
-@pytest.mark.parametrize("names", ["person,dog", "{1: 'a'}", "{0: ", "3"])
-def test_metadata_of_another_form_is_ignored(tmp_path, names):
-    assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}
+def test_metadata_are_settings_where_their_form_is_known(tmp_path):
+    assert read_settings(tmp_path / "model.onnx", {}) == {"preprocessing": {}}
+    metadata = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "stride": "32", "task": "detect"}
+    found = read_settings(tmp_path / "model.onnx", metadata)
+    assert found == {"classes": ["person", "dog"], "input_size": [640, 480], "preprocessing": {}}
+    for names in ["person,dog", "{1: 'a'}", "{0: ", "3"]:
+        assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_invalid_and_binary_settings_are_refused_with_the_name_of_the_file(tmp_path):
+    for text, message in [
         ('{"head": ', "line 1"),
         ("[]", "an object"),
         ('{"preprocessing": 3}', "preprocessing: expected dict, got 3"),
@@ -63,17 +55,12 @@ def test_metadata_of_another_form_is_ignored(tmp_path, names):
         ('{"classes": "cat, dog"}', "classes: expected list"),
         ('{"logits": 1}', "logits: expected bool"),
         ('{"heads": "yolox"}', "unknown key 'heads'; known: name, head"),
-    ],
-)
-def test_invalid_settings_are_refused_with_the_name_of_the_file(tmp_path, text, message):
-    (tmp_path / "model.json").write_text(text)
-    with pytest.raises(DataError, match=rf"model\.json.*{message}"):
-        read_settings(tmp_path / "model.onnx", {})
-    with pytest.raises(DataError, match=rf"metadata of other\.onnx.*{message}"):
-        read_settings(tmp_path / "other.onnx", {"semfov": text})
-
-
-def test_binary_settings_files_are_refused(tmp_path):
+    ]:
+        (tmp_path / "model.json").write_text(text)
+        with pytest.raises(DataError, match=rf"model\.json.*{message}"):
+            read_settings(tmp_path / "model.onnx", {})
+        with pytest.raises(DataError, match=rf"metadata of other\.onnx.*{message}"):
+            read_settings(tmp_path / "other.onnx", {"semfov": text})
     (tmp_path / "model.json").write_bytes(b"\x9f\xfe\x07\x9f")
     with pytest.raises(DataError, match="cannot read"):
         read_settings(tmp_path / "model.onnx", {})
@@ -118,14 +105,11 @@ def test_a_resized_network_computes_the_same_convolution(shuffled, canvas):
     assert (path == shuffled) == (canvas == (64, 64))
 
 
-def test_a_damaged_copy_is_made_again(shuffled):
+def test_copies_of_another_size_are_checked(shuffled):
     path = with_input_size(shuffled, (96, 96), (8,))
     content = path.read_bytes()
     path.write_bytes(content[:-1])
     assert with_input_size(shuffled, (96, 96), (8,)).read_bytes() == content
-
-
-def test_a_size_that_does_not_fit_the_maps_is_refused(shuffled):
     with pytest.raises(InputError, match="input_size: expected multiples of 32 pixels"):
         with_input_size(shuffled, (100, 64), (8,))
 

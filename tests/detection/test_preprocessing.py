@@ -60,18 +60,13 @@ def test_bytes_equal_the_formula(settings, layout):
     assert np.array_equal(canvas.numpy(), source)
 
 
-def test_networks_that_take_bytes_get_them_exactly():
+def test_canvases_of_bytes_are_exact_and_checked():
     canvas = torch.arange(256, dtype=torch.uint8).expand(1, 3, 1, -1)
     image = Preprocessing(channels="bgr", scale=255.0).of_bytes(canvas)
     assert torch.equal(image, torch.arange(256.0).expand(1, 3, 1, -1))
-
-
-@pytest.mark.parametrize(
-    "canvas", [torch.zeros(1, 3, 4, 4), torch.zeros(3, 4, 4).byte(), torch.zeros(1, 4, 4, 3).byte()]
-)
-def test_refuses_what_is_no_canvas_of_bytes(canvas):
-    with pytest.raises(InputError, match=r"canvas: expected bytes of shape \(B, 3, H, W\)"):
-        Preprocessing().of_bytes(canvas)
+    for canvas in [torch.zeros(1, 3, 4, 4), torch.zeros(3, 4, 4).byte(), torch.zeros(1, 4, 4, 3).byte()]:
+        with pytest.raises(InputError, match=r"canvas: expected bytes of shape \(B, 3, H, W\)"):
+            Preprocessing().of_bytes(canvas)
 
 
 @pytest.mark.parametrize(

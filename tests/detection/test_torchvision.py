@@ -7,11 +7,9 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBo
 from torchvision.models.detection.ssd import SSD
 from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
+from semfov import DataError, InputError, Selection, load_detector
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.load import load_detector
-from semfov.detection.selection import Selection
 from semfov.detection.torchvision import _output_count, _TorchvisionDetector, load_torchvision
-from semfov.errors import DataError, InputError
 from semfov.io.files import sha256
 
 NAMES = ("cat", "dog", "cup")
@@ -301,12 +299,9 @@ def test_a_model_in_memory_is_a_detector(kind):
         load_detector(model)
 
 
-def test_a_model_with_the_outputs_of_coco_needs_no_names():
+def test_models_may_have_the_outputs_of_coco_or_none_for_background():
     model = RetinaNet(Backbone(32), 91, anchor_generator=anchors((16,), (32,)), **SMALL)
     assert load_detector(model).classes == COCO_CLASSES
-
-
-def test_models_of_sigmoids_may_have_no_background_output():
     model = RetinaNet(Backbone(32), 3, anchor_generator=anchors((16,), (32,)), **SMALL)
     detector = _TorchvisionDetector(model, NAMES, first=0)
     canvas = torch.rand(1, 3, 64, 64)

@@ -9,10 +9,9 @@ import transformers as hf
 from torch import nn
 from transformers.models.hgnet_v2 import HGNetV2Config
 
-from semfov import load_detector
+from semfov import DataError, InputError, load_detector
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD
 from semfov.detection.transformers import _SOFTMAX
-from semfov.errors import DataError, InputError
 
 PROCESSORS = {
     "detr": hf.DetrImageProcessor,

@@ -95,14 +95,11 @@ def test_the_error_without_a_working_source_names_the_remedy(cache, register):
     assert not list(cache.iterdir())
 
 
-def test_a_file_without_a_source_is_asked_for(cache):
+def test_files_that_cannot_be_fetched_name_the_remedy(cache):
     with pytest.raises(DataError) as caught:
         fetch("nanodet-plus-m-1.5x")
     for part in ("no source", "RangiLyu/nanodet/releases", "nanodet-plus-m-1.5x_416.onnx", "weights=", str(cache)):
         assert part in str(caught.value)
-
-
-def test_unknown_names_are_refused_with_a_suggestion():
     with pytest.raises(InputError, match="did you mean 'yolov3-tiny'"):
         fetch("yolo3-tiny")
 
@@ -198,9 +195,6 @@ def test_a_file_is_downloaded_from_its_address(address, tmp_path, monkeypatch):
     assert Path(tmp_path / "out").read_bytes() == CONTENT
     with pytest.raises(DataError, match=r"missing.weights: cannot be downloaded \(HTTPError\)"):
         _Address(f"{address}/missing.weights").fetch(tmp_path / "out")
-
-
-def test_an_unreachable_address_is_named_in_the_error(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
         _Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from semfov.envs.environment import EpisodeEnv
-from semfov.envs.vector import GazeVectorEnv
+from semfov.envs import EpisodeEnv, GazeVectorEnv
 from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.exploration_protocol import explore_noise

@@ -2,8 +2,7 @@
 
 import pytest
 
-from semfov.envs import open_scenery
-from semfov.envs.zoom_scenery import open_zoom_scenery
+from semfov.envs import open_scenery, open_zoom_scenery
 
 
 @pytest.fixture(scope="session")

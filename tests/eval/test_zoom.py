@@ -6,9 +6,7 @@ import torch
 
 from eval.zoom.observed import ObservedRates
 from eval.zoom.orders import sparse
-from semfov import FovealObservationModel
-from semfov.errors import InputError
-from semfov.zoom import WindowEye
+from semfov import FovealObservationModel, InputError, WindowEye
 from semfov.zoom.glances import LiveGlances, overview
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice

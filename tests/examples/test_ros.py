@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 
 import semfov
 from examples import ros_messages as ros
-from semfov import Detections
+from semfov import Detections, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
-from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
 from tests.examples.messages import KINDS, plain
 from tests.small import Coloured

@@ -22,11 +22,10 @@ from eval.decide.run import DecideConfig
 from eval.explore.run import ExploreConfig
 from eval.search import main as search
 from eval.search.run import SearchConfig
-from semfov import ActivePerception, DataError, InputError
+from semfov import ActivePerception, DataError, EmbeddedScenes, FovealObservationModel, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
-from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.detector import _seconds_of_looks, _thin_classes, _with_classes
 from semfov.fit.detector_report import Difference
@@ -38,7 +37,6 @@ from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
-from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from eval.calibration import main as calibrate
-from semfov import FovealObservationModel
 from semfov.fit.observation import FitObservationConfig
-from semfov.observation import match
+from semfov.observation import FovealObservationModel, match
 from semfov.runs.config import DataConfig
 from semfov.runs.samples import Sampler
 from semfov.runs.seeds import generator_for

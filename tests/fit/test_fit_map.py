@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Grid
-from semfov.belief import MapEvidence
+from semfov import Grid, MapEvidence
 from semfov.belief.look_features import class_features
 from semfov.belief.observers import LearnedMap
 from semfov.episode import StoredLooks, rollout

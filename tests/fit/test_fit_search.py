@@ -8,13 +8,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Grid
-from semfov.belief import TargetEvidence
+from semfov import EmbeddedScenes, Grid, TargetEvidence, rollout
 from semfov.belief.look_features import look_features
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.data.scenes import EmbeddedScenes
-from semfov.episode import StoredLooks, rollout
+from semfov.episode import StoredLooks
 from semfov.fit.evidence import (
     _JUDGED,
     FitSearchConfig,

@@ -7,12 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from semfov import ActivePerception, Eye, Foveation
-from semfov.belief import TargetEvidence, Verification
+from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, Foveation, TargetEvidence
+from semfov.belief import Verification
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.data.scenes import EmbeddedScenes
-from semfov.errors import DataError
 from semfov.fit.searches import _search_photograph, open_photographs, photograph_searches
 from semfov.fit.verification import (
     _LEVELS,

@@ -11,9 +11,8 @@ from semfov.agents.episode import EpisodeLimits
 from semfov.agents.windows import WindowEpisode
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
+from semfov.data import Annotation, EmbeddedScenes, Scene
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scene
-from semfov.data.scenes import EmbeddedScenes
 from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import unverified, verify
@@ -24,8 +23,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
-from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.lattice import Lattice
+from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from tests.small import Coloured, Tiles
 from train.fit_fom import fit_fom
 from train.fit_zoom import fit_zoom

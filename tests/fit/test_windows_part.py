@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov import ActivePerception
+from semfov import ActivePerception, EmbeddedScenes
 from semfov.data.mosaics import Mosaics
-from semfov.data.scenes import EmbeddedScenes
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.parts.windows import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
 from semfov.fit.settings import FitDetectorConfig

@@ -3,10 +3,8 @@
 import pytest
 import torch
 
-from semfov import Detections, FovealObservationModel, Grid
-from semfov.belief import DirichletBelief, MapEvidence, TargetEvidence
+from semfov import Detections, DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
-from semfov.errors import InputError
 from semfov.gaze.acquisition import CloserLook, ExpectedAccuracy, ExpectedGain
 from semfov.gaze.policies import Closer, Gain, Random, SaliencyMaximum
 from semfov.runs.candidates import _Models, make_strategy

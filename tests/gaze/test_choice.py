@@ -5,8 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import Grid
-from semfov.errors import InputError
+from semfov import Grid, InputError
 from semfov.gaze.choice import Exploratory, Greedy, Softmax, drawn_from, select_fixation, soft_fixation
 
 CENTRES = torch.stack([torch.arange(9.0), torch.zeros(9)], -1)

@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from semfov.belief import DirichletBelief, Grid
-from semfov.errors import InputError
+from semfov import DirichletBelief, Grid, InputError
 from semfov.gaze.acquisition import CloserLook
 
 GRID = Grid(4, 3, (80, 60))

@@ -6,9 +6,7 @@ import pytest
 import torch
 from scipy import stats
 
-from semfov import FovealObservationModel, Grid
-from semfov.belief import fusion
-from semfov.errors import InputError
+from semfov import FovealObservationModel, Grid, InputError, fusion
 from semfov.gaze.acquisition import (
     BayesianSurprise,
     KLDivergence,

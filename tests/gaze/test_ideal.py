@@ -8,8 +8,7 @@ import torch
 from scipy import integrate
 from scipy.stats import norm
 
-from semfov import DirichletBelief, FovealObservationModel, Grid
-from semfov.errors import InputError
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError
 from semfov.gaze.acquisition import CorrectLocalisation, EntropyLimit, TargetPosterior
 from semfov.gaze.acquisition.ideal import _correct_localisation
 from semfov.observation import visibility

@@ -2,8 +2,7 @@
 
 import torch
 
-from semfov import acquisition, policies, saliency
-from semfov.belief import DirichletBelief
+from semfov import DirichletBelief, acquisition, policies, saliency
 from semfov.belief.observers import LearnedMap
 from tests.base_tester import GraphTester, TensorTester, make_testers
 from tests.small import GRID, detections, look, mapping, memory, model, rand

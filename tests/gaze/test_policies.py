@@ -3,10 +3,7 @@
 import pytest
 import torch
 
-from semfov import FovealObservationModel
-from semfov.belief import DirichletBelief, Grid, MapEvidence
-from semfov.errors import InputError
-from semfov.gaze import acquisition, policies
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition, policies
 from semfov.gaze.policies import POLICIES, Means, Policy, named_policy, policy_names
 
 GRID = Grid(4, 3, (80, 60))

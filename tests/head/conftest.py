@@ -3,10 +3,7 @@
 import pytest
 import torch
 
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.target_evidence import TargetEvidence
-from semfov.eye import Eye
-from semfov.sensor import Foveation
+from semfov import Eye, Foveation, MapEvidence, TargetEvidence
 from tests.small import Tiles
 
 

@@ -5,15 +5,11 @@ import math
 import pytest
 import torch
 
-from semfov.agent import ActivePerception
-from semfov.agents import HeadAgent
+from semfov import ActivePerception, Detections, Flat, HeadAgent, InputError, Panorama
 from semfov.agents.head import _decide_look
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.detection import Detections
-from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
-from semfov.head import Flat, Panorama
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from eval.head.run import _rests_on
+from semfov import InputError, Panorama, rollout
 from semfov.belief.observers import LearnedMap, Target
-from semfov.episode import rollout
-from semfov.errors import InputError
 from semfov.gaze.choice import Given
-from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
 from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT
 

@@ -8,10 +8,8 @@ import torch
 from PIL import Image
 
 from examples.pan_tilt import SimulatedCamera
-from semfov import ActivePerception, Eye, Flat, Foveation, Panorama
-from semfov.agents import HeadAgent
+from semfov import ActivePerception, DataError, Eye, Flat, Foveation, HeadAgent, InputError, Panorama
 from semfov.belief.observers import LearnedMap, Target
-from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.head import (
     CameraFrame,

@@ -4,8 +4,7 @@ from functools import cache
 
 import torch
 
-from semfov import Eye, Foveation
-from semfov.agents import HeadAgent
+from semfov import Eye, Foveation, HeadAgent
 from semfov.belief.observers import LearnedMap, Target
 from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
 from tests.base_tester import BaseTester

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from semfov.data import EmbeddedScenes
-from semfov.errors import InputError
+from semfov import EmbeddedScenes, InputError
 from semfov.head import Panoramas
 from semfov.sensor.perspective import perspective
 

@@ -9,12 +9,6 @@ from semfov.errors import InputError
 from semfov.head import Speeds
 
 
-def test_saccades_follow_the_main_sequence():
-    """21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time."""
-    found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
-    torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
-
-
 @given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
 def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, speed, acceleration):
     found = float(Speeds(head=speed, acceleration=acceleration).turn(torch.tensor(angle, dtype=torch.float64)))
@@ -39,7 +33,10 @@ def test_a_shift_takes_as_long_as_the_longest_of_simultaneous_movements():
     assert float(speeds.duration(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
 
 
-def test_head_and_zoom_settle_after_a_movement_and_the_eye_does_not():
+def test_durations_of_movements_follow_the_main_sequence_and_settling():
+    # 21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time.
+    found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
     plain, slow, none = Speeds(), Speeds(settle=0.4), torch.tensor(0.0)
     eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-1.0)
     for moved, later in (((eye, none, none), 0.0), ((eye, head, none), 0.4), ((none, none, zoom), 0.4)):

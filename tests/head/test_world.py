@@ -5,8 +5,7 @@ import torch
 
 from semfov.errors import InputError
 from semfov.head import Flat, Panorama, Views
-from semfov.sensor.glimpse import glimpse
-from semfov.sensor.perspective import perspective
+from semfov.sensor import glimpse, perspective
 
 
 @pytest.fixture(params=["panorama", "flat"])

@@ -55,12 +55,9 @@ def test_the_digest_of_a_class_depends_on_imported_user_code(package):
     assert code.class_digest(package("own_policy", POLICY.replace("sqrt", "log")).Policy) != first
 
 
-def test_two_classes_in_one_file_have_different_digests(package):
+def test_digests_of_classes(package):
     module = package("own_pair", "class One:\n    pass\nclass Two:\n    pass\n")
     assert code.class_digest(module.One) != code.class_digest(module.Two)
-
-
-def test_the_digest_of_a_class_without_a_file_is_valid_in_one_process_only():
     typed = type("Typed", (), {"__module__": "__nowhere__"})
     assert code.class_digest(typed) == code.class_digest(typed)
     assert "process" in code.class_digest(typed)

@@ -39,13 +39,10 @@ def test_a_process_that_ends_within_a_write_leaves_the_old_file_alone(tmp_path):
     assert path.read_text() == "new"
 
 
-def test_a_path_below_a_file_is_refused(tmp_path):
+def test_paths_that_name_no_file_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"cannot write .*a\.json"), replacing(tmp_path / "file" / "a.json"):
         pass
-
-
-def test_a_name_is_needed():
     for path in ("", "."):
         with pytest.raises(DataError, match=r"cannot write '.': expected the name of a file"), replacing(path):
             pass

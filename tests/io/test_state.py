@@ -7,11 +7,8 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from semfov import ActivePerception, Eye, Foveation
-from semfov.belief import MapEvidence, TargetEvidence
-from semfov.errors import InputError
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, InputError, MapEvidence, TargetEvidence
 from semfov.io.state import without_settings
-from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Glimpse, LogPolar, MultiScaleFovea, Perspective
 from tests.small import Blobs, Coloured, agent
 

@@ -9,14 +9,12 @@ import torch
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
 from eval.search.run import SearchConfig
-from semfov import InputError
-from semfov.belief import MapEvidence, TargetEvidence
+from semfov import FovealObservationModel, InputError, MapEvidence, TargetEvidence, rollout
 from semfov.belief.observers import LearnedMap, Semantic, Target
-from semfov.episode import StoredLooks, rollout
+from semfov.episode import StoredLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.calibration import BinarySums
-from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes

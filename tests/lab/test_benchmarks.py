@@ -39,14 +39,11 @@ def test_ratios_take_the_share_of_the_work_into_account():
     assert comparison_rows(measured) == [["work", "peer", "3,000", "24,000", "8 (8 to 8)"]]
 
 
-def test_the_order_of_runs_rotates():
+def test_runs_rotate_and_are_averaged_in_a_turn():
     order: list[str] = []
     interleaved({name: lambda name=name: order.append(name) for name in "abc"}, 0.0, time.perf_counter, least=3)
     rounds = ["".join(order[i : i + 3]) for i in range(0, len(order), 3)]
     assert rounds == ["abc", "bca", "cab", "abc"]
-
-
-def test_repeated_runs_in_a_turn_are_averaged():
     clock = iter(range(10**6))
     found = interleaved({"a": lambda: next(clock)}, 0.0, lambda: float(next(clock)), least=1, times=4)
     assert found == {"a": [1e3 * 5 / 4]}

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarters, sharp_place
-from semfov import DataError, Detections, DirichletBelief, Grid, InputError
-from semfov.belief import TargetEvidence
+from semfov import DataError, Detections, DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, conclude, decide
@@ -17,7 +16,6 @@ from semfov.episode import StoredLooks, rollout
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Predictive
-from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for, noise_for

@@ -202,22 +202,16 @@ def test_pictures_are_looked_at_once(tmp_path):
     assert [*first[0].features.maps] == [*again[0].features.maps] == ["red", "itti-koch"]
 
 
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
+def test_settings_of_gaze_without_their_fixations_are_refused():
+    for given, told in [
         ({"seconds": (-1.0,)}, r"seconds\[0\]: expected a number from 0.1"),
         ({"seconds": (0.05,)}, r"seconds\[0\]"),
         ({"seconds": (3.0, 5.0)}, "seconds: expected a time for each of 1 files"),
         ({"sizes": ("800x600", "640x480")}, "sizes: expected a frame"),
         ({"pictures": ()}, "pictures: expected a folder"),
-    ],
-)
-def test_a_time_and_a_folder_are_given_for_each_file_of_fixations(given, told):
-    with pytest.raises(InputError, match=told):
-        ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
-
-
-def test_settings_of_gaze_without_fixations_are_refused():
+    ]:
+        with pytest.raises(InputError, match=told):
+            ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
     with pytest.raises(InputError, match=r"--gaze\.fixations FILE"):
         FitDetectorConfig(model=Path("yolov3-tiny"), gaze=GazeModelFit(seconds=(3.0,))).named()
 

@@ -11,8 +11,7 @@ import torch
 
 from eval.head import report as head_report
 from eval.head.run import HeadConfig, HeadRun, _scene_answers, _tiling_order
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.target_evidence import TargetEvidence
+from semfov import MapEvidence, TargetEvidence
 from semfov.data.scene import Annotation, Scene
 from semfov.head.views import Views
 from tests.small import Tiles

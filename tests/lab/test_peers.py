@@ -15,14 +15,11 @@ from tests.small import Coloured
 pytestmark = pytest.mark.slow
 
 
-def test_contrast_of_a_sensor_without_blur_is_1():
+def test_contrasts_and_finest_gratings():
     assert acuity.contrasts(Foveation(1e9), 8.0) == pytest.approx([1.0] * 7, abs=1e-3)
     kept = acuity.contrasts(LogPolar(60.0), 8.0)
     assert kept[0] > 0.85
     assert kept[-1] < 0.05
-
-
-def test_wavelengths_of_the_finest_gratings_grow_with_the_distance():
     found = [float(value.strip("≤ >")) for value in acuity.finest(LogPolar(60.0))]
     assert found == sorted(found)
     # At least two samples per wavelength; samples are 1 + 350 / 60 times as far apart as in the centre.

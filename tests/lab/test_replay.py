@@ -8,10 +8,8 @@ import torch
 from eval.comparison.replay import replay
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.run import SearchConfig, SearchRun
-from semfov import ActivePerception
-from semfov.belief import MapEvidence
+from semfov import ActivePerception, MapEvidence, rollout
 from semfov.belief.observers import LearnedMap
-from semfov.episode import rollout
 from semfov.runs import exploration_protocol, search_protocol
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from tests.small import run_settings

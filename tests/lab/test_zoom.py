@@ -22,15 +22,13 @@ from eval.zoom.orders import in_order, quad_tree, shuffled
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.data.scene import Annotation
-from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects
+from semfov.detection import Detections, Objects
 from semfov.runs.config import DataConfig
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom import GlimpseEvidence
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
 from semfov.zoom.glances import Glance
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles, cells_of
 

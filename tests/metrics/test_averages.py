@@ -11,8 +11,5 @@ def test_standard_error():
     assert np.isnan(standard_error(values[:1])).all()
     np.testing.assert_allclose(standard_error(values.T, axis=1), standard_error(values))
     assert standard_error(values[:, :1], axis=1).shape == (3,)
-
-
-def test_two_values_are_enough():
-    """For a and b the standard deviation is |a - b| / √2, and the standard error of their mean |a - b| / 2."""
+    # For a and b the standard deviation is |a - b| / √2, and the standard error of their mean |a - b| / 2.
     np.testing.assert_allclose(standard_error(np.array([[1.0, 2.0], [4.0, 2.0]])), [1.5, 0])

@@ -41,32 +41,6 @@ def test_metrics_equal_loops(dtype):
     assert got.count == 500
 
 
-def test_bins_are_open_below_and_closed_above():
-    count, confident, right = reliability(torch.tensor([0.0, 0.5, 0.51, 1.0]), torch.tensor([0, 1, 0, 1]).bool(), 2)
-    assert count.tolist() == [2, 2]
-    assert confident.tolist() == pytest.approx([0.5, 1.51])
-    assert right.tolist() == [1, 1]
-
-
-def test_bins_may_have_any_edges():
-    p, right = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.9]), torch.tensor([1, 0, 1, 1, 1]).bool()
-    bins = reliability(p, right, torch.tensor([0.1, 0.5]))
-    torch.testing.assert_close(bins, torch.tensor([[2.0, 2, 1], [0.1, 0.5, 0.9], [1, 2, 1]], dtype=torch.float64))
-
-
-def test_a_certain_but_wrong_prediction_has_a_finite_loss():
-    assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)
-
-
-def test_without_predictions_the_error_is_nan():
-    assert math.isnan(calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).ece)
-
-
-def test_shapes_that_do_not_match_are_refused():
-    with pytest.raises(InputError, match="labels"):
-        calibration(torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))
-
-
 def test_sums_equal_loops(dtype, device):
     """Metrics of rare events in numpy, prediction by prediction."""
     generator = np.random.default_rng(0)
@@ -126,14 +100,11 @@ def test_sums_are_exact_after_json(pairs):
     assert (back.surprisal, back.square) == (sums.surprisal, sums.square)
 
 
-def test_sums_over_no_predictions_have_nan_metrics():
+def test_sums_of_few_and_of_certain_but_wrong_predictions():
     nothing = BinarySums.nothing()
     assert nothing.count == 0
     for name in ("nll", "brier", "ece", "probability", "rate"):
         assert math.isnan(getattr(nothing, name))
-
-
-def test_certain_but_wrong_predictions_have_finite_sums():
     sums = BinarySums.of(torch.tensor([1.0, 0.0]), torch.tensor([False, True]))
     assert math.isfinite(sums.nll)
     assert (sums.brier, sums.ece) == (1, 1)
@@ -155,12 +126,23 @@ def test_settings_at_their_limits():
     assert calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).count == 0
 
 
-def test_one_wrong_prediction_has_its_confidence_as_error():
+def test_calibration_of_few_and_of_certain_but_wrong_predictions():
+    assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)
+    assert math.isnan(calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).ece)
+    with pytest.raises(InputError, match="labels"):
+        calibration(torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))
     assert float(calibration_error(torch.tensor([0.8]), torch.tensor([False]))) == pytest.approx(0.8)
     assert float(calibration_error(torch.zeros(0), torch.zeros(0, dtype=torch.bool))) == 0
 
 
-def test_edges_between_bins_are_exact_in_double_precision():
+def test_bins_are_open_below_and_closed_above_at_any_edges():
+    count, confident, right = reliability(torch.tensor([0.0, 0.5, 0.51, 1.0]), torch.tensor([0, 1, 0, 1]).bool(), 2)
+    assert count.tolist() == [2, 2]
+    assert confident.tolist() == pytest.approx([0.5, 1.51])
+    assert right.tolist() == [1, 1]
+    p, right = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.9]), torch.tensor([1, 0, 1, 1, 1]).bool()
+    bins = reliability(p, right, torch.tensor([0.1, 0.5]))
+    torch.testing.assert_close(bins, torch.tensor([[2.0, 2, 1], [0.1, 0.5, 0.9], [1, 2, 1]], dtype=torch.float64))
     edges = torch.arange(1, 15, dtype=torch.float64) / 15
     for p in (edges, torch.nextafter(edges, torch.zeros_like(edges))):
         assert reliability(p, p > 0.5)[0].tolist() == [1] * 14 + [0]

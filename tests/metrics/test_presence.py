@@ -32,12 +32,6 @@ def test_area_equals_the_mann_whitney_statistic(hits, misses, seed):
     assert area_under_roc(*cases(hits, misses, seed)) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("present", [[True, True], [False, False], []], ids=["there", "not there", "none"])
-def test_present_and_absent_cases_are_both_needed(present):
-    with pytest.raises(InputError, match="present: expected both true and false values"):
-        area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
-
-
 @given(scores, shares)
 def test_threshold_is_the_smallest_that_keeps_the_allowed_false_alarms(misses, share):
     values = torch.tensor(misses, dtype=torch.float64)
@@ -71,23 +65,20 @@ def test_hits_equal_trying_every_threshold(hits, misses, share):
     assert hits_at(*cases(hits, misses), share) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_single_precision_score_equal_to_a_false_alarm_is_no_hit():
-    """The threshold is the next double above the absent case, so an equal score does not reach it."""
-    score = torch.tensor([0.3, 0.3, 0.30000004])
-    assert hits_at(score, torch.tensor([True, False, True]), 0.0) == 0.5
-
-
-def test_a_threshold_needs_at_least_one_case():
+def test_cases_of_both_kinds_are_needed():
+    for present in [[True, True], [False, False], []]:
+        with pytest.raises(InputError, match="present: expected both true and false values"):
+            area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
     with pytest.raises(InputError, match="absent: expected at least one case"):
         _threshold_for(torch.zeros(0), 0.1)
 
 
-def test_the_next_number_above_a_false_alarm_is_a_hit():
+def test_hits_lie_above_the_false_alarms():
+    # The threshold is the next double above the absent case, so an equal score does not reach it.
+    score = torch.tensor([0.3, 0.3, 0.30000004])
+    assert hits_at(score, torch.tensor([True, False, True]), 0.0) == 0.5
     score = torch.tensor([0.3, math.nextafter(0.3, 1)], dtype=torch.float64)
     assert hits_at(score, torch.tensor([False, True]), 0.0) == 1
-
-
-def test_every_target_is_a_hit_if_all_false_alarms_are_allowed():
     score = torch.tensor([0.5, 0.7, 0.1], dtype=torch.float64)
     assert _threshold_for(score, 1.0) == -math.inf
     assert hits_at(score, torch.tensor([False, True, True]), 1.0) == 1

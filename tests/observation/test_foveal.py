@@ -13,9 +13,8 @@ import scipy.optimize
 import scipy.stats
 import torch
 
-from semfov.errors import InputError
+from semfov import DirichletStatistics, FovealObservationModel, InputError, dirichlet
 from semfov.io.compatibility import NETWORKS, check_same_detector
-from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.fitting import _estimate_prior, _expected_table, _fit_table
 
 CLASSES = ["cup", "cat", "dog"]
@@ -81,11 +80,6 @@ def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
 
 
-def test_calibration_accepts_looks_without_detections():
-    model = FovealObservationModel(table(), EDGES, CLASSES)
-    assert model.calibrate(torch.zeros(2, 0, 4).double(), torch.zeros(2, 0).double()).shape == (2, 0, 4)
-
-
 def test_extreme_scores_neither_overflow_nor_vanish():
     alpha = torch.full((4, 3, 4), 0.2)
     alpha += 500 * torch.eye(4)[:, None]
@@ -103,12 +97,6 @@ def test_identity_returns_the_scores(dtype):
     torch.testing.assert_close(model.calibrate(scores, distance), dirichlet.floor(scores, 1e-6))
 
 
-def test_levels_follow_the_edges():
-    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
-    distance = torch.tensor([0.0, 0.1, 0.1001, 0.25, 0.26, 9.0])
-    assert model.level(distance).tolist() == [0, 0, 1, 1, 2, 2]
-
-
 def test_expected_scores_match_the_means_of_equation_16():
     """eq:expected_operator, its first factor: α_kd / Σ_j α_kdj."""
     model, alpha = FovealObservationModel(table(), EDGES, CLASSES), table().tolist()
@@ -119,11 +107,16 @@ def test_expected_scores_match_the_means_of_equation_16():
     assert torch.equal(fixed.expected_scores(), given)
 
 
-def test_the_given_table_is_copied():
+def test_levels_follow_the_edges_and_the_table_is_copied():
+    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
+    distance = torch.tensor([0.0, 0.1, 0.1001, 0.25, 0.26, 9.0])
+    assert model.level(distance).tolist() == [0, 0, 1, 1, 2, 2]
     alpha = table()
     with torch.no_grad():
         FovealObservationModel(alpha, EDGES, CLASSES).log_alpha.zero_()
     assert torch.equal(alpha, table())
+    model = FovealObservationModel(table(), EDGES, CLASSES)
+    assert model.calibrate(torch.zeros(2, 0, 4).double(), torch.zeros(2, 0).double()).shape == (2, 0, 4)
 
 
 def test_calls_use_the_current_parameters():
@@ -205,13 +198,10 @@ def test_levels_with_few_samples_copy_their_inner_neighbour_and_warn():
         assert torch.equal(model.expected_scores()[:, level], model.expected_scores()[:, 0])
 
 
-def test_empirical_expected_scores_are_the_means_of_the_data():
+def test_expected_scores_and_prior_are_those_of_the_data():
     statistics = draw(table(), torch.full((4, 3), 500))
     got = _expected_table(statistics, {}, shrinkage=1e-6)
     torch.testing.assert_close(got, statistics.mean, rtol=0, atol=1e-6)
-
-
-def test_prior_is_the_frequency_of_the_classes():
     count = torch.tensor([[9000, 900], [1000, 100], [0, 0]])
     prior = _estimate_prior(count).exp()
     torch.testing.assert_close(prior.sum(0), torch.ones(2, dtype=torch.float64))
@@ -322,15 +312,12 @@ def test_the_file_of_another_network_is_named(digest, said):
         check_same_detector({"name": "yolox-nano", "digest": own}, {"name": "yolox-nano", "digest": digest}, "model")
 
 
-def test_distances_in_pixels_are_refused_with_the_unit():
+def test_values_of_another_kind_or_unit_are_refused_with_the_conversion():
     model = FovealObservationModel(torch.ones(3, 2, 3), [0.2], ("cup", "cat"))
     scores = torch.tensor([0.2, 0.5, 0.3])
     with pytest.raises(InputError, match=r"^distance: expected units of the image's longer side, got 240; divide"):
         model.log_likelihood(scores, torch.tensor(240.0))
     assert torch.isfinite(model.log_likelihood(scores, torch.tensor(1.5))).all()
-
-
-def test_values_that_are_no_tensors_of_numbers_between_0_and_1_are_refused_with_the_conversion():
     model = FovealObservationModel(torch.ones(3, 2, 3), [0.2], ("cup", "cat"))
     scores, distance = torch.tensor([0.2, 0.5, 0.3]), torch.tensor(0.1)
     with pytest.raises(InputError, match=r"^scores: expected a tensor, got a NumPy array; give torch.as_tensor"):

@@ -20,11 +20,6 @@ def test_iou_equals_torchvision(scale):
     torch.testing.assert_close(box_iou(a, b), torchvision_iou(a, b))
 
 
-def test_boxes_without_area_overlap_nothing():
-    flat = torch.tensor([[3.0, 3, 3, 9]])
-    assert box_iou(flat, flat).tolist() == [[0.0]]
-
-
 def test_match_equals_a_loop():
     for seed in range(30):
         boxes, truth = some_boxes(12, seed), some_boxes(6, seed + 100)
@@ -42,7 +37,9 @@ def test_match_equals_a_loop():
         assert match(boxes, truth, labels, iou=0.3).tolist() == expected
 
 
-def test_matching_without_boxes_or_without_objects():
+def test_boxes_without_area_and_empty_lists_match_nothing():
+    flat = torch.tensor([[3.0, 3, 3, 9]])
+    assert box_iou(flat, flat).tolist() == [[0.0]]
     assert match(torch.zeros(0, 4), some_boxes(3, 0), torch.tensor([1, 2, 3])).tolist() == []
     assert match(some_boxes(2, 0), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)).tolist() == [0, 0]
 

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from semfov import FovealObservationModel
 from semfov.errors import InputError
-from semfov.observation import MissCounts
+from semfov.observation import FovealObservationModel, MissCounts
 
 
 def draw_looks(looks, seed=0):

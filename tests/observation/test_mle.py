@@ -140,15 +140,12 @@ def test_one_sample_shrinks_towards_the_parent():
     assert alpha.argmax() == 0
 
 
-def test_without_samples_the_fit_is_the_parent():
+def test_shrinkage_adds_samples_of_the_prior():
     empty = torch.full((2, 4), torch.nan, dtype=torch.float64)
     parent = expected_logs(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64))
     torch.testing.assert_close(shrink(empty, torch.zeros(2), parent, 1.0), parent.expand(2, 4))
     alpha = mle(shrink(empty, torch.zeros(2), vacuous(4), 1.0))
     torch.testing.assert_close(alpha, torch.ones(2, 4, dtype=torch.float64))
-
-
-def test_shrinkage_equals_adding_samples_of_the_prior():
     data = torch.from_numpy(np.random.default_rng(4).dirichlet([2.0, 1.0, 4.0], 7)).log()
     prior = torch.from_numpy(np.random.default_rng(5).dirichlet([1.0, 1.0, 1.0], 3)).log()
     pooled = mle(torch.cat([data, prior]).mean(0))

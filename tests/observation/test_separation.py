@@ -6,9 +6,8 @@ import torch
 from scipy import integrate, stats
 from torch.distributions import Dirichlet
 
-from semfov import FovealObservationModel
 from semfov.errors import InputError
-from semfov.observation import visibility
+from semfov.observation import FovealObservationModel, visibility
 from semfov.observation.separation import log_ratio_moments
 
 

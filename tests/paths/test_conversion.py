@@ -16,10 +16,9 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from torchvision.utils import draw_bounding_boxes
 
-from semfov import Detections, Grid, InputError
+from semfov import DataError, Detections, Grid, InputError
 from semfov.cli.episodes import _check_places
 from semfov.data.large import open_large
-from semfov.errors import DataError
 from tests import small
 
 CLASSES = ("background", "person", "tvmonitor", "cup")

@@ -87,12 +87,6 @@ def test_the_seed_repeats_scanpaths(gaze):
     assert not all(np.array_equal(a.points, b.points) for a, b in zip(again[0], other, strict=True))
 
 
-@pytest.mark.parametrize(("name", "value"), [("people", 0), ("seconds", 0.0), ("seconds", 1e9)])
-def test_wrong_numbers_are_named(gaze, name, value):
-    with pytest.raises(InputError, match=name):
-        gaze.scanpaths(**{name: value})
-
-
 def test_the_next_fixation_of_viewers_is_the_mean_of_their_densities(gaze):
     paths = gaze.scanpaths(5, seed=3)
     mean = gaze.given(paths, 2)
@@ -178,15 +172,15 @@ def test_comparison_equals_the_measures(gaze):
     assert gaze.compare(doubled)["NSS"] == pytest.approx(scores["NSS"])
 
 
-def test_frames_of_other_proportions_are_refused(gaze):
+def test_what_cannot_be_drawn_or_compared_is_refused(gaze):
+    for name, value in [("people", 0), ("seconds", 0.0), ("seconds", 1e9)]:
+        with pytest.raises(InputError, match=name):
+            gaze.scanpaths(**{name: value})
     square = Fixations("a.png", "1", np.array([[5.0, 5.0], [7.0, 8.0]]), (100, 100))
     with pytest.raises(InputError, match="proportions of 104 × 78"):
         gaze.compare([square])
     with pytest.raises(InputError, match="at least one person"):
         gaze.compare([])
-
-
-def test_first_fixations_alone_are_refused(gaze):
     only = Fixations("a.png", "1", np.array([[5.0, 5.0]]), (104, 78))
     with pytest.raises(InputError, match="after the first of each person"):
         gaze.compare([only])

@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov import Detections, Grid
+from semfov import Detections, Grid, Objects
 from semfov.decision import CloseUp, Decision
-from semfov.detection import Objects
 from semfov.head import Flat, Panorama, Views
 from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions

@@ -14,11 +14,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
+from semfov import DataError, Detections, DirichletBelief, Grid, InputError, Scanpath
 from semfov.data.large import open_large
 from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects, Placement
-from semfov.errors import DataError
 from semfov.head import Flat, Panorama, Views
 from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Stimulus, WindowMoment, ZoomPath, reduced_copy
@@ -225,13 +224,6 @@ def test_a_record_is_not_saved_under_the_name_of_another_file(name, call, tmp_pa
     with pytest.raises(InputError, match=rf"path: .* use record\.{call}\('.*{name}'\)"):
         scanpath().save(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_objects_are_printed_with_names_and_without_tensors():
-    path = zoom_path()
-    assert repr(path.objects) == "2 objects\n  cup 0.80, box 1,2–9,10, look 2\n  cup 0.70, box 2,4–18,20, look 2"
-    assert "class 1 0.70" in repr(path.candidates)
-    assert "tensor" not in repr(path.objects)
 
 
 def test_a_table_without_objects_has_its_columns():
@@ -536,7 +528,11 @@ def test_objects_of_a_head_have_the_directions_to_turn_to():
         assert (row["pan"], row["tilt"]) == pytest.approx((row["x"] - 32, 24 - row["y"]), abs=1e-4)
 
 
-def test_a_look_and_an_object_are_one_line():
+def test_objects_and_looks_are_printed_in_one_line_each():
+    path = zoom_path()
+    assert repr(path.objects) == "2 objects\n  cup 0.80, box 1,2–9,10, look 2\n  cup 0.70, box 2,4–18,20, look 2"
+    assert "class 1 0.70" in repr(path.candidates)
+    assert "tensor" not in repr(path.objects)
     record = zoom_path()
     assert [repr(record[number]).count("\n") for number in range(len(record))] == [0] * len(record)
     assert record.objects[-1].boxes.equal(record.objects.boxes[-1:])

@@ -10,9 +10,8 @@ import torch
 from eval.comparison import report_page as run_report
 from eval.comparison.summary import Curve
 from eval.search.run import SearchConfig
-from semfov import Detections, Grid, Scanpath
+from semfov import Detections, Grid, Objects, Scanpath
 from semfov.decision import Decision
-from semfov.detection import Objects
 from semfov.paths import ZoomPath
 from semfov.report import write_page, zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig

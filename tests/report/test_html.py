@@ -12,9 +12,8 @@ from PIL import Image
 
 from eval.comparison.curves_html import curves_html
 from semfov.decision import Decision
-from semfov.report.episode import episode_data
+from semfov.report import episode_data, write_page
 from semfov.report.looks import table_html
-from semfov.report.page import write_page
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -92,24 +91,6 @@ def test_the_page_contains_fixations_detections_and_pictures(page, scanpath, ima
     assert len(data["pictures"]) == 2  # the three views are equal
 
 
-def test_an_episode_that_was_not_timed_has_no_times(scanpath, image):
-    data = episode_data(scanpath, image, [image] * 3, name="replayed")
-    assert [each["seconds"] for each in data["fixations"]] == [None] * 3
-
-
-def test_the_number_of_classes_can_be_limited(scanpath, image):
-    data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, name="few", classes=1)
-    assert [each["label"] for each in data["maps"]] == [scanpath.classes[2], "background"]
-
-
-def test_values_that_are_not_finite_become_null(scanpath, image, tmp_path):
-    values = scanpath.values.clone()
-    values[0, 3] = -torch.inf
-    data = episode_data(replace(scanpath, values=values), image, [image] * 3, name="-inf")
-    page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
-    assert data_of(page)["episodes"][0]["fixations"][0]["values"][3] is None
-
-
 def test_points_of_curves_follow_the_numbers(hostile):
     text = curves_html({"flat": np.full(3, 0.5), hostile: np.array([0, 0.5, 1.0])}, {"flat": np.full(3, 0.1)}, hostile)
     assert hostile not in text
@@ -140,7 +121,16 @@ def test_classes_of_the_same_name_have_separate_entries(scanpath, image):
     assert sorted(labels) == ["N/A", "N/A (2)", "background", "cup"]
 
 
-def test_a_page_without_pictures_says_so(scanpath, tmp_path):
+def test_what_an_episode_lacks_is_left_out(scanpath, image, tmp_path):
+    data = episode_data(scanpath, image, [image] * 3, name="replayed")
+    assert [each["seconds"] for each in data["fixations"]] == [None] * 3
+    data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, name="few", classes=1)
+    assert [each["label"] for each in data["maps"]] == [scanpath.classes[2], "background"]
+    values = scanpath.values.clone()
+    values[0, 3] = -torch.inf
+    data = episode_data(replace(scanpath, values=values), image, [image] * 3, name="-inf")
+    page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
+    assert data_of(page)["episodes"][0]["fixations"][0]["values"][3] is None
     data = episode_data(scanpath, None, None, name="in the dark")
     page = write_page(tmp_path / "page.html", "t", [data]).read_text(encoding="utf-8")
     assert data_of(page)["pictures"] == []

@@ -10,9 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
+from semfov import InputError, Objects
 from semfov.decision import CloseUp, Decision
-from semfov.detection import Objects
-from semfov.errors import InputError
 from semfov.report import episode_data, page_html, zoom_data
 from semfov.report.zoom import _MOST_DETECTIONS
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
@@ -22,18 +21,12 @@ def pixels(uri):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))), dtype=float) / 255
 
 
-def test_names_are_never_interpreted_as_markup(zoom_page, hostile):
+def test_the_page_is_text_and_loads_nothing_from_elsewhere(zoom_page, hostile):
     page = zoom_page.read_text(encoding="utf-8")
     elements = names_are_text(page, hostile)
     # Title, heading, two entries of the head, name of the picture, rows of tables, and titles of objects.
     assert elements.texts.count(hostile) >= 7
-
-
-def test_the_page_loads_nothing_from_elsewhere(zoom_page):
     assert len(loads_nothing(zoom_page.read_text(encoding="utf-8"))) >= 5
-
-
-def test_pictures_are_in_the_markup_alone(zoom_page):
     page = zoom_page.read_text(encoding="utf-8")
     assert page.count("data:image/jpeg;base64,") == 4
     assert data_of(page)["pictures"] == []

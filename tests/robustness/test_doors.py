@@ -9,8 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov import ActivePerception, MapEvidence, TargetEvidence, WindowEye, ZoomAgent, as_image, foveate
-from semfov.data import read_image
+from semfov import ActivePerception, MapEvidence, TargetEvidence, WindowEye, ZoomAgent, as_image, foveate, read_image
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
 from semfov.detection.class_names import COCO_CLASSES
@@ -255,13 +254,10 @@ SUGGESTED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "meant"), SUGGESTED.items())
-def test_unknown_names_are_refused_with_a_suggested_class(name, meant):
-    with pytest.raises(SemfovError, match=rf"^target: unknown class '{name}'; did you mean '{re.escape(meant)}'"):
-        class_index(name, COCO_CLASSES, "target")
-
-
-def test_synonyms_are_no_class_names_and_suggest_only_known_classes():
+def test_unknown_names_are_refused_with_a_suggested_class():
+    for name, meant in SUGGESTED.items():
+        with pytest.raises(SemfovError, match=rf"^target: unknown class '{name}'; did you mean '{re.escape(meant)}'"):
+            class_index(name, COCO_CLASSES, "target")
     for word, classes in _SYNONYMS.items():
         assert set(classes) <= set(COCO_CLASSES)
         assert word not in {name.replace(" ", "") for name in COCO_CLASSES}

@@ -26,11 +26,8 @@ def test_grey_tiffs_are_rotated_only_once(tmp_path, orientation, oriented):
         assert expected.shape == (3, 2, 3)
 
 
-def test_points_far_outside_belong_to_the_nearest_cell():
+def test_points_and_boxes_far_outside_are_in_the_grid():
     assert Grid(3, 2, (30, 20)).cell_of(torch.tensor([[1e30, 5.0], [-1e30, 5.0]])).tolist() == [2, 0]
-
-
-def test_soft_footprints_of_huge_boxes_are_uniform():
     weights = Grid(3, 2, (30, 20)).footprint(torch.tensor([[-1e30, -1e30, 1e30, 1e30]]), "soft")
     torch.testing.assert_close(weights, torch.ones(1, 6))
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 import semfov
-from semfov import acquisition, fusion
-from semfov.belief import DirichletBelief
+from semfov import DirichletBelief, acquisition, fusion
 from semfov.gaze import select_fixation
 from tests.small import beliefs, model, rand
 

@@ -8,16 +8,9 @@ import torch
 
 from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
-from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence, observers, policies
 from semfov.belief import MapEvidence
-from semfov.errors import InputError
-from semfov.gaze.acquisition import (
-    ExpectedAccuracy,
-    PredictedTargetPosterior,
-    SaliencyPrior,
-    Static,
-    TargetPosterior,
-)
+from semfov.gaze.acquisition import ExpectedAccuracy, PredictedTargetPosterior, SaliencyPrior, Static, TargetPosterior
 from semfov.runs import candidates
 from semfov.runs.candidates import Candidate, _Models, _needs_observation, belief_settings, load_models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
@@ -87,19 +80,6 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
         assert needs_model(None, given, task="exploration") == (name not in without)
 
 
-def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model):
-    """`needs_observation` agrees with what making the strategy requires."""
-    others = {"evidence": TargetEvidence(4, 4), "map": MapEvidence(4, 4)}
-    for task in ("search", "exploration"):
-        for preset in presets(task).values():
-            assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
-            if _needs_observation([preset], BeliefConfig()):
-                with pytest.raises(InputError, match="observation model"):
-                    strategy(preset, task, **others)
-            else:
-                strategy(preset, task, **others)
-
-
 @pytest.fixture
 def loaded(monkeypatch):
     """The models that a run loads, as pairs of kind and name."""
@@ -132,10 +112,20 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
 
 
-@pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
-def test_a_run_without_policies_is_refused(config):
-    with pytest.raises(InputError, match="policies: expected at least one"):
-        load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
+def test_presets_need_their_observation_model_and_runs_a_policy(model):
+    # `needs_observation` agrees with what making the strategy requires.
+    others = {"evidence": TargetEvidence(4, 4), "map": MapEvidence(4, 4)}
+    for task in ("search", "exploration"):
+        for preset in presets(task).values():
+            assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
+            if _needs_observation([preset], BeliefConfig()):
+                with pytest.raises(InputError, match="observation model"):
+                    strategy(preset, task, **others)
+            else:
+                strategy(preset, task, **others)
+    for config in [SearchConfig, ExploreConfig]:
+        with pytest.raises(InputError, match="policies: expected at least one"):
+            load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
 
 
 def test_strategies_follow_their_settings(model):

@@ -6,8 +6,7 @@ import pytest
 import torch
 import yaml
 
-from semfov.detection import Selection
-from semfov.errors import InputError
+from semfov import InputError, Selection
 from semfov.fit.tempering import FitTemperingConfig
 from semfov.runs import config as settings
 from semfov.runs.command import run_command
@@ -34,16 +33,13 @@ def test_rounding_errors_just_above_one_are_accepted(agent):
     agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
 
 
-@pytest.mark.parametrize("wrong", [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}])
-def test_invalid_selections_are_refused(wrong):
-    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
-        Selection(**wrong)
-
-
-@pytest.mark.parametrize("stride", ["auto", 0, -32, 1.5, True])
-def test_invalid_strides_are_refused(stride):
-    with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
-        small.Fixed(stride=stride)
+def test_invalid_selections_and_strides_are_refused():
+    for wrong in [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}]:
+        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
+            Selection(**wrong)
+    for stride in ["auto", 0, -32, 1.5, True]:
+        with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
+            small.Fixed(stride=stride)
 
 
 def test_unused_settings_are_no_options_and_are_not_written(capsys):

@@ -38,14 +38,6 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_policy_has_a_preset(task):
-    made = {preset.policy for preset in presets(task).values()}
-    assert made == set(_valid_policies(task)) >= set(policy_names(task))
-    for name, preset in presets(task).items():
-        assert resolve(name, task) == resolve(preset, task) == preset
-
-
 def test_names_give_policy_scores_and_saliency():
     assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
@@ -62,7 +54,11 @@ def test_names_give_policy_scores_and_saliency():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_labels_of_presets_are_their_names(task):
+def test_every_policy_has_a_preset_with_its_name(task):
+    made = {preset.policy for preset in presets(task).values()}
+    assert made == set(_valid_policies(task)) >= set(policy_names(task))
+    for name, preset in presets(task).items():
+        assert resolve(name, task) == resolve(preset, task) == preset
     for name in presets(task):
         assert label(name, task) == ALIASES[task].get(name, name)
 
@@ -93,9 +89,8 @@ def test_labels_list_the_differences_from_a_preset():
     assert label(PolicyConfig("kl", saliency="itti-koch"), "exploration") == "kl-raw, saliency itti-koch"
 
 
-@pytest.mark.parametrize(
-    ("choice", "task", "suggested"),
-    [
+def test_unknown_names_and_settings_are_refused_with_a_suggestion():
+    for choice, task, suggested in [
         ("predicitve-raw", "search", "predictive-raw"),
         ("target-evidenc", "search", "target-evidence"),
         ("recomended", "exploration", "recommended"),
@@ -106,36 +101,30 @@ def test_labels_list_the_differences_from_a_preset():
         (PolicyConfig("kl", footprint="box-centre"), "exploration", "box_centre"),
         (PolicyConfig("kl", saliency="vocus"), "exploration", "vocus2"),
         (PolicyConfig("kl", "calibratd"), "exploration", "calibrated"),
-    ],
-    ids=str,
-)
-def test_unknown_names_get_a_suggestion(choice, task, suggested):
-    for call in (resolve, label):
-        with pytest.raises(InputError, match=f"did you mean '{suggested}'"):
-            call(choice, task)
-
-
-@pytest.mark.parametrize(
-    ("task", "settings", "told"),
-    [
+    ]:
+        for call in (resolve, label):
+            with pytest.raises(InputError, match=f"did you mean '{suggested}'"):
+                call(choice, task)
+    for task, settings, told in [
         ("search", {"policy": "kl"}, "policy"),
         ("exploration", {"policy": "target-evidence"}, "policy"),
         *((task, {"policy": "saliency"}, "^saliency: .*vocus2, itti-koch") for task in TASKS),
-        *(("exploration", {"policy": "kl", "tempering": wrong}, "^tempering: expected a number above 0")
-          for wrong in (0.0, -0.5, float("nan"))),
+        *(
+            ("exploration", {"policy": "kl", "tempering": wrong}, "^tempering: expected a number above 0")
+            for wrong in (0.0, -0.5, float("nan"))
+        ),
         # Without scores in use, its label would be the same as with raw scores.
         ("search", {"policy": "random", "scores": "calibrated"}, "^scores: .*'random'"),
         ("search", {"policy": "target-evidence", "scores": "calibrated"}, "^scores: .*'target-evidence'"),
         ("search", {"policy": "saliency", "scores": "calibrated", "saliency": "vocus2"}, "^scores: .*'saliency'"),
         # It has a belief of its own, not the map.
-        *(("search", {"policy": "target-evidence", name: value}, f"^{name}: .*'target-evidence'")
-          for name, value in (("tempering", 0.25), ("footprint", "soft"), ("memory", "all"), ("misses", True))),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_that_a_policy_does_not_have_are_refused(task, settings, told):
-    with pytest.raises(InputError, match=told):
-        resolve(PolicyConfig(**settings), task)
+        *(
+            ("search", {"policy": "target-evidence", name: value}, f"^{name}: .*'target-evidence'")
+            for name, value in (("tempering", 0.25), ("footprint", "soft"), ("memory", "all"), ("misses", True))
+        ),
+    ]:
+        with pytest.raises(InputError, match=told):
+            resolve(PolicyConfig(**settings), task)
 
 
 def parsed(config, *arguments):

@@ -174,12 +174,9 @@ def test_an_episode_does_not_depend_on_other_scenes(scenes):
     assert torch.equal(tie_noise(scenes, first[3], 25, protocol), tie_noise(alone, second[3], 25, protocol))
 
 
-def test_different_seeds_give_different_starts(scenes):
+def test_starts_depend_on_the_seed_and_repeat_evenly(scenes):
     starts = [[e.start for e in episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10, seed=seed))] for seed in (0, 1)]
     assert starts[0] != starts[1]
-
-
-def test_starts_repeat_evenly_when_there_are_more_than_cells(scenes):
     episodes = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=48))
     starts = [episode.start for episode in episodes if episode.target == 2]
     assert len(starts) == 48

@@ -5,8 +5,7 @@ import json
 import pytest
 from PIL import Image
 
-from semfov import ActivePerception, CocoScenes
-from semfov.errors import DataError, InputError
+from semfov import ActivePerception, CocoScenes, DataError, InputError
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye, make_observation, make_scenes, observation_name
@@ -90,24 +89,14 @@ def test_photographs_are_chosen_by_their_ids(photographs, ids):
     assert [scene.name for scene in scenes] == ["3.png", "92.png"]
 
 
-def test_other_selections_apply_after_the_one_by_ids(photographs):
+def test_selections_apply_in_order_and_have_their_fingerprint(photographs):
     assert choose(photographs, ids=[15, 92, 14], limit=2).ids == [14, 15]
     assert choose(photographs).ids == choose(photographs, ids=None).ids == [3, 14, 15, 92]
     with pytest.raises(DataError, match="none of 4 images"):
         CocoScenes(photographs, photographs / "cups.json", ("cup",), min_instances=2, ids=[14])
-
-
-def test_the_fingerprint_depends_on_the_chosen_photographs(photographs):
     every, some, same = (choose(photographs, ids=ids).fingerprint for ids in (None, [3, 14], ["14", "3"]))
     assert some == same != every
     assert choose(photographs, ids=[3, 14, 15, 92]).fingerprint == every
-
-
-def test_missing_ids_are_named(photographs):
-    with pytest.raises(DataError, match=r"cups\.json: expected .* each of 3 ids, got none for 2 of them: 16, 7;"):
-        choose(photographs, ids=[7, 14, 16])
-    with pytest.raises(DataError, match="each of 9 ids, got none for 9 of them: 100, 101, 102, 103, 104, …"):
-        choose(photographs, ids=range(100, 109))
 
 
 def test_ids_are_read_from_a_file(photographs):
@@ -120,11 +109,15 @@ def test_ids_are_read_from_a_file(photographs):
         make_scenes(data, ("cup",))
 
 
-@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00"], ids=["missing", "not text"])
-def test_a_list_of_ids_that_cannot_be_read_is_named(photographs, content):
-    listed = photographs / "ids.txt"
-    if content is not None:
-        listed.write_bytes(content)
-    data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed)
-    with pytest.raises(DataError, match=r"ids\.txt: expected a text file with one id per line"):
-        make_scenes(data, ("cup",))
+def test_ids_that_are_missing_or_cannot_be_read_are_named(photographs):
+    with pytest.raises(DataError, match=r"cups\.json: expected .* each of 3 ids, got none for 2 of them: 16, 7;"):
+        choose(photographs, ids=[7, 14, 16])
+    with pytest.raises(DataError, match="each of 9 ids, got none for 9 of them: 100, 101, 102, 103, 104, …"):
+        choose(photographs, ids=range(100, 109))
+    for content in [None, b"\xff\xfe\x00"]:
+        listed = photographs / "ids.txt"
+        if content is not None:
+            listed.write_bytes(content)
+        data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed)
+        with pytest.raises(DataError, match=r"ids\.txt: expected a text file with one id per line"):
+            make_scenes(data, ("cup",))

@@ -9,9 +9,8 @@ from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
 from torch.utils.data import DataLoader
 
 import semfov.sensor
-from semfov import foveate
 from semfov.errors import InputError
-from semfov.sensor import RandomFoveation
+from semfov.sensor import RandomFoveation, foveate
 from tests.small import draw
 
 
@@ -80,12 +79,6 @@ def test_the_given_share_of_images_is_foveated():
     assert 30 < changed.sum() < 90
 
 
-@pytest.mark.parametrize("keepdim", [False, True])
-def test_one_image(keepdim):
-    image = draw(3, 24, 32, dtype=torch.float32)
-    assert RandomFoveation(5.0, p=1.0, keepdim=keepdim)(image).shape == (image.shape if keepdim else (1, 3, 24, 32))
-
-
 def test_gradients():
     augment = RandomFoveation((3.0, 6.0), levels=2, p=1.0)
     image = draw(2, 1, 6, 7, dtype=torch.float64).requires_grad_()
@@ -125,15 +118,17 @@ def test_compiles_to_one_graph():
     torch.testing.assert_close(compiled(image, params=params), augment(image, params=params))
 
 
-def test_works_in_a_data_loader():
+def test_one_image_is_augmented_alone_or_in_a_loader():
+    for keepdim in [False, True]:
+        image = draw(3, 24, 32, dtype=torch.float32)
+        assert RandomFoveation(5.0, p=1.0, keepdim=keepdim)(image).shape == (image.shape if keepdim else (1, 3, 24, 32))
     augment = RandomFoveation(5.0, p=1.0, keepdim=True)
     loader = DataLoader([(augment(draw(3, 16, 20, dtype=torch.float32)), 0)] * 2, batch_size=2)
     assert next(iter(loader))[0].shape == (2, 3, 16, 20)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
+def test_bad_settings_and_names():
+    for settings, message in [
         ({"sigma": 0.0}, "sigma: expected a positive number"),
         ({"sigma": (5.0, 4.0)}, "sigma: expected"),
         ({"sigma": math.inf}, "sigma: expected"),
@@ -142,13 +137,8 @@ def test_works_in_a_data_loader():
         ({"growth": 0.0}, "growth: expected a positive number"),
         ({"p": 1.5}, "p: expected a probability"),
         ({"convention": "korina"}, "did you mean 'kornia'"),
-    ],
-)
-def test_bad_settings(settings, message):
-    with pytest.raises(InputError, match=message):
-        RandomFoveation(**{"sigma": 3.0} | settings)
-
-
-def test_an_unknown_name_in_the_module_is_an_error():
+    ]:
+        with pytest.raises(InputError, match=message):
+            RandomFoveation(**{"sigma": 3.0} | settings)
     with pytest.raises(AttributeError, match="RandomFixation"):
         _ = semfov.sensor.RandomFixation

@@ -3,9 +3,8 @@ import math
 import pytest
 import torch
 
-from semfov import Foveation, foveate
 from semfov.errors import InputError
-from semfov.sensor import laplacian_pyramid
+from semfov.sensor import Foveation, foveate, laplacian_pyramid
 from tests.small import close, draw, rand
 
 CONVENTIONS = ("kornia", "opencv")

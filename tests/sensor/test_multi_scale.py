@@ -7,9 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import load_detector
-from semfov.errors import InputError
-from semfov.eye import Eye
+from semfov import Eye, InputError, load_detector
 from semfov.sensor import MultiScaleFovea
 from tests.colours import write_network
 from tests.small import Coloured, close, draw

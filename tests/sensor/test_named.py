@@ -9,9 +9,8 @@ import torch
 
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import main as search
-from semfov import ActivePerception, FovealObservationModel, Scanpath
+from semfov import ActivePerception, FovealObservationModel, InputError, Scanpath
 from semfov.cli.main import main as command
-from semfov.errors import InputError
 from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig

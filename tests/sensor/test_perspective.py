@@ -73,13 +73,10 @@ def test_gradients_in_yaw_pitch_and_field(pose, antialias):
     assert gradcheck(lambda p: perspective(panorama, p, (5, 4), antialias=antialias), (place,), eps=1e-7, atol=1e-5)
 
 
-def test_gradients_in_the_panorama():
+def test_gradients_in_the_panorama_and_at_a_pole():
     panorama = torch.rand(1, 1, 6, 12, dtype=torch.float64, requires_grad=True)
     pose = torch.tensor([[175.0, 60.0, 80.0]], dtype=torch.float64)
     assert gradcheck(lambda p: perspective(p, pose, (4, 3)), (panorama,))
-
-
-def test_gradients_are_finite_and_not_zero_at_a_pole():
     panorama = torch.rand(1, 3, 32, 64)
     pose = torch.tensor([[30.0, 90.0, 60.0]], requires_grad=True)
     perspective(panorama, pose, (9, 9)).square().sum().backward()

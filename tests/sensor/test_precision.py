@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.belief.grid import Grid
+from semfov import Foveation, Grid, InputError, foveate, merge_boxes
 from semfov.data.inputs import as_positions
-from semfov.detection import merge_boxes
 from semfov.detection.placement import Placement
-from semfov.errors import InputError
 from semfov.observation.matching import box_iou
-from semfov.sensor import Foveation, LogPolar, MultiScaleFovea, foveate, glimpse, perspective
+from semfov.sensor import LogPolar, MultiScaleFovea, glimpse, laplacian_pyramid, perspective
 from semfov.sensor.glimpse import window_around, windows_at
-from semfov.sensor.pyramid import laplacian_pyramid
 from tests.small import rand
 
 WIDE = 4096
@@ -69,13 +66,7 @@ def test_views_of_a_panorama_in_half_precision(dtype):
     torch.testing.assert_close(view.float(), expected, atol=8 * torch.finfo(dtype).eps, rtol=0)
 
 
-def test_places_of_bands_are_not_rounded():
-    bands = laplacian_pyramid(rand(1, 1, 4, WIDE).half(), 2)
-    assert bands.places(0, -1).tolist() == list(range(WIDE))
-
-
 ONE, OTHER = [3000.5, 2000.25, 3400.5, 2400.25], [3010.5, 2000.25, 3400.5, 2400.25]
-IOU = 390 / 400
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int32], ids=str)
@@ -137,6 +128,8 @@ def test_places_on_a_canvas_of_any_type(kind):
     torch.testing.assert_close(around.double(), window_around(boxes[0].double(), (4096, 3072)), rtol=1e-6, atol=1e-3)
 
 
-def test_positions_keep_double_precision_and_their_own_device():
+def test_places_and_positions_are_not_rounded():
+    bands = laplacian_pyramid(rand(1, 1, 4, WIDE).half(), 2)
+    assert bands.places(0, -1).tolist() == list(range(WIDE))
     assert as_positions(torch.tensor([0.1], dtype=torch.float64)).dtype == torch.float64
     assert as_positions(torch.tensor([1]), torch.zeros(1, dtype=torch.float16)).dtype == torch.float32

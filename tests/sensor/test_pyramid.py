@@ -6,9 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import foveate
 from semfov.errors import InputError
-from semfov.sensor import laplacian_pyramid, pyramid, pyrdown, pyrup
+from semfov.sensor import foveate, laplacian_pyramid, pyramid, pyrdown, pyrup
 from tests.small import draw
 
 CONVENTIONS = ("kornia", "opencv")

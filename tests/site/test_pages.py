@@ -40,24 +40,6 @@ def test_names_link_to_the_page_of_their_definition(names, name, there):
     assert names.place(name) == there
 
 
-@pytest.mark.parametrize("name", ["semfov.MissModel", "semfov.sensor.fovea", "semfov.Foveation.close"])
-def test_names_that_do_not_exist_are_refused(names, name):
-    with pytest.raises(LookupError, match="does not exist"):
-        names.link(f"see `{name}`")
-
-
-def test_names_in_links_double_backticks_and_plain_text_are_not_linked(names):
-    text = "[`Foveation`](x.md), ``Foveation`` and Foveation"
-    assert names.link(text) == text
-
-
-def test_names_of_internal_functions_are_collected(names):
-    inside = set()
-    text = names.link("`semfov.fit.evidence.evidence_objective`", inside)
-    assert text == "[`semfov.fit.evidence.evidence_objective`][semfov.fit.evidence.evidence_objective]"
-    assert inside == {"semfov.fit.evidence.evidence_objective"}
-
-
 def test_a_docstring_becomes_markdown(names):
     text = """Blur.
 
@@ -105,7 +87,13 @@ blur(1)
     )
 
 
-def test_short_names_link_to_the_same_module_but_not_if_they_are_arguments(names):
+def test_names_are_linked_where_they_are_names(names):
+    text = "[`Foveation`](x.md), ``Foveation`` and Foveation"
+    assert names.link(text) == text
+    inside = set()
+    text = names.link("`semfov.fit.evidence.evidence_objective`", inside)
+    assert text == "[`semfov.fit.evidence.evidence_objective`][semfov.fit.evidence.evidence_objective]"
+    assert inside == {"semfov.fit.evidence.evidence_objective"}
     module = "semfov.observation.dirichlet"
     assert docstring("see `entropy`", names, module) == "see [`entropy`][semfov.observation.dirichlet.entropy]"
     assert docstring("see `entropy`", names, module, {"entropy"}) == "see `entropy`"
@@ -136,22 +124,19 @@ def test_spaces_around_functions_are_those_of_tex(formula, spaces):
     assert len(etree.fromstring(mathml(formula, block=False)).findall(f".//{SPACE}mspace")) == spaces
 
 
-def test_a_command_without_mathml_is_refused():
-    with pytest.raises(ValueError, match="foo"):
-        mathml(r"\foo{a}", block=False)
-
-
-@pytest.mark.parametrize("text", ["`$x$`", "it costs $5", "$HOME and $PATH", r"\$x\$"])
-def test_dollar_signs_outside_formulas_are_left_unchanged(text):
-    assert "<math" not in markdown.markdown(text, extensions=["docs.site.formulas"])
-
-
-def test_formulas_in_tables_are_converted():
+def test_formulas_are_converted_in_tables_and_other_dollars_are_not():
+    for text in ["`$x$`", "it costs $5", "$HOME and $PATH", r"\$x\$"]:
+        assert "<math" not in markdown.markdown(text, extensions=["docs.site.formulas"])
     html = markdown.markdown("| a | b |\n|---|---|\n| $x_i$ | c |", extensions=["docs.site.formulas", "tables"])
     assert "<td><math" in html
 
 
-def test_a_link_to_a_missing_page_is_refused(tmp_path):
+def test_names_commands_and_links_that_do_not_exist_are_refused(names, tmp_path):
+    for name in ["semfov.MissModel", "semfov.sensor.fovea", "semfov.Foveation.close"]:
+        with pytest.raises(LookupError, match="does not exist"):
+            names.link(f"see `{name}`")
+    with pytest.raises(ValueError, match="foo"):
+        mathml(r"\foo{a}", block=False)
     stage = Stage(tmp_path)
     stage.page("[here](nowhere.md)", "docs/method.md")
     with pytest.raises(LookupError, match=r"docs/method\.md links to nowhere\.md"):

@@ -26,11 +26,8 @@ def test_labels_do_not_overlap(corners, point):
     assert all(abs(x2 - x1 - 20) < 1e-9 and abs(y2 - y1 - 6) < 1e-9 for x1, y1, x2, y2 in labels)
 
 
-def test_a_single_label_is_placed_in_the_corner_of_its_box():
+def test_a_label_is_in_the_corner_of_its_box_and_in_the_frame():
     assert place_labels([(10, 20, 60, 70)], [(20, 6)], (100, 100)) == [(10, 20, 30, 26)]
-
-
-def test_a_label_stays_in_the_frame():
     assert place_labels([(95, 98, 100, 100)], [(20, 6)], (100, 100)) == [(80, 94, 100, 100)]
 
 

@@ -17,12 +17,6 @@ print("image/png" in plain, drawn["image/png"][:4] == b"\\x89PNG", drawn["image/
 """
 
 
-def test_a_figure_is_displayed_before_pyplot_is_imported(fresh):
-    """Plain Matplotlib figures are not: notebooks can display them only after pyplot is imported."""
-    pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
-    assert fresh(CODE).split() == ["False", "True", "1"]
-
-
 LOOP = """
 from IPython.core.interactiveshell import InteractiveShell
 from IPython.utils.capture import capture_output
@@ -38,7 +32,10 @@ for cell in ("for number in range(2): draw()", "kept = draw()", "draw()", "1"):
 """
 
 
-def test_figures_of_a_loop_are_displayed_once(fresh):
-    """The last value of a cell is its result, which is shown in another way."""
+def test_figures_are_displayed_once(fresh):
+    # Plain Matplotlib figures are not: notebooks can display them only after pyplot is imported.
+    pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
+    assert fresh(CODE).split() == ["False", "True", "1"]
+    # The last value of a cell is its result, which is shown in another way.
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
     assert fresh(LOOP).split() == ["2", "1", "0", "0"]

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Grid
+from semfov import Grid, InputError
 from semfov.data.fixations import Fixations
-from semfov.errors import InputError
 from semfov.viz import plot_scanpath
 from semfov.viz.style import TIME
 from tests import small

@@ -10,8 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import InputError, viz
-from semfov.errors import DataError
+from semfov import DataError, InputError, viz
 
 CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
 

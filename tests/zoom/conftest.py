@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
+from semfov.detection import Candidates, Detector
 
 
 class Squares(Detector):

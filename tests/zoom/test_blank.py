@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from semfov.data.large import open_large
-from semfov.zoom import GlimpseEvidence
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
 from tests.data.test_large import pixels
 

@@ -9,18 +9,15 @@ import pytest
 import torch
 from scipy.stats import nbinom
 
-from semfov.agents import ZoomAgent
+from semfov import Detections, InputError, Objects, WindowEye, ZoomAgent
 from semfov.data.scene import Annotation
-from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects, unlike
-from semfov.errors import InputError
+from semfov.detection.objects import unlike
 from semfov.fit.windows_certainty import _fit_unseen, fit_certainty
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty, object_facts
 from semfov.zoom.glances import Glance, on_lattice
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, merge_with_facts
 from tests.small import area, iou, shared
 

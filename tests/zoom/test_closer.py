@@ -7,14 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov.agents import ZoomAgent
+from semfov import DataError, Detections, InputError, WindowEye, ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
-from semfov.detection.detections import Detections
-from semfov.errors import DataError, InputError
 from semfov.io.storage import read, write_file
-from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
 from semfov.zoom.glances import Glance, Glances, on_lattice
 from tests.zoom.conftest import Squares

@@ -9,11 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from examples.export_look import _LOOK_METADATA_KEY, export_look
+from semfov import InputError, Selection, WindowEye
 from semfov.detection.onnx import load_onnx
-from semfov.detection.selection import Selection
-from semfov.errors import InputError
 from semfov.observation.matching import box_iou
-from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import pool_all
 from semfov.zoom.glances import LiveGlances, on_lattice
 
@@ -118,12 +117,6 @@ def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network,
         compare(found, eye.glance(eye.open(picture), torch.tensor([[90.0, 90.0, 1.0]])), 1e-3, 1e-6)
 
 
-def test_a_picture_without_objects_gives_no_boxes(exported):
-    found = run(exported, np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
-    assert found["boxes"].shape == (0, 4)
-    assert found["scores"].shape == (0, 4)
-
-
 def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
     """With a torch detector, in windows of 32 cells."""
     torch.manual_seed(3)
@@ -160,7 +153,10 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
             torch.testing.assert_close(found[f"odds_{step}"], expected, rtol=0, atol=tolerance)
 
 
-def test_the_file_records_classes_input_size_and_cells(exported):
+def test_the_file_records_its_settings_and_gives_no_boxes_without_objects(exported):
+    found = run(exported, np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
+    assert found["boxes"].shape == (0, 4)
+    assert found["scores"].shape == (0, 4)
     session = ort.InferenceSession(exported, providers=["CPUExecutionProvider"])
     metadata = json.loads(session.get_modelmeta().custom_metadata_map[_LOOK_METADATA_KEY])
     assert metadata == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}

@@ -5,9 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.errors import InputError
+from semfov import InputError, WindowEye
 from semfov.sensor.glimpse import glimpse, windows_at
-from semfov.zoom import WindowEye
 from semfov.zoom.eye import BORDER
 
 

@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from semfov.detection import Candidates, Detector, Selection
+from semfov import Detector, InputError, Selection, WindowEye
+from semfov.detection import Candidates
 from semfov.detection.detector import FAINT
-from semfov.errors import InputError
-from semfov.zoom import WindowEye
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.hints import DETECTION_SCORE, hints_of
 

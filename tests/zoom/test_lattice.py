@@ -24,13 +24,6 @@ def test_windows_tile_the_picture(size):
     assert whole[3] >= size[1] - 0.5
 
 
-def test_actions_are_numbered():
-    lattice = Lattice.over((2560, 1920), (416, 416))
-    assert len(lattice.actions) == len(lattice) == 579
-    for number in (0, 1, 153, 154, 578):
-        assert lattice.number(*lattice.actions[number].tolist()) == number
-
-
 @given(sizes)
 def test_a_single_fixation_equals_its_row_among_all(size):
     lattice = Lattice.over(size, (416, 320))
@@ -39,7 +32,11 @@ def test_a_single_fixation_equals_its_row_among_all(size):
     assert torch.equal(torch.tensor(fixations), lattice.fixations(some))
 
 
-def test_fixations_are_centres_of_boxes():
+def test_actions_are_numbered_and_fixations_are_centres_of_boxes():
+    lattice = Lattice.over((2560, 1920), (416, 416))
+    assert len(lattice.actions) == len(lattice) == 579
+    for number in (0, 1, 153, 154, 578):
+        assert lattice.number(*lattice.actions[number].tolist()) == number
     lattice = Lattice.over((3840, 2160), (416, 416))
     boxes, fixations = lattice.boxes(lattice.actions), lattice.fixations(lattice.actions)
     torch.testing.assert_close((boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5, fixations[:, :2])

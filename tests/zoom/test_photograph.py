@@ -5,11 +5,10 @@ import math
 import pytest
 import torch
 
-from semfov.agents import ZoomAgent
+from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
-from semfov.detection.detections import Detections
-from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import PhotographPlaces, WindowLook, candidates, closer_window
 from semfov.zoom.glances import LiveGlances, overview
@@ -47,13 +46,6 @@ def evidence(give_up=0.1, confirm=0.6):
     return GlimpseEvidence(3, 8, thresholds=Thresholds(0.9, 0.3), photograph=own).eval().requires_grad_(False)
 
 
-def test_presence_follows_the_formula():
-    own = evidence().photograph
-    for score, target, usual in ((0.3, 1, 0.0), (0.01, 2, -1.0), (0.9, 3, 2.0)):
-        expected = math.log(score / (1 - score)) + 0.5 * usual + 0.25
-        assert float(own.presence(torch.tensor(score), torch.tensor(target))) == pytest.approx(expected, abs=1e-5)
-
-
 def test_a_file_keeps_the_evidence_for_photographs(tmp_path):
     model = evidence()
     plain = Verification(thresholds=model.photograph.verification.thresholds)
@@ -67,7 +59,11 @@ def test_a_file_keeps_the_evidence_for_photographs(tmp_path):
     assert GlimpseEvidence.from_pretrained(tmp_path / "without.safetensors").photograph is None
 
 
-def test_a_photograph_has_its_own_certainty():
+def test_presence_follows_the_formula_with_certainty_of_its_own():
+    own = evidence().photograph
+    for score, target, usual in ((0.3, 1, 0.0), (0.01, 2, -1.0), (0.9, 3, 2.0)):
+        expected = math.log(score / (1 - score)) + 0.5 * usual + 0.25
+        assert float(own.presence(torch.tensor(score), torch.tensor(target))) == pytest.approx(expected, abs=1e-5)
     model = evidence()
     assert model.certainty_in(LATTICE) is model.photograph.certainty
     assert model.certainty_in(Lattice.over((1024, 768), (128, 128))) is model.certainty

@@ -8,14 +8,11 @@ import torch
 from matplotlib.figure import Figure
 from torchvision.transforms.functional import to_pil_image
 
-from semfov.agents import ZoomAgent
+from semfov import Detections, InputError, WindowEye, ZoomAgent
 from semfov.data.large import open_large
-from semfov.detection.detections import Detections
-from semfov.errors import InputError
 from semfov.viz import plot_scanpath
-from semfov.zoom import GlimpseEvidence, WindowEye, merge
+from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
-from semfov.zoom.lattice import Lattice
 
 
 @pytest.fixture

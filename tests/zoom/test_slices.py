@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.agents import ZoomAgent
+from semfov import InputError, WindowEye, ZoomAgent
 from semfov.agents.episode import EpisodeLimits
-from semfov.errors import InputError
-from semfov.zoom import WindowEye
 from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import adaptive_slices, ranked, raw, usual_slices

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import ActivePerception
-from semfov.agents import ZoomAgent
-from semfov.detection.detections import Detections
-from semfov.errors import InputError
-from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
+from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.objects import without_replaced
 from tests.zoom.test_closer import Fickle, evidence

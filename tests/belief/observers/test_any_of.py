@@ -3,11 +3,9 @@
 import pytest
 import torch
 
-from semfov import Grid
-from semfov.belief import TargetEvidence
+from semfov import Grid, InputError, TargetEvidence
 from semfov.belief.observers import AnyOf, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.errors import InputError
 from semfov.strategy import _weights_by_class
 
 GRID = Grid(5, 4, (100, 60))

@@ -7,12 +7,9 @@ import pytest
 import scipy.special
 import torch
 
-from semfov import FovealObservationModel, Grid
-from semfov.belief import TargetEvidence
+from semfov import FovealObservationModel, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, highest_score
-from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, MapBelief, Target
-from semfov.errors import InputError
 from semfov.gaze.acquisition import KLDivergence
 
 GRID = Grid(6, 4, (90, 60))

@@ -27,20 +27,14 @@ def test_a_letterboxed_picture_fits_and_is_centred(width, height, across, down):
     np.testing.assert_allclose(placed.box_to_picture(placed.box_to_screen((1, 2, 3, 4))), (1, 2, 3, 4), atol=1e-6)
 
 
-def test_letterbox_equals_values_computed_by_hand():
+def test_letterbox_and_resizing_equal_values_computed_by_hand():
     # 640 × 480 on a screen of 1680 × 1050 becomes 1400 × 1050, with an offset of 140 from the left.
     placed = Letterbox((1680, 1050), (640, 480))
     assert placed.box_to_screen((0, 0, 640, 480)) == (140, 0, 1540, 1050)
     # 480 × 640 becomes 787.5 × 1050.
     assert Letterbox((1680, 1050), (480, 640)).offset == (446.25, 0)
-
-
-def test_resizing_keeps_centres_of_cells_and_edges():
     assert _resized_box((0, 0, 32, 24), (32, 24), (1680, 1050)) == (0, 0, 1680, 1050)
     np.testing.assert_allclose(_resized_points(np.array([[0.0, 23.0]]), (32, 24), (1680, 1050)), [[25.75, 1027.625]])
-
-
-def test_a_size_of_zero_is_refused():
     with pytest.raises(InputError, match=r"^picture:"):
         Letterbox((1680, 1050), (0, 5))
 

@@ -6,8 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.belief import Grid
-from semfov.errors import InputError
+from semfov import Grid, InputError
 from semfov.gaze.saliency import cell_saliency
 
 

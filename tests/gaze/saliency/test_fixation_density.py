@@ -7,9 +7,8 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from semfov import Detections, InputError
+from semfov import DataError, Detections, InputError
 from semfov.detection import FeatureMaps, Placement
-from semfov.errors import DataError
 from semfov.gaze.saliency import FixationDensity, OculomotorBias
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.gaze.saliency.oculomotor import _LENGTHS, _NEAR

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from semfov import InputError
-from semfov.detection import Detections, Placement
-from semfov.detection.feature_maps import FeatureMaps
+from semfov.detection import Detections, FeatureMaps, Placement
 from semfov.gaze.saliency import features_so_far
 from tests.small import draw as rand
 

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from semfov import FovealObservationModel
-from semfov.belief import MapEvidence, TargetEvidence
+from semfov import FovealObservationModel, MapEvidence, TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.fixations import Fixations, write_table
 from semfov.runs.config import DetectorConfig, SensorConfig

@@ -8,10 +8,9 @@ import torch
 from eval.ivsn import main as search
 from eval.ivsn.fit import _objects_of, _TemplateSums, main
 from eval.ivsn.templates import ClassTemplates
-from semfov import EmbeddedScenes, load_detector
+from semfov import EmbeddedScenes, InputError, load_detector
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _yolov3_tiny
-from semfov.errors import InputError
 from tests.small import Fixed
 
 

@@ -6,10 +6,9 @@ from scipy.spatial.distance import cosine
 
 from eval.ivsn.attention import Attending, TemplateAttention, TemplateSearch
 from eval.ivsn.templates import ClassTemplates, at_points
-from semfov import DirichletBelief, Grid
+from semfov import DirichletBelief, Grid, InputError
 from semfov.belief.observers import Semantic
 from semfov.detection.placement import Placement, letterbox
-from semfov.errors import InputError
 from semfov.gaze.policies import Means
 from semfov.strategy import Strategy
 
@@ -74,15 +73,12 @@ def test_attention_over_several_looks_equals_the_loop(dtype, device):
             assert float(got[episode, x]) == pytest.approx(total / weights, rel=1e-4, abs=1e-5)
 
 
-def test_templates_of_other_classes_are_refused():
+def test_other_classes_and_invalid_arguments_are_refused():
     model = make_templates()
     model.metadata |= {"detector": {"name": "yolov3-tiny", "digest": "1"}}
     model.check_eye({"detector": model.metadata["detector"], "sensor": {}}, ["a", "b", "c"])
     with pytest.raises(InputError, match="class"):
         model.check_eye({"detector": model.metadata["detector"], "sensor": {}}, ["a", "b", "d"])
-
-
-def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="templates"):
         ClassTemplates(torch.zeros(2, 5), torch.zeros(5), ["a", "b", "c"])
     with pytest.raises(InputError, match="features"):

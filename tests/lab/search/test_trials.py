@@ -11,9 +11,8 @@ from eval.chance import random_search
 from eval.human.search.scores import People
 from eval.human.search.screens import Screens
 from eval.human.search.trials import drawn_searches, goal_rectangle, in_cells, read_searches, shift_found
-from semfov import Grid
+from semfov import DataError, Grid
 from semfov.data.fixations import Fixations, write_ruarte
-from semfov.errors import DataError
 
 SCREEN = (320, 240)
 GRID = Grid(8, 6, SCREEN)

@@ -45,12 +45,6 @@ def test_durations_repeat_letters():
         scanmatch(ours, theirs, SIZE, durations=([1.0], [1.0]))
 
 
-@pytest.mark.parametrize("wrong", [{"durations": ([np.nan], [1.0])}, {"durations": ([1e12], [1.0])}, {"cells": (0, 1)}])
-def test_durations_and_cells_are_checked(wrong):
-    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected"):
-        scanmatch([[1.0, 1.0]], [[1.0, 1.0]], SIZE, **wrong)
-
-
 def test_the_substitution_matrix_of_the_toolbox_has_the_published_range():
     """ScanMatch's default of 12 × 8 cells and 3.5: equal letters add 3.5, opposite corners 3.5 - √(11² + 7²)."""
     corners = [[0.0, 0.0]], [[79.0, 59.0]]
@@ -82,7 +76,10 @@ def test_time_delay_embedding_by_loops(length):
     assert time_delay_embedding(ours, theirs, length=length) == pytest.approx(np.mean(nearest))
 
 
-def test_short_and_wrong_scanpaths():
+def test_short_and_wrong_scanpaths_durations_and_cells():
+    for wrong in [{"durations": ([np.nan], [1.0])}, {"durations": ([1e12], [1.0])}, {"cells": (0, 1)}]:
+        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected"):
+            scanmatch([[1.0, 1.0]], [[1.0, 1.0]], SIZE, **wrong)
     assert np.isnan(time_delay_embedding(path(2), path(5)))
     for measure in (dynamic_time_warping, time_delay_embedding):
         for bad in (np.zeros((0, 2)), np.zeros((3, 3)), [[np.nan, 0.0]]):

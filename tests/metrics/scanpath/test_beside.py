@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Grid
+from semfov import Grid, InputError
 from semfov.data.fixations import Fixations, Letterbox, write_table
-from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, compare_scanpath, edit_distance, multimatch, sequence_score
 from tests import small
 

@@ -74,14 +74,6 @@ def test_a_uniform_map_is_at_chance():
     np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
 
 
-def test_a_floor_gives_every_pixel_a_probability():
-    values = np.zeros(SHAPE)
-    values[0, 0] = 1
-    assert log_likelihood(log_density(values), [5], [5])[0] == -np.inf
-    assert log_likelihood(log_density(values, floor=0.1), [5], [5])[0] == pytest.approx(np.log2(0.1))
-    assert np.exp(log_density(values, floor=0.1)).sum() == pytest.approx(1)
-
-
 def test_batches_of_tensors_equal_single_maps():
     maps = torch.rand(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x, y = torch.zeros(2, 3, 4), torch.ones(2, 3, 4)
@@ -104,7 +96,12 @@ def test_errors_say_which_values_and_how_many_points_are_wrong():
         nss(np.ones(SHAPE), [17, 3, 0], [0, 3, 12])
 
 
-def test_each_map_of_a_batch_is_normalised_in_double_precision():
+def test_densities_have_a_floor_and_double_precision():
+    values = np.zeros(SHAPE)
+    values[0, 0] = 1
+    assert log_likelihood(log_density(values), [5], [5])[0] == -np.inf
+    assert log_likelihood(log_density(values, floor=0.1), [5], [5])[0] == pytest.approx(np.log2(0.1))
+    assert np.exp(log_density(values, floor=0.1)).sum() == pytest.approx(1)
     maps = torch.rand(2, 3, *SHAPE, generator=torch.Generator().manual_seed(4))
     maps[1] *= 100
     density = log_density(maps, floor=0.2)

@@ -39,20 +39,6 @@ def test_area_equals_the_trapezoid_rule_of_scipy(curve):
     assert performance_area(curve) == pytest.approx(trapezoid(curve, dx=1 / (len(curve) - 1)))
 
 
-def test_finding_targets_at_once_gives_area_one_and_mismatch_zero():
-    assert performance_area(np.ones(7)) == pytest.approx(1)
-    assert probability_mismatch(np.ones(7), np.ones(7)) == 0
-    assert probability_mismatch(torch.zeros(7), torch.ones(7)) == 7
-
-
-@pytest.mark.parametrize("kind", [np.array, torch.tensor])
-def test_the_edges_of_a_box_are_on_the_target(kind):
-    path = kind([[0.0, 0.0], [10.0, 20.0], [15.0, 25.0]])
-    assert found_at(path, (10, 20, 30, 40)) == 1
-    assert found_at(path, (10.001, 20, 30, 40)) == 2
-    assert found_at(path, (50, 50, 60, 60)) == -1
-
-
 def test_a_straight_scanpath_has_ratio_one_and_a_detour_less():
     box = (90, -10, 110, 10)
     assert scanpath_ratio([[0, 0], [50, 0], [100, 0]], box) == pytest.approx(1)
@@ -79,7 +65,12 @@ def test_invalid_arguments_are_refused_by_name(call, argument):
         call()
 
 
-def test_all_four_edges_are_on_the_target():
+def test_the_four_edges_of_a_box_are_on_the_target():
+    for kind in [np.array, torch.tensor]:
+        path = kind([[0.0, 0.0], [10.0, 20.0], [15.0, 25.0]])
+        assert found_at(path, (10, 20, 30, 40)) == 1
+        assert found_at(path, (10.001, 20, 30, 40)) == 2
+        assert found_at(path, (50, 50, 60, 60)) == -1
     box = (10, 20, 30, 40)
     for point in ([10, 20], [30, 20], [10, 40], [30, 40]):
         assert found_at([point], box) == 0
@@ -103,12 +94,12 @@ def test_byte_coordinates_do_not_overflow():
     assert probability_mismatch(found, everyone) == 1
 
 
-def test_a_curve_may_be_boolean():
-    """One search, found by the second of three fixations."""
+def test_areas_by_hand():
+    assert performance_area(np.ones(7)) == pytest.approx(1)
+    assert probability_mismatch(np.ones(7), np.ones(7)) == 0
+    assert probability_mismatch(torch.zeros(7), torch.ones(7)) == 7
+    # One search, found by the second of three fixations.
     assert performance_area(np.array([False, True, True])) == pytest.approx(0.75)
-
-
-def test_tfp_auc_sums_seven_fixations_by_default():
     assert tfp_auc([0, 0], ["cup", "fork"]) == 7
     assert tfp_auc([6, 7], ["cup", "fork"]) == 0.5
 

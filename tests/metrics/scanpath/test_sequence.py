@@ -43,14 +43,6 @@ def test_the_edit_distance_is_the_levenshtein_distance(a, b):
     assert edit_distance(a, b) == levenshtein(a, b)
 
 
-def test_cell_labels_match_the_grid():
-    from semfov.belief.grid import Grid
-
-    grid = Grid(5, 4, (101, 77))
-    np.testing.assert_array_equal(cell_labels(grid.centres.numpy(), 5, 4, (101, 77)), np.arange(20))
-    assert cell_labels([[-0.5, -0.5], [100.5, 76.5]], 5, 4, (101, 77)).tolist() == [0, 19]
-
-
 def test_clusters_separate_distant_fixations():
     generator = np.random.default_rng(0)
     places = np.array([[100.0, 100.0], [400.0, 100.0], [250.0, 400.0]])
@@ -71,13 +63,13 @@ def test_consecutive_fixations_closer_than_half_a_window_are_merged():
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [1.0, 30.0]], (10, 10)), [[0, 0], [1, 30]])
 
 
-def test_an_error_says_how_many_points_are_outside_the_picture():
-    with pytest.raises(InputError, match=r"^points: .*got 2 outside it"):
-        cell_labels([[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
+def test_cell_labels_match_the_grid():
+    from semfov.belief.grid import Grid
 
-
-def test_cells_of_points_in_half_precision():
-    """1025 can be represented in half precision and 1025.5 cannot."""
+    grid = Grid(5, 4, (101, 77))
+    np.testing.assert_array_equal(cell_labels(grid.centres.numpy(), 5, 4, (101, 77)), np.arange(20))
+    assert cell_labels([[-0.5, -0.5], [100.5, 76.5]], 5, 4, (101, 77)).tolist() == [0, 19]
+    # 1025 can be represented in half precision and 1025.5 cannot.
     assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
 
 
@@ -90,12 +82,14 @@ def test_merging_restarts_after_a_large_step_and_includes_the_last_fixation():
     np.testing.assert_allclose(merge_close(np.array([[200, 0], [202, 2]], dtype=np.uint8), (10, 10)), [[201, 1]])
 
 
-@pytest.mark.parametrize("figure", [sequence_score, edit_distance])
-def test_empty_sequences_are_refused_by_name(figure):
-    with pytest.raises(InputError, match=r"^ours:"):
-        figure([], [1])
-    with pytest.raises(InputError, match=r"^theirs:"):
-        figure([1], [])
+def test_empty_sequences_and_points_outside_the_picture_are_refused_by_name():
+    with pytest.raises(InputError, match=r"^points: .*got 2 outside it"):
+        cell_labels([[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
+    for figure in [sequence_score, edit_distance]:
+        with pytest.raises(InputError, match=r"^ours:"):
+            figure([], [1])
+        with pytest.raises(InputError, match=r"^theirs:"):
+            figure([1], [])
 
 
 def test_labels_in_an_array_equal_labels_in_a_list():
