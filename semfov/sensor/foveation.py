@@ -13,8 +13,8 @@ from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions, widened
 from semfov.threads import one_thread_if_small
 
-# Elements of all views from which they are made one at a time on a CPU.
-_MANY = 1 << 23
+# Elements of the views that are made together on a CPU; those of many views leave the processor's cache.
+_TOGETHER = 1 << 21
 
 
 @one_thread_if_small
@@ -84,24 +84,23 @@ def foveate(
                 check(False, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
     widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
     size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
-    elements = batch * number * like.shape[1] * size[0] * size[1]
     details = source.details if isinstance(source, Bands) else ()
     tensors = [each for each in (*details, like, fixation, widths, growth) if isinstance(each, Tensor)]
     recorded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    alone = batch * number > 1 and elements >= _MANY and like.device.type == "cpu" and not recorded
-    if not (alone and values_known(*tensors)):
+    step = max(1, _TOGETHER // max(1, like.shape[1] * size[0] * size[1]))
+    apart = batch * number > step and like.device.type == "cpu" and not recorded
+    if not (apart and values_known(*tensors)):
         bands = source if isinstance(source, Bands) else laplacian_pyramid(source, levels, convention)
         result = _collapse(bands, fixation, widths, growth)
         return result if many else result[:, 0]
-    # One view at a time stays in the processor's cache.
     views = like.new_empty(batch, number, like.shape[1], *size)
-    for b in range(batch):
+    for b in (slice(n, n + max(1, step // number)) for n in range(0, batch, max(1, step // number))):
         if isinstance(source, Bands):
-            own = Bands(tuple(band[b : b + 1] for band in source.details), source.base[b : b + 1], source.convention)
+            own = Bands(tuple(band[b] for band in source.details), source.base[b], source.convention)
         else:
-            own = laplacian_pyramid(source[b : b + 1], levels, convention)
-        for g in range(number):
-            _collapse(own, fixation[b : b + 1, g : g + 1], widths[b : b + 1], growth, views[b : b + 1, g : g + 1])
+            own = laplacian_pyramid(source[b], levels, convention)
+        for g in (slice(n, n + step) for n in range(0, number, step)):
+            _collapse(own, fixation[b, g], widths[b], growth, views[b, g])
     return views if many else views[:, 0]
 
 

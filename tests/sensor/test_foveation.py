@@ -107,18 +107,20 @@ def test_writing_to_a_view_does_not_change_other_views(size):
 
 @pytest.mark.parametrize("levels", [0, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_many_views_are_made_one_at_a_time(monkeypatch, dtype, levels):
-    """They have the same bits as all at once, from images and from their pyramid."""
-    images, gaze = draw(2, 3, 170, 164).to(dtype), 160 * draw(2, 3, 2)
+def test_many_views_are_made_in_parts(monkeypatch, dtype, levels):
+    """They are those of all at once, from images and from their pyramid, in parts of one view and of two."""
+    images, gaze = draw(3, 3, 170, 164).to(dtype), 160 * draw(3, 3, 2)
     bands = laplacian_pyramid(images, levels)
     at_once = foveate(images, gaze, sigma=5.0, levels=levels)
-    monkeypatch.setattr("semfov.sensor.foveation._MANY", 0)
-    for source in (images, bands):
-        views = foveate(source, gaze, sigma=5.0, levels=levels)
-        assert views.dtype == dtype
-        assert views.is_contiguous()
-        torch.testing.assert_close(views, at_once, rtol=1e-6, atol=1e-6)
-    assert torch.equal(foveate(images, gaze[:, 0], sigma=5.0, levels=levels), views[:, 0])
+    for together in (0, 2 * images[0].numel()):
+        monkeypatch.setattr("semfov.sensor.foveation._TOGETHER", together)
+        for source in (images, bands):
+            views = foveate(source, gaze, sigma=5.0, levels=levels)
+            assert views.dtype == dtype
+            assert views.is_contiguous()
+            torch.testing.assert_close(views, at_once, rtol=1e-6, atol=1e-6)
+        one = foveate(images, gaze[:, 0], sigma=5.0, levels=levels)
+        torch.testing.assert_close(one, views[:, 0], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
