@@ -2,6 +2,7 @@
 
 import sys
 from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from benchmarks import acuity
 from semfov.eye import Eye
 from semfov.sensor import Foveation, LogPolar
+from semfov.zoom import WindowEye
 from tests.small import Coloured
 
 pytestmark = pytest.mark.slow
@@ -47,22 +49,46 @@ def test_missing_sahi_is_named_with_the_remedy(monkeypatch):
         import_module("benchmarks.sahi")
 
 
-def test_sahi_accepts_a_detector_of_semfov():
+def test_slicers_see_through_the_same_eye():
     pytest.importorskip("sahi")
     from sahi.predict import get_sliced_prediction
 
-    from benchmarks.sahi import Slicing
+    from benchmarks.sahi import Parts, Slicing, _slicer
 
     picture = np.zeros((128, 192, 3), dtype=np.uint8)
     picture[70:90, 140:150, 0] = 255
-    model = Slicing(Coloured(("red",), (64, 64), score=0.8), None, 0.1)
-    slicing = {"slice_height": 64, "slice_width": 64, "verbose": 0}
-    found = get_sliced_prediction(picture, model, **slicing).object_prediction_list
-    assert model.passes == 1 + 3 * 4
+
+    def parts(classes, target):
+        return Parts(WindowEye(Coloured(classes, (64, 64), score=0.8)), target)
+
+    red, slicing = parts(("red",), None), {"slice_height": 64, "slice_width": 64, "verbose": 0}
+    found = get_sliced_prediction(picture, Slicing(red), **slicing).object_prediction_list
+    assert red.passes == 1 + 3 * 4
     assert [(each.category.id, each.category.name) for each in found] == [(1, "red")] * len(found)
     assert found[0].score.value == pytest.approx(0.8)
     # Without the pass over the whole picture, whose coarse box some versions of SAHI merge with those of the slices.
-    found = get_sliced_prediction(picture, model, **slicing, perform_standard_pred=False).object_prediction_list
+    alone = Slicing(parts(("red",), None))
+    found = get_sliced_prediction(picture, alone, **slicing, perform_standard_pred=False).object_prediction_list
     assert [[round(side) for side in each.bbox.to_xyxy()] for each in found] == [[140, 70, 150, 90]]
-    green = Slicing(Coloured(("red", "green"), (64, 64), score=0.8), 2, 0.1)
+    run = SimpleNamespace(eye=red.eye, target=None, config=SimpleNamespace(overlap=0.2))
+    objects, passes = _slicer(run, 64, picture)
+    assert passes == 3 * 4
+    assert objects.boxes.round().tolist() == [[140, 70, 150, 90]]
+    green = Slicing(parts(("red", "green"), 2))
     assert not get_sliced_prediction(picture, green, **slicing).object_prediction_list
+
+
+def test_the_figure_of_seconds_has_a_band_where_there_are_errors():
+    pytest.importorskip("sahi")
+    from benchmarks.sahi import plot_seconds
+
+    points = {("semfov", f"{n} passes"): (0.1 * n, 0.05 * n, 0.02) for n in (2, 4)}
+    points["SAHI", "640 px"] = 0.5, 0.3, 0.1
+    without = {name: (*numbers[:2], float("nan")) for name, numbers in points.items()}
+    figure = plot_seconds({"pictures": points, "frames": without})
+    one, other = figure.axes
+    assert [ax.get_xlabel() for ax in figure.axes] == ["seconds a picture (one thread)"] * 2
+    (low, *_), (band,) = one.lines[0].get_xydata(), one.collections[:1]
+    assert low.tolist() == pytest.approx([0.2, 0.1])
+    assert band.get_paths()[0].vertices[:, 1].min() == pytest.approx(0.08)
+    assert len(other.collections) == 0
