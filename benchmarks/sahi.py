@@ -321,7 +321,8 @@ def compare(config: SahiConfig) -> None:
         objects = sum(next(iter(outcomes.values())).objects)
         frames = "frames of one scene" if number else "pictures"
         title = f"{len(run.scenes)} {frames}, {width} × {height} px, {objects} × {config.target or 'object'}"
-        points, rows = {}, []
+        points: dict[tuple[str, str], tuple[float, float, float]] = {}
+        rows: list[list[str]] = []
         for name, outcome in outcomes.items():
             precision, (passes, seconds) = outcome.precision(), outcome.mean()
             if rows and name[0] == SEMFOV and rows[-1][1] == f"{passes:.1f}":
@@ -334,7 +335,7 @@ def compare(config: SahiConfig) -> None:
         lines += [f"{title}:", "", table(["", "passes", "seconds", "AP50"], rows), ""]
     text = "\n".join(lines)
     write_text(config.out / "summary.md", text)
-    save_figure(plot_seconds(panels), config.out / "seconds.png")
+    save_figure(plot_seconds(panels), config.out / "seconds.png", dpi=120)
     print(text)
 
 

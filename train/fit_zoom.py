@@ -78,6 +78,9 @@ def fit_zoom(config: FitZoomConfig) -> None:
         lines += fit.verification(model)
     if "certainty" in refit:
         lines += fit.certainty(model)
+    elif "spread" in refit:
+        check(model.certainty is not None, "evidence", "a model whose certainty was fitted", config.evidence)
+        lines += fit.spread(model)
     if "photograph" in refit and config.photographs:
         scenes = make_scenes(config.data, fit.eye.detector.classes)
         lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]

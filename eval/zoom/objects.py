@@ -20,7 +20,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom.certainty import SPREAD
+from semfov.zoom.certainty import SPREAD, number_of
 from semfov.zoom.glances import Glance
 from semfov.zoom.objects import merge
 
@@ -32,11 +32,12 @@ _SAME = 0.5
 
 
 class Returned(NamedTuple):
-    """All objects, those that are listed, the number that was not seen, if known, and whether a number is given."""
+    """All objects, those that are listed, and the number that was not seen, if known, with the spread of all."""
 
     objects: Objects
     listed: Objects
     unseen: tuple[float, float] | None = None
+    spread: float = SPREAD
     given: bool = False
 
 
@@ -83,10 +84,10 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         are left out.
     """
     after = {}
-    for number, (objects, listed, unseen, given) in returned.items():
+    for number, (objects, listed, unseen, spread, given) in returned.items():
         right, sure = right_boxes(objects, annotation), right_boxes(listed, annotation)
         counts = right >= 0
-        chances = objects.scores[counts].double()
+        mean, variance = number_of(objects.scores[counts], unseen or (0.0, 0.0), spread)
         alike = (box_iou(plain.boxes, listed.boxes) >= _SAME) & (plain.labels[:, None] == listed.labels)
         after[str(number)] = {
             "scores": objects.scores[counts].tolist(),
@@ -95,8 +96,8 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
             "listed": int((sure >= 0).sum()),
             "listed right": int((sure > 0).sum()),
             "kept": int(alike.any(1).sum()) if len(listed) else 0,
-            "in all": None if unseen is None else float(chances.sum()) + unseen[0],
-            "error": None if unseen is None else _error(chances, unseen),
+            "in all": None if unseen is None else mean,
+            "error": None if unseen is None else variance**0.5,
             "given": given,
         }
     labels = annotation.labels[~annotation.crowd]
@@ -109,12 +110,6 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         "plain": len(plain),
         "after": after,
     }
-
-
-def _error(chances: Tensor, unseen: tuple[float, float]) -> float:
-    """Standard deviation of the number of objects in all (`ZoomPath.expected_error`)."""
-    spread = SPREAD * (float(chances.sum()) + unseen[0])
-    return float((chances * (1 - chances)).sum() + unseen[1] + spread**2) ** 0.5
 
 
 def average_precision(scores: Tensor, right: Tensor, objects: int, counts: Tensor | None = None) -> float:

@@ -224,7 +224,9 @@ class ZoomRun(WindowLooking, SceneRun):
         }
         ways[f"{SEMFOV}, scores of the detector"] = ways[SEMFOV]
         ways[SEMFOV] = {
-            number: Returned(path.candidates, path.objects, path.unseen, path.reacts and len(path.objects) > 1)
+            number: Returned(
+                path.candidates, path.objects, path.unseen, path.spread, path.reacts and len(path.objects) > 1
+            )
             for number, path in paths.items()
         }
         for way, returned in ways.items():

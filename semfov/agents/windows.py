@@ -24,6 +24,7 @@ from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
+from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import candidates, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions, decide_by_score, score_needed
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
@@ -519,6 +520,7 @@ class WindowEpisode(Episode[ZoomPath]):
             "seconds": tuple(look.seconds for look in self._looks),
             "candidates": objects,
             "unseen": unseen,
+            "spread": SPREAD if self.certainty is None else self.certainty.spread,
             "least": self.least,
             "closer": tuple(replace(look, number=places[look.number]) for look in closer if look.number in places),
         }

@@ -187,7 +187,7 @@ def run(
     Example::
 
         rows = semfov.run("flight", "person", out="people.csv", agent=agent, passes=16)
-        print(sum(row["expected"]["person"] for row in rows if "error" not in row))
+        print(sum(row["expected"]["person"] or 0 for row in rows if "error" not in row))
     """
     kind = _TASKS[lookup(task, _TASKS, "task")]
     listed = [pictures] if isinstance(pictures, str | PathLike) else list(pictures)

@@ -22,7 +22,7 @@ from semfov.data.scene import ChosenScenes, Scenes
 from semfov.errors import check
 from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
-from semfov.fit.windows_certainty import certainty_again
+from semfov.fit.windows_certainty import certainty_again, spread_again
 from semfov.fit.windows_decision import Searches, fit_closer, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
     SurveyExample,
@@ -51,7 +51,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
 
-RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "photograph"]
+RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]
 
 
 def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
@@ -107,8 +107,8 @@ class FitZoomConfig(FitConfig):
         refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
             further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
             closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
-            closer looks find, `certainty`, the probability that an object is there, and `photograph`, the evidence for
-            photographs. The verification has to
+            closer looks find, `certainty`, the probability that an object is there, with the spread of expected
+            numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification has to
             follow new decisions; without it they are made without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
@@ -337,17 +337,26 @@ class MosaicFit:
         return ["Closer looks:", "", text]
 
     def certainty(self, model: GlimpseEvidence) -> list[str]:
-        """Fit the probability that an object is there."""
+        """Fit the probability that an object is there, and the spread of expected numbers."""
         prepare_worker()
-        fitted, judged = self._searched().values()
-        some = some_explored(self.config.searched)
-        training, held_out = (
-            {kind: (self.pictures[kind], self.opened(kind)[: some.get(kind)]) for kind in dict.fromkeys(kinds)}
-            for kinds in ((*fitted, *some), judged)
-        )
+        training, held_out = self._explored()
         lines = certainty_again(model, training, held_out, passes=self.config.passes)
         self._told(model, "certainty", _COUNTING)
         return lines
+
+    def spread(self, model: GlimpseEvidence) -> list[str]:
+        """Fit the spread of expected numbers alone."""
+        prepare_worker()
+        return spread_again(model, self._explored()[0], passes=self.config.passes)
+
+    def _explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
+        """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""
+        fitted, judged = self._searched().values()
+        some = some_explored(self.config.searched)
+        return [
+            {kind: (self.pictures[kind], self.opened(kind)[: some.get(kind)]) for kind in dict.fromkeys(kinds)}
+            for kinds in ((*fitted, *some), judged)
+        ]
 
     def _searched(self) -> dict[str, tuple[str, ...]]:
         """Kinds of pictures to fit decisions on, and to choose thresholds on."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice, product
 from typing import NamedTuple
 
@@ -12,13 +13,14 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.progress import track
+from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
-from semfov.zoom.certainty import FACTS, Certainty
+from semfov.zoom.certainty import FACTS, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
-from semfov.zoom.objects import merge_with_facts, probable_objects
+from semfov.zoom.objects import merge_with_facts
 
 _AFTER = (3, 6, 12, 24)
 """Numbers of looks after which objects are taken."""
@@ -32,30 +34,53 @@ _FAINT = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
 _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
 
-class _MosaicExploration(NamedTuple):
-    """An exploration of a mosaic; facts `(n, 14)`, right `(n,)`."""
+_SPREADS = tuple(0.05 * n for n in range(41))
+_CHECKED = (8, 24)
+"""Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""
+_COVERED = 0.9
+"""Share of the pictures in which the annotated number should be within two errors of the expected one."""
 
-    looks: StoredGlances
+
+class _Exploration(NamedTuple):
+    """An exploration of a picture for all classes, or for a target of which it holds a number of objects.
+
+    After numbers of looks, the last one included, it has the facts about the objects `(n, 14)` and whether they are
+    right `(n,)`, -1 in a crowd.
+    """
+
     target: int | None
-    glances: list[Glance]
+    held: int
+    objects: dict[int, tuple[Tensor, Tensor]]
     remaining: list[tuple[float, float]]
     promised: list[float]
-    facts: Tensor
-    right: Tensor
 
-    def outcome(self, certainty: Certainty, number: int) -> tuple[float, float]:
+    @property
+    def looks(self) -> int:
+        """Number of looks."""
+        return len(self.promised)
+
+    def sums(self, certainty: Certainty, number: int) -> tuple[float, float]:
         """The sums of the probabilities of the objects after the first look, and after a number of them."""
-        lattice = self.looks.lattice
-        return tuple(  # type: ignore[return-value]
-            float(probable_objects(self.glances[:n], lattice, self.target, certainty)[0].scores.sum())
-            for n in (1, number)
+        first, after = (float(certainty.probability(self.objects[n][0]).double().sum()) for n in (1, number))
+        return first, after
+
+    def number(self, certainty: Certainty, number: int) -> tuple[float, float] | None:
+        """Mean and variance of the number of objects after some looks, without a spread; None where none is claimed."""
+        facts, right = self.objects[number]
+        chances = certainty.probability(facts)
+        if not (chances >= 0.5).any() or not reacts(chances):
+            return None
+        first, after = self.sums(certainty, number)
+        unseen = certainty.unseen(
+            self.remaining[number - 1], promised=self.promised[number - 1], discoveries=max(after - first, 0.0)
         )
+        return number_of(chances[right >= 0], unseen, 0.0)
 
 
 @torch.inference_mode()
-def _mosaic_explorations(
+def _explorations(
     model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> Iterator[_MosaicExploration]:
+) -> Iterator[_Exploration]:
     """Explore pictures, for objects of all classes and for those of the most frequent class of each."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
@@ -66,15 +91,13 @@ def _mosaic_explorations(
                 glances.append(turn.glance)
                 remaining.append(turn.belief.remaining())
                 promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
-            facts, right = [], []
-            for number in sorted({min(n, len(glances), passes) for n in (*_AFTER, passes)}):
-                objects, object_facts = merge_with_facts(glances[:number], looks.lattice, target)
-                hits = right_boxes(objects, annotation)
-                facts.append(object_facts[hits >= 0])
-                right.append(hits[hits >= 0] > 0)
-            yield _MosaicExploration(
-                looks, target, glances, remaining, promised[1:], torch.cat(facts), torch.cat(right)
-            )
+            counts = {min(n, len(glances)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
+            objects = {}
+            for number in sorted(counts):
+                found, facts = merge_with_facts(glances[:number], looks.lattice, target)
+                objects[number] = facts, right_boxes(found, annotation)
+            held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
+            yield _Exploration(target, held, objects, remaining, promised[1:])
         looks.save()
 
 
@@ -118,7 +141,23 @@ def fit_certainty(facts: Tensor, right: Tensor) -> Certainty:
     return Certainty(offset, tuple(weights))
 
 
-def _fit_unseen(certainty: Certainty, explored: Sequence[_MosaicExploration]) -> Certainty:
+def _judged(explored: Sequence[_Exploration], passes: int) -> tuple[Tensor, Tensor]:
+    """Facts about the objects of explorations after some numbers of looks, and which are right, without crowds."""
+    after = [
+        each.objects[n]
+        for each in explored
+        for n in sorted({min(number, each.looks, passes) for number in (*_AFTER, passes)})
+    ]
+    facts, right = (torch.cat(column) for column in zip(*after, strict=True))
+    return facts[right >= 0], right[right >= 0] > 0
+
+
+def _fitted(explored: Sequence[_Exploration], passes: int) -> Certainty:
+    """Fit the probability of objects, and then the number of objects that further looks show."""
+    return _fit_unseen(fit_certainty(*_judged(explored, passes)), explored)
+
+
+def _fit_unseen(certainty: Certainty, explored: Sequence[_Exploration]) -> Certainty:
     """Fit the number of objects that further looks show, by least squares over a grid.
 
     The error is that of the logarithm of one more than the number of objects in all, so that pictures with few objects
@@ -127,10 +166,10 @@ def _fit_unseen(certainty: Certainty, explored: Sequence[_MosaicExploration]) ->
     """
     cases = []
     for each in explored:
-        numbers = [n for n in _EXPECTING if n < len(each.glances)] if each.target is None else []
-        end = each.outcome(certainty, len(each.glances))[1] if numbers else 0.0
+        numbers = [n for n in _EXPECTING if n < each.looks] if each.target is None else []
+        end = each.sums(certainty, each.looks)[1] if numbers else 0.0
         for number in numbers:
-            first, sums = each.outcome(certainty, number)
+            first, sums = each.sums(certainty, number)
             shown = max(sums - first, 0.0), sums, max(end, sums)
             cases.append((*each.remaining[number - 1], each.promised[number - 1], *shown))
     if not cases:
@@ -146,6 +185,87 @@ def _fit_unseen(certainty: Certainty, explored: Sequence[_MosaicExploration]) ->
     return Certainty(certainty.offset, certainty.weights, *chosen)
 
 
+class _Numbers(NamedTuple):
+    """Claimed numbers of pictures of a kind after some looks: mean, variance and the annotated number; each `(n,)`."""
+
+    mean: Tensor
+    variance: Tensor
+    held: Tensor
+
+    def covered(self, spread: float) -> float:
+        """Share of the pictures in which the annotated number is within two errors of the mean."""
+        error = (self.variance + (spread * self.mean) ** 2).sqrt()
+        return float(((self.held - self.mean).abs() <= 2 * error).double().mean())
+
+
+def _left_out(explored: Mapping[str, Sequence[_Exploration]], passes: int) -> dict[tuple[str, int], _Numbers]:
+    """The numbers claimed in pictures of each kind, by kind and number of looks, fitted on the other kinds alone."""
+    numbers = {}
+    for kind, some in explored.items():
+        others = [each for other, group in explored.items() if other != kind for each in group]
+        if not others:
+            continue
+        certainty = _fitted(others, passes)
+        for after in _CHECKED:
+            claims = [
+                (*claim, each.held)
+                for each in some
+                if each.target is not None
+                for claim in [each.number(certainty, min(after, each.looks))]
+                if claim is not None
+            ]
+            if claims:
+                numbers[kind, after] = _Numbers(*torch.tensor(claims, dtype=torch.float64).unbind(-1))
+    return numbers
+
+
+def _fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> float:
+    """The least spread with which the annotated numbers are covered, in the mean over kinds of pictures and looks."""
+    for spread in _SPREADS:
+        if sum(each.covered(spread) for each in numbers.values()) >= _COVERED * len(numbers):
+            return spread
+    return _SPREADS[-1]
+
+
+def spread_again(
+    model: GlimpseEvidence, fitted: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], *, passes: int
+) -> list[str]:
+    """Fit the spread of the expected numbers of a model, by kinds of pictures that are left out."""
+    return _spread(model, _explored(model, fitted, passes), passes)
+
+
+def _explored(
+    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
+) -> dict[str, list[_Exploration]]:
+    """The explorations of pictures by their kind."""
+    return {
+        kind: [*_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")]
+        for kind, (pictures, opened) in some.items()
+    }
+
+
+def _spread(model: GlimpseEvidence, explored: Mapping[str, Sequence[_Exploration]], passes: int) -> list[str]:
+    """Fit the spread on explorations; the report in Markdown."""
+    assert model.certainty is not None
+    numbers = _left_out(explored, passes)
+    if not numbers:
+        return []
+    model.certainty = replace(model.certainty, spread=_fit_spread(numbers))
+    rows = [["kind that is left out", "looks", "pictures", "within two errors", "with no spread"]]
+    rows += [
+        [kind, f"{after}", f"{len(each.mean)}", *(f"{each.covered(s):.2f}" for s in (model.certainty.spread, 0.0))]
+        for (kind, after), each in numbers.items()
+    ]
+    return [
+        f"Spread of the expected number of objects of the most frequent class of a picture: "
+        f"{model.certainty.spread:.2f}. Pictures in which the annotated number is within two errors, each kind with a "
+        "certainty that was fitted on the others:",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
 def certainty_again(
     model: GlimpseEvidence,
     fitted: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]],
@@ -154,24 +274,17 @@ def certainty_again(
     passes: int,
 ) -> list[str]:
     """Fit the certainty of a model on some kinds of pictures, and evaluate it on others."""
-    training, held_out = (
-        [
-            each
-            for kind, (pictures, opened) in some.items()
-            for each in _mosaic_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")
-        ]
-        for some in (fitted, judged)
-    )
-    regression = fit_certainty(
-        torch.cat([each.facts for each in training]), torch.cat([each.right for each in training])
-    )
-    model.certainty = _fit_unseen(regression, training)
-    facts, right = torch.cat([each.facts for each in held_out]), torch.cat([each.right for each in held_out])
+    kinds = _explored(model, fitted, passes)
+    training = [each for group in kinds.values() for each in group]
+    held_out = [each for group in _explored(model, judged, passes).values() for each in group]
+    model.certainty = _fitted(training, passes)
+    told = _spread(model, kinds, passes)
+    facts, right = _judged(held_out, passes)
     chances = model.certainty.probability(facts)
     sure, error = chances >= 0.5, BinarySums.of(chances, right).ece
     weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, model.certainty.weights, strict=True))
     return [
-        f"Probability of an object, fitted on {sum(len(each.right) for each in training)} objects: offset "
+        f"Probability of an object, fitted on {len(_judged(training, passes)[1])} objects: offset "
         f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
         f"strength {model.certainty.strength:g}, faint cells {model.certainty.faint:g}, promises "
         f"{model.certainty.promise:g}.",
@@ -181,4 +294,5 @@ def certainty_again(
         f"{int(sure.sum())} from probability 0.5 on, {int(right[sure].sum())} are right and "
         f"{float(chances[sure].sum()):.0f} expected.",
         "",
+        *told,
     ]

@@ -445,7 +445,7 @@ class Record(Conversion):
         """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values.
 
         Returns:
-            Values by name; None for the box of what was not found, and for errors that no probabilities tell.
+            Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
         """
         (width, height), decision = self.size, self.decision
         values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,7 @@ from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
-from semfov.zoom.certainty import SPREAD
+from semfov.zoom.certainty import SPREAD, number_of, reacts
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
@@ -54,13 +54,10 @@ VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
     "windows": Array(WINDOW, "n"),
     "unseen": Maybe(pair(Number(low=0))),
+    "spread": Maybe(Number(low=0)),
     "seconds": Array(Number(low=0)),
 }
 """JSON values of the files of looks at windows."""
-
-
-_SURE, _SEVERAL, _MOST = 0.5, 5, 0.6
-"""Probability, number and share of the objects to which a detector reacts (`ZoomPath.reacts`)."""
 
 _NUMBER = (
     "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
@@ -93,6 +90,8 @@ class ZoomPath(GazeRecord):
             probabilities that box and class are right.
         unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
             no probabilities.
+        spread: standard deviation of the share of the expected number by which it is off because the model does not
+            suit the picture (`semfov.zoom.certainty`).
         detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
         closer: closer looks of a search, in their order; they are among the `glances`, each with its `number`.
@@ -111,6 +110,7 @@ class ZoomPath(GazeRecord):
     values: tuple[float, ...]
     candidates: Objects = field()
     unseen: tuple[float, float] | None = None
+    spread: float = SPREAD
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
@@ -130,9 +130,10 @@ class ZoomPath(GazeRecord):
         """Expected number of objects by the name of their class, those included that no look has shown yet.
 
         It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
-        each class has its share of that sum. Without probabilities it is the number of `objects`.
+        each class has its share of that sum. It is NaN for a class to which the detector hardly reacts (`reacts`), and
+        null in files. Without probabilities it is the number of `objects`.
         """
-        return super().expected if self.unseen is None else {name: mean for name, (mean, _) in self._numbers().items()}
+        return super().expected if self.unseen is None else {name: mean for name, (mean, _) in self._claimed().items()}
 
     @property
     def expected_error(self) -> dict[str, float]:
@@ -140,13 +141,13 @@ class ZoomPath(GazeRecord):
 
         With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
         has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
-        share :math:`\tau = 0.3` of the expected number E:
+        share :math:`\tau` (`spread`) of the expected number E:
 
         .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
         if self.unseen is None:
             return super().expected_error
-        return {name: variance**0.5 for name, (_, variance) in self._numbers().items()}
+        return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
 
     @property
     def reacts(self) -> bool:
@@ -155,25 +156,39 @@ class ZoomPath(GazeRecord):
         It does where objects are listed of which five or more have a probability of one half, or where these make up
         three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
         """
-        chances = self.candidates.of(self._sought).scores
-        sure = chances[chances >= _SURE]
-        return len(self.objects) > 0 and (len(sure) >= _SEVERAL or float(sure.sum()) >= _MOST * float(chances.sum()))
+        return self._reacts_to(self._sought)
 
-    def _numbers(self) -> dict[str, tuple[float, float]]:
+    def to_dict(self) -> dict[str, Any]:
+        """The outcome, the objects and the looks as JSON values, without numbers that are not claimed.
+
+        Returns:
+            Values by name, as `semfov.paths.Record.to_dict` has them; None for numbers that are NaN.
+        """
+        values = super().to_dict()
+        for key in ("expected", "expected_error"):
+            values[key] = {
+                name: None if number is None or math.isnan(number) else number for name, number in values[key].items()
+            }
+        return values
+
+    def _reacts_to(self, labels: Sequence[int]) -> bool:
+        return len(self.objects.of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
+
+    def _claimed(self) -> dict[str, tuple[float, float]]:
+        """Mean and variance of the number of objects of each class; NaN where the detector hardly reacts."""
+        nothing = math.nan, math.nan
+        numbers = self._numbers().items()
+        return {self.classes[label]: number if self._reacts_to([label]) else nothing for label, number in numbers}
+
+    def _numbers(self) -> dict[int, tuple[float, float]]:
         """Mean and variance of the number of objects of each class."""
         more, spread = self.unseen or (0.0, 0.0)
-        chances, labels = self.candidates.scores.double(), self.candidates.labels
-        sums, spreads = torch.zeros(2, len(self.classes), dtype=torch.float64)
-        sums.index_add_(0, labels, chances)
-        spreads.index_add_(0, labels, chances * (1 - chances))
-        sought = list(self._sought or sums.nonzero()[:, 0].tolist())
-        if not sought:
-            return {}
-        share = (sums[sought] + 1e-9) / (sums[sought] + 1e-9).sum()
-        means, variances = sums[sought] + share * more, spreads[sought] + share * spread
+        sought = self._sought or tuple(self.candidates.labels.unique().tolist())
+        chances = [self.candidates.of([label]).scores for label in sought]
+        sums = [float(each.double().sum()) + 1e-9 for each in chances]
         return {
-            self.classes[label]: (mean, variance + (SPREAD * mean) ** 2)
-            for label, mean, variance in zip(sought, means.tolist(), variances.tolist(), strict=True)
+            label: number_of(each, (total / sum(sums) * more, total / sum(sums) * spread), self.spread)
+            for label, each, total in zip(sought, chances, sums, strict=True)
         }
 
     @property
@@ -229,18 +244,13 @@ class ZoomPath(GazeRecord):
             return text
         if not self.reacts:
             return f"{text} (the detector hardly reacts, so no number is given)"
-        chances = self.objects.scores.double()
+        chances = self.objects.scores
         if len(chances) == 1:
             return text
-        mean, of = float(chances.sum()), "of them right"
-        variance = float((chances * (1 - chances)).sum()) + (SPREAD * mean) ** 2
-        expected = sum(self.expected.values())
-        if round(expected) >= len(chances):
-            mean, variance, of = (
-                expected,
-                sum(e**2 for e in self.expected_error.values()),
-                "that this detector can show",
-            )
+        (mean, variance), of = number_of(chances, (0.0, 0.0), self.spread), "of them right"
+        means, variances = zip(*self._numbers().values(), strict=True)
+        if round(sum(means)) >= len(chances):
+            mean, variance, of = sum(means), sum(variances), "that this detector can show"
         return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of})"
 
     def _looks(self) -> Iterator[RecordedLook]:
@@ -279,7 +289,8 @@ class ZoomPath(GazeRecord):
         windows = [window_values(glance.window) for glance in self.glances]
         unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
-        return tensors, {"lattice": lattice, "windows": windows, "unseen": unseen, "seconds": list(self.seconds)}
+        numbers = {"unseen": unseen, "spread": self.spread, "seconds": list(self.seconds)}
+        return tensors, {"lattice": lattice, "windows": windows, **numbers}
 
     @classmethod
     def _fields(
@@ -305,6 +316,7 @@ class ZoomPath(GazeRecord):
             "values": tuple(tensors["values"].tolist()),
             "candidates": objects,
             "unseen": unseen,
+            "spread": SPREAD if record.get("spread") is None else record["spread"],
             "seconds": tuple(record["seconds"]),
         }
 

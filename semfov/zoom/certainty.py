@@ -32,7 +32,10 @@ FACTS = (
 """Facts about an object, from which its probability is predicted (`object_facts`)."""
 
 SPREAD = 0.3
-"""Standard deviation of the share by which the probabilities of one picture are all too low or too high."""
+"""The spread of a certainty (`Certainty`) for which none was fitted."""
+
+_SURE, _SEVERAL, _PART = 0.5, 5, 0.6
+"""Probability, number and share of the objects to which a detector reacts (`reacts`)."""
 
 _LEAST, _MOST = 0.01, 0.999
 _SMALLEST = 6.0
@@ -56,6 +59,9 @@ class Certainty:
         R = R_1 + w R_2, \qquad
         E[c] = \frac{k c_0 + F}{k + u W}, \qquad
         \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
+
+    Pictures differ in how far all this suits them: the `spread` is the standard deviation of the share of the expected
+    number by which it is off for that reason.
     """
 
     offset: float
@@ -64,6 +70,7 @@ class Certainty:
     strength: float = math.inf
     faint: float = 1.0
     promise: float = 1.0
+    spread: float = SPREAD
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
@@ -72,7 +79,10 @@ class Certainty:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
         first = len(FACTS) + 1
         check(
-            len(numbers) in (first + 2, first + 4), "certainty", f"2, {first + 2} or {first + 4} numbers", len(numbers)
+            len(numbers) - first in (2, 4, 5),
+            "certainty",
+            f"2, {first + 2}, {first + 4} or {first + 5} numbers",
+            len(numbers),
         )
         return cls(numbers[0], tuple(numbers[1:first]), *numbers[first:])
 
@@ -81,7 +91,7 @@ class Certainty:
         """The numbers of a file, as `of` reads them."""
         if math.isinf(self.strength):
             return [self.offset, self.weights[0]]
-        return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise]
+        return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise, self.spread]
 
     def probability(self, facts: Tensor) -> Tensor:
         """The probabilities of objects; facts `(M, 14)` → `(M,)`."""
@@ -96,6 +106,32 @@ class Certainty:
         rate = self.strength + self.promise * promised
         scale = (self.strength * self.scale + discoveries) / rate
         return scale * number, scale * number * (1 + number / rate)
+
+
+def reacts(chances: Tensor) -> bool:
+    """Whether a detector reacts to the objects with these probabilities `(M,)`, so that their number can be believed.
+
+    It does where five or more of them have a probability of one half, or where these make up three fifths of the sum
+    of all. Otherwise most of that sum is of faint candidates.
+    """
+    sure = chances[chances >= _SURE]
+    return len(sure) >= _SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
+
+
+def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
+    r"""Mean and variance of the number of objects with some probabilities, and of those that no look has shown.
+
+    The former are independent (a Poisson-binomial distribution), the latter have the distribution of `Certainty`:
+
+    .. math::
+        E = \sum_i p_i + E[n], \qquad
+        \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+
+    Shapes: chances `(M,)`.
+    """
+    each = chances.double()
+    mean = float(each.sum()) + unseen[0]
+    return mean, float((each * (1 - each)).sum()) + unseen[1] + (spread * mean) ** 2
 
 
 def object_facts(

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from math import isnan
 
 import pytest
 import torch
@@ -124,6 +125,28 @@ def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances,
     lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"glances": (), "values": (), "least": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
     assert path.describe() == f"{words} in 0 passes"
+    values = path.to_dict()
+    numbers = values["expected"]["cup"], values["expected_error"]["cup"]
+    assert numbers == ((None, None) if HARDLY in words else (path.expected["cup"], path.expected_error["cup"]))
+
+
+def test_a_number_is_claimed_class_by_class():
+    """Of cats the detector shows only faint candidates, so their number is withheld."""
+    chances, labels = torch.tensor([0.9, 0.8, 0.3, 0.3, 0.2]), torch.tensor([1, 1, 2, 2, 2])
+    found = Objects(torch.rand(5, 4), chances, labels, torch.zeros(5).long())
+    lattice = Lattice.over((2560, 1920), (416, 416))
+    parts = {"glances": (), "values": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
+    path = ZoomPath(lattice=lattice, classes=CLASSES, candidates=found, **parts)
+    share = 1.7 / 2.5
+    assert path.expected["cup"] == pytest.approx(1.7 + 0.5 * share)
+    error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
+    assert path.expected_error["cup"] == pytest.approx(error**0.5)
+    assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
+    assert isnan(path.expected["cat"])
+    assert isnan(path.expected_error["cat"])
+    values = path.to_dict()
+    assert (values["expected"]["cat"], values["expected_error"]["cat"]) == (None, None)
+    json.dumps(values, allow_nan=False)
 
 
 def test_objects_that_a_look_at_the_whole_picture_shows_count_too():

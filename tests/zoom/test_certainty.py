@@ -9,17 +9,19 @@ import pytest
 import torch
 from scipy.stats import nbinom
 
-from semfov import Detections, InputError, Objects, WindowEye, ZoomAgent
+from semfov import Detections, EmbeddedScenes, InputError, Objects, WindowEye, ZoomAgent
+from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.objects import unlike
-from semfov.fit.windows_certainty import _fit_unseen, fit_certainty
+from semfov.fit.windows_certainty import _explorations, _fit_spread, _fit_unseen, _Numbers, fit_certainty
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
+from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty, object_facts
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.objects import merge, merge_with_facts
-from tests.small import area, iou, shared
+from tests.small import Tiles, area, iou, shared
 
 SCALES = torch.tensor([0.25, 0.5, 1.0, 0.5])
 WINDOWS = torch.tensor([[0.0, 0, 400, 300], [0, 0, 200, 200], [50, 50, 150, 150], [100, 100, 300, 300]])
@@ -147,15 +149,15 @@ def test_what_further_looks_show_is_fitted_by_the_number_in_all():
     """Pictures whose looks show half of what clear cells promise, and nothing else, teach this."""
 
     class Exploration:
-        target, glances = None, [None] * 9
+        target, looks = None, 9
 
         def __init__(self, clear, faint):
             self.remaining = [(clear * (1 - n / 8), faint) for n in range(9)]
             self.promised = [clear * n / 8 for n in range(9)]
-            self.sums = [1 + clear / 2 * n / 8 for n in range(9)]
+            self.after = [1 + clear / 2 * n / 8 for n in range(9)]
 
-        def outcome(self, certainty, number):
-            return self.sums[0], self.sums[number - 1]
+        def sums(self, certainty, number):
+            return self.after[0], self.after[number - 1]
 
     fitted = _fit_unseen(
         Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]
@@ -164,6 +166,33 @@ def test_what_further_looks_show_is_fitted_by_the_number_in_all():
         assert fitted.unseen((clear, faint), promised=0.0, discoveries=0.0)[0] == pytest.approx(clear / 2, rel=0.15)
         after = fitted.unseen((clear / 2, faint), promised=clear / 2, discoveries=clear / 4)[0]
         assert after == pytest.approx(clear / 4, rel=0.15)
+
+
+def test_the_spread_covers_nine_of_ten_pictures():
+    """Pictures whose annotated number is off by a share that is uniform from 0 to 1/2 or 1: nine tenths of the most."""
+    for most, spread in ((0.5, 0.25), (1.0, 0.45)):
+        mean = torch.full((200,), 20.0).double()
+        held = mean * (1 + most * torch.linspace(-1, 1, 200).double())
+        kinds = {("mosaics", 8): _Numbers(mean, torch.zeros(200).double(), held)}
+        assert _fit_spread(kinds) == pytest.approx(spread)
+        # A kind whose numbers are right needs less, and both count as much.
+        kinds["scattered", 8] = _Numbers(mean, torch.ones(200).double(), mean)
+        assert _fit_spread(kinds) == pytest.approx(0.2 if most == 0.5 else 0.4)
+
+
+def test_the_spread_is_fitted_on_the_numbers_of_records():
+    eye = WindowEye(Tiles(name="bright"))
+    mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 4, 4, tile=(96, 72), count=1)
+    certainty = Certainty(2.0, (1.0, *[0.0] * (len(FACTS) - 1)), scale=0.5, strength=2.0)
+    torch.manual_seed(0)
+    evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()
+    _, sought = _explorations(evidence, mosaics, [StoredGlances(eye, mosaics, 0, None)], passes=4, title="")
+    assert sought.held == int((mosaics.annotation(0).labels == sought.target).sum())
+    for passes in (2, 4):
+        record = ZoomAgent(eye, evidence).find_all(mosaics[0].image, sought.target, passes=passes, worth=0.0)
+        (expected,), (error,) = record.expected.values(), replace(record, spread=0.0).expected_error.values()
+        assert sought.number(certainty, passes) == pytest.approx((expected, error**2), rel=1e-5)
+    assert sought.number(replace(certainty, offset=-9.0), 4) is None
 
 
 def test_probabilities_of_the_fit_maximise_the_likelihood():
@@ -191,10 +220,11 @@ def test_what_no_look_has_shown_is_negative_binomial():
     assert variance == pytest.approx(law.var())
     assert certainty.unseen((0.0, 0.0), promised=10.0, discoveries=3.0) == (0.0, 0.0)
     assert Certainty.of(certainty.numbers) == certainty
-    earlier = Certainty.of(certainty.numbers[:-2])  # all cells and promises count in full
+    assert Certainty.of([*certainty.numbers[:-1], 0.7]) == replace(certainty, spread=0.7)
+    earlier = Certainty.of(certainty.numbers[:-3])  # all cells and promises count in full
     assert earlier == replace(certainty, faint=1.0, promise=1.0)
     assert earlier.unseen((2.0, 4.0), promised=10.0, discoveries=3.0) == pytest.approx((law.mean(), law.var()))
-    with pytest.raises(InputError, match="certainty: expected 2, 17 or 19 numbers, got 3"):
+    with pytest.raises(InputError, match="certainty: expected 2, 17, 19 or 20 numbers, got 3"):
         Certainty.of([1.0, 2.0, 3.0])
 
 
@@ -213,7 +243,7 @@ def test_boxes_are_right_once_and_crowds_are_neither():
 def path(detector, picture):
     torch.manual_seed(0)
     weights = (1.0, *[0.0] * (len(FACTS) - 1))
-    evidence = GlimpseEvidence(3, 8, certainty=Certainty(-0.5, weights, scale=0.5, strength=2.0))
+    evidence = GlimpseEvidence(3, 8, certainty=Certainty(3.0, weights, scale=0.5, strength=2.0))
     return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, passes=4)
 
 
@@ -221,12 +251,13 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     assert path.least == 0.5
     assert (path.objects.scores >= 0.5).all()  # the overview shows none with such a score
     assert path.unseen[0] > 0
+    assert path.spread == SPREAD
     chances = path.candidates.scores.double()
     assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
     variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
-    assert path.describe() == f"{len(path.objects)} objects from probability or score 0.5 in 4 passes"
+    assert path.describe() == "1 object from probability or score 0.5 in 4 passes"
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
