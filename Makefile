@@ -22,7 +22,7 @@ NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types and the tests of the library"
-	@echo "make lab         the tests of studies, fits for studies, benchmarks and the site"
+	@echo "make lab         the tests of studies, whole fits, benchmarks and the site"
 	@echo "make app         the page on which to try an agent out, in Chromium"
 	@echo "make test-quick  the tests that take no more than a second each"
 	@echo "make test-all    all of these, with the tests that repeat others at length"

@@ -4,6 +4,7 @@ import atexit
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -49,6 +50,8 @@ RUNS = {"finished", "fitted", "home", "trained", "whole"}
 """Fixtures that run a command to its end."""
 LAB = {"lab", "eval"}
 """Folders of tests of the laboratory: studies, the fits that only studies need, benchmarks."""
+OF_LAB = re.compile(rf"mark\.lab|def (?:{'|'.join(RUNS)})\(")
+"""What the file of a test of the laboratory contains that lies in another folder."""
 NO_CALL = SimpleNamespace(params={})
 
 
@@ -59,13 +62,16 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     if asked.startswith("not"):
         return True if LAB & {*folder} else None
-    marked = "mark.lab" in collection_path.read_text(encoding="utf-8")
-    return None if marked or {*LAB, "site"} & {*folder} else True
+    if {*LAB, "site"} & {*folder} or OF_LAB.search(collection_path.read_text(encoding="utf-8")):
+        return None
+    return True
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests of the laboratory and of the built site, and as slow those that use a fixture that runs a command.
+    """Mark tests of the laboratory and of the built site, and as slow and of the laboratory those of a whole run.
+
+    These use a fixture that runs a command to its end.
 
     A test of both precisions and both devices uses the GPU in single precision alone.
     """
@@ -76,7 +82,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(item.fixturenames) if isinstance(item, pytest.Function) else set()
         if RUNS & fixtures:
             item.add_marker(pytest.mark.slow)
-        if "site" in fixtures or (item.path.is_relative_to(here) and item.path.relative_to(here).parts[0] in LAB):
+        folder = item.path.relative_to(here).parts[0] if item.path.is_relative_to(here) else ""
+        if folder in LAB or {*RUNS, "site"} & fixtures:
             item.add_marker(pytest.mark.lab)
     items.sort(key=lambda item: "site" not in getattr(item, "fixturenames", ()))  # what takes longest begins first
 

@@ -104,6 +104,7 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     monkeypatch.setattr("train.mosaic_samples.TILE", (96, 72))

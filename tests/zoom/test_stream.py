@@ -171,25 +171,25 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
 
 
 @pytest.fixture
-def whole(detector):
+def raw(detector):
     agent = ActivePerception.raw(detector)
     return agent
 
 
-def test_the_first_frame_decides_how_a_stream_is_looked_at(whole, picture):
+def test_the_first_frame_decides_how_a_stream_is_looked_at(raw, picture):
     for size, how, kind in ((128, "fovea", "FoveaMoment"), (1024, "windows", "WindowMoment")):
-        live = whole.live("red")
+        live = raw.live("red")
         assert live.how == "auto"
         moment = live.step(picture[:, :size, :size])
         assert (live.how, type(moment).__name__) == (how, kind)
         assert moment.describe().startswith("red: ") or "p(red)" in moment.describe()
-    assert type(whole.live("red", how="fovea").step(picture)).__name__ == "FoveaMoment"
-    small = whole.live(["red", "blue"]).step(picture[:, :128, :128])
+    assert type(raw.live("red", how="fovea").step(picture)).__name__ == "FoveaMoment"
+    small = raw.live(["red", "blue"]).step(picture[:, :128, :128])
     assert (type(small).__name__, small.targets) == ("WindowMoment", (1, 3))
-    assert whole.live(["red"]).describe() == "finding all “red”"
+    assert raw.live(["red"]).describe() == "finding all “red”"
 
 
-def test_frames_of_opencv_and_other_kinds_give_the_same_moments(whole, picture):
+def test_frames_of_opencv_and_other_kinds_give_the_same_moments(raw, picture):
     pixels = (picture * 255).round().byte().permute(1, 2, 0).numpy()
     given = [
         ("rgb", picture),
@@ -197,7 +197,7 @@ def test_frames_of_opencv_and_other_kinds_give_the_same_moments(whole, picture):
         ("bgr", pixels[..., ::-1]),
         ("bgr", np.ascontiguousarray(pixels[..., ::-1])),
     ]
-    lives = [(whole.live(how="windows", color=color), frame) for color, frame in given]
+    lives = [(raw.live(how="windows", color=color), frame) for color, frame in given]
     for _ in range(4):
         first, *others = [live.step(frame) for live, frame in lives]
         for other in others:
@@ -206,17 +206,17 @@ def test_frames_of_opencv_and_other_kinds_give_the_same_moments(whole, picture):
             assert torch.equal(other.photograph, first.photograph)
 
 
-def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(whole, picture):
+def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
     with pytest.raises(InputError, match=r"how: expected 'fovea', 'windows' or 'auto' for a stream; .* got head"):
-        whole.live("red", how="head")
+        raw.live("red", how="head")
     with pytest.raises(InputError, match=r"target: expected one class, or None; .* how='windows'"):
-        whole.live(["red", "blue"], how="fovea")
+        raw.live(["red", "blue"], how="fovea")
     with pytest.raises(InputError, match=r"start: expected None for frames that are looked at by windows"):
-        whole.live("red", how="windows", start=3)
-    live = whole.live("red", start=3)
+        raw.live("red", how="windows", start=3)
+    live = raw.live("red", start=3)
     with pytest.raises(InputError, match="start: expected None"):
         live.step(picture)
-    running = whole.live(how="windows")
+    running = raw.live(how="windows")
     running.step(picture)
     with pytest.raises(
         InputError, match=r"frame: expected 1024 × 768 pixels, the size of the first frame, got 1024 × 700"

@@ -13,6 +13,7 @@ from semfov.runs.setup import split_photographs
 from semfov.zoom.lattice import Lattice
 from train.mosaic_samples import MosaicSampler, _choose_windows
 
+pytestmark = pytest.mark.lab
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
 
