@@ -36,8 +36,10 @@ _SHIPPED_GROWTHS = (1.0, 2.0)
 """Growths of the fovea that learned models are shipped for."""
 
 
-def _check_shipped_sensor(sigma: float, growth: float) -> None:
-    """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
+def recommended_arguments(
+    name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
+) -> dict[str, Any]:
+    """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
     if growth not in _SHIPPED_GROWTHS:
         growths = " and ".join(f"{value:g}" for value in _SHIPPED_GROWTHS)
         raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
@@ -45,13 +47,6 @@ def _check_shipped_sensor(sigma: float, growth: float) -> None:
         raise InputError(
             f"sigma: models are shipped for {_SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
         )
-
-
-def recommended_arguments(
-    name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
-) -> dict[str, Any]:
-    """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
-    _check_shipped_sensor(sigma, growth)
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(Foveation(sigma, growth=growth), detector)

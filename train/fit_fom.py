@@ -32,14 +32,14 @@ from semfov.observation import MissCounts
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.runs.command import command
-from semfov.runs.samples import Sampler, Samples
+from semfov.runs.samples import Samples
 from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 from train.mosaic_samples import MosaicSampler
 from train.outputs import commit, model_path
-from train.samples import collect_samples
+from train.samples import Sampler, collect_samples
 
 _Models = dict[str, FovealObservationModel]
 
@@ -166,8 +166,8 @@ def fit_fom(config: FitObservationConfig) -> None:
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
-    statistics = statistics_of(config, sampler, training)
-    model = fit_model(config, sampler, statistics, samples[~held_out])
+    statistics = statistics_of(config, sampler.eye.detector.classes, training)
+    model = fit_model(config, sampler.eye, sampler.scenes, statistics, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     counts = (
         count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
@@ -182,9 +182,13 @@ def fit_fom(config: FitObservationConfig) -> None:
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
-        models[f"Dirichlet, {method}"] = fit_published(config, sampler, statistics, method)
-    models["Dirichlet with class prior"] = fit_published(config, sampler, statistics, "newton", prior=True)
-    models["the same, tempered 0.1"] = fit_published(config, sampler, statistics, "newton", prior=True, tempering=0.1)
+        models[f"Dirichlet, {method}"] = fit_published(config, sampler.eye, sampler.scenes, statistics, method)
+    models["Dirichlet with class prior"] = fit_published(
+        config, sampler.eye, sampler.scenes, statistics, "newton", prior=True
+    )
+    models["the same, tempered 0.1"] = fit_published(
+        config, sampler.eye, sampler.scenes, statistics, "newton", prior=True, tempering=0.1
+    )
     if config.method == "discriminative":
         models["discriminative"] = model
     written = _write_report(config, model, models, samples[held_out])

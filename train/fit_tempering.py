@@ -22,11 +22,11 @@ from semfov.eye import Eye
 from semfov.fit.tempering import FitTemperingConfig, hit_rates, mean_hits
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
-from semfov.runs.samples import Sampler, Samples
+from semfov.runs.samples import Samples
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from train.outputs import write_outputs
-from train.samples import collect_samples
+from train.samples import Sampler, collect_samples
 
 
 def fit_tempering(config: FitTemperingConfig) -> None:

@@ -20,8 +20,9 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
-from semfov.fit.windows import PICTURE_KINDS, FitZoomConfig, MosaicFit, RefitPart, _figures_of, judge_windows
+from semfov.fit.windows import MosaicFit, _figures_of, judge_windows
 from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
+from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, RefitPart
 from semfov.io.files import inside
 from semfov.runs.command import command
 from semfov.runs.setup import make_scenes

@@ -13,12 +13,13 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import ChosenScenes, Scenes
 from semfov.observation.matching import match
 from semfov.runs.looks import one_thread
-from semfov.runs.samples import Sampler, Samples
+from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.zoom_store import WINDOW_SOURCES as GLANCES
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
+from train.samples import Sampler
 
 COLUMNS, ROWS, TILE = 8, 6, (480, 360)
 """Columns and rows of a mosaic, and the size of its slots in pixels.

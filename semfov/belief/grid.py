@@ -108,7 +108,10 @@ class Grid:
         check_shape(points, "points", 2)
         check_finite(points, "points")
         points = as_positions(points)
-        step = ((points + 0.5) / self._align(self._layout(points).cell, points)).floor()
+        values = self._layout(points).cell
+        extra = points.ndim - values.ndim
+        aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
+        step = ((points + 0.5) / aligned.to(points)).floor()
         column = step[..., 0].clamp(0, self.columns - 1).long()
         row = step[..., 1].clamp(0, self.rows - 1).long()
         return row * self.columns + column
@@ -228,12 +231,6 @@ class Grid:
             return self.distance(self.centres)
         offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]
-
-    def _align(self, values: Tensor, points: Tensor) -> Tensor:
-        """Reshape per-image values `(B, 2)` so that they broadcast over points `(B, ..., 2)`."""
-        extra = points.ndim - values.ndim
-        aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
-        return aligned.to(points)
 
 
 def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:

@@ -90,11 +90,6 @@ def _launched(page: Any, host: str, port: int | None) -> str:
     return str(address)
 
 
-def _grid_of(agent: ActivePerception, image: Tensor) -> Grid:
-    """The agent's cells over a picture `(3, H, W)`."""
-    return Grid(agent.columns, agent.rows, (image.shape[-1], image.shape[-2]))
-
-
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
     """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
     episode = FoveaEpisode(agent.fovea, class_index(target, agent.classes[1:], "target"), closer=0, cells=cells)
@@ -135,7 +130,8 @@ class _Calls:
             image = as_image(_given(picture), argument="picture")
             scale = image.shape[-1] / _reduced(image).width
             point = torch.tensor([[side * scale for side in event.index]])
-            cells = [*cells, int(_grid_of(self.agent, image).cell_of(point)[0])]
+            grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
+            cells = [*cells, int(grid.cell_of(point)[0])]
             looked = _look_at_cells(self.agent, image, _one(target, self.classes), cells)
             return (
                 cells,

@@ -54,11 +54,6 @@ class PictureSource(NamedTuple):
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
 
-def _is_video(source: Path) -> bool:
-    """Tell by its name whether a file is a video."""
-    return source.suffix.lower() in VIDEOS and not source.is_dir()
-
-
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: list[PictureSource] = []
@@ -75,7 +70,8 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
         there = path.exists() or bool(path.suffix) or len(path.parts) > 1
         expected = f"a file or folder (a class is given by --target {name})"
         check(there, "picture", expected, f"{name}, which does not exist")
-        check(not _is_video(path), "picture", "photographs; `semfov live` takes videos", name)
+        video = path.suffix.lower() in VIDEOS and not path.is_dir()
+        check(not video, "picture", "photographs; `semfov live` takes videos", name)
         for each in picture_files(path, recursive=options.recursive):
             place = each.relative_to(path) if path.is_dir() else Path(each.name)
             sources.append(PictureSource(printable(str(each)), each, place=place, shown=shown))

@@ -1,6 +1,5 @@
 """Large pictures that are read window by window: arrays, memory maps, TIFFs, rasters, and files decoded when needed."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
@@ -116,14 +115,6 @@ def _rgb(image: "Image") -> NDArray[np.uint8]:
     return array
 
 
-def _check_bands(bands: int | Sequence[int] | None) -> None:
-    """Raise `InputError` for what are no numbers of one band or of three."""
-    if bands is not None:
-        numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
-        fits = len(numbers) in (1, 3) and all(type(each) is int and each >= 1 for each in numbers)
-        check(fits, "bands", "the number of a band, or three for red, green and blue, from 1", bands)
-
-
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
@@ -137,7 +128,10 @@ def open_large(
     With `white`, numbers of any type are scaled to bytes: a thermal picture, reflectances, 12 bits in 16.
     """
     check_white(white)
-    _check_bands(bands)
+    if bands is not None:
+        numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
+        fits = len(numbers) in (1, 3) and all(type(each) is int and each >= 1 for each in numbers)
+        check(fits, "bands", "the number of a band, or three for red, green and blue, from 1", bands)
     if isinstance(source, LargePicture):
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source

@@ -66,7 +66,8 @@ class TiffPicture(LargePicture):
         extra = [int(each) for each in page.extrasamples]
         self._alpha = next((kind for kind in extra if kind in (_PREMULTIPLIED, _UNASSOCIATED)), 0)
         colours = count - len(extra)
-        named = _named_bands(page.tags.get(_METADATA))
+        metadata = page.tags.get(_METADATA)
+        named = {name: int(band) + 1 for band, name in _NAMED.findall("" if metadata is None else str(metadata.value))}
         if self._alpha and named.get("Alpha", 0) == 0 and colours + extra.index(self._alpha) + 1 in named.values():
             self._alpha = 0  # GDAL names that band otherwise
         colour = tuple(named[name] for name in ("Red", "Green", "Blue") if name in named)
@@ -195,11 +196,6 @@ class TiffPicture(LargePicture):
 def _taken(tile: NDArray[Any], channels: list[int]) -> NDArray[Any]:
     """The channels of a tile, without a copy where they are all."""
     return tile if channels == [*range(tile.shape[-1])] else tile[..., channels]
-
-
-def _named_bands(metadata: Any) -> dict[str, int]:
-    """The bands that GDAL's metadata, a tag, name, from 1, by their names."""
-    return {name: int(band) + 1 for band, name in _NAMED.findall("" if metadata is None else str(metadata.value))}
 
 
 def is_converted(path: str | PathLike[str]) -> bool:

@@ -124,7 +124,7 @@ class Verifier(Generic[LookType]):
     @property
     def over(self) -> bool:
         """Whether no look of the search is worth a pass, or all closer looks were made."""
-        return self.places.left < self.thresholds.give_up or self._spent
+        return self.places.left < self.thresholds.give_up or self._made >= self.most
 
     def outcome(self) -> int:
         """Decide whether the search ends."""
@@ -172,7 +172,7 @@ class Verifier(Generic[LookType]):
         recent = [chance for chance, each in zip(self._chances, self.verdicts, strict=True) if self._recent(each)]
         sure = self._verified(recent, over=False) > 0
         last = last or self.places.left < self.thresholds.give_up
-        self.candidate = None if self._spent or sure else self.places.due(self.thresholds.place, last=last)
+        self.candidate = None if self._made >= self.most or sure else self.places.due(self.thresholds.place, last=last)
 
     def _verified(self, chances: Sequence[float], *, over: bool) -> int:
         """The outcome by the probabilities of some places (`verified`)."""
@@ -183,11 +183,6 @@ class Verifier(Generic[LookType]):
     def _made(self) -> int:
         """Number of recent closer looks."""
         return sum(self._recent(each) for each in self.verdicts)
-
-    @property
-    def _spent(self) -> bool:
-        """Whether all closer looks were made."""
-        return self._made >= self.most
 
     @property
     def _chances(self) -> list[float]:

@@ -28,7 +28,7 @@ from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, percent_of, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import NonPredictive
@@ -425,17 +425,13 @@ class EvidenceFit(PartFit):
     """Train the target evidence, and choose its thresholds."""
 
     name: ClassVar[str] = "evidence"
+    settings: FitSearchConfig
 
-    @property
-    def settings(self) -> FitSearchConfig:
-        """The settings of the training."""
-        return self.inputs.settings(FitSearchConfig, absent=self.inputs.absent)
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
-        judged = len(self.inputs.judged)
-        return {
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(FitSearchConfig, absent=inputs.absent)
+        judged = len(inputs.judged)
+        self.tasks = {
             "describing looks": 0.05 * len(self.run.scenes),
             "training": 0.1 * self.settings.steps,
             "describing others": 0.05 * len(self.inputs.held_out),

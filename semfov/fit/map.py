@@ -23,7 +23,7 @@ from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartResult, strategy
+from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Closer, Random
@@ -342,17 +342,13 @@ class MapFit(PartFit):
     """Train the map of all classes."""
 
     name: ClassVar[str] = "map"
+    settings: FitMapConfig
 
-    @property
-    def settings(self) -> FitMapConfig:
-        """The settings of the training."""
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
         steps = self.config.map_steps or 1000
-        return self.inputs.settings(FitMapConfig, steps=steps, gain_steps=max(1, steps // 5))
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
-        return {
+        self.settings = inputs.settings(FitMapConfig, steps=steps, gain_steps=max(1, steps // 5))
+        self.tasks = {
             "describing looks": 0.05 * len(self.run.scenes),
             "training": 0.25 * self.settings.steps,
             "learning the gain of looks": 0.1 * self.settings.gain_steps,

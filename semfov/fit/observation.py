@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,20 +13,21 @@ import torch
 from torch import Tensor
 
 from semfov.data.scene import Scenes
+from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, in_words, section
 from semfov.fit.outputs import split
-from semfov.fit.parts.base import IOU, PartFit, PartResult
+from semfov.fit.parts.base import IOU, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.looking import Looking
-from semfov.runs.samples import CellsOfLook, Sampler, Samples, all_cells
+from semfov.runs.samples import CellsOfLook, Samples, all_cells
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
+from semfov.zoom.eye import WindowEye
 
 
 @dataclass(frozen=True)
@@ -89,23 +90,24 @@ class FitObservationConfig(FitConfig):
         return [step * n for n in range(1, self.levels)]
 
 
-_Looker = Sampler | Looking
-"""The source of the detections: random looks, or looks from every cell."""
-
-
 def fit_model(
-    config: FitObservationConfig, sampler: _Looker, statistics: DirichletStatistics, samples: Samples
+    config: FitObservationConfig,
+    eye: Eye | WindowEye,
+    scenes: Scenes,
+    statistics: DirichletStatistics,
+    samples: Samples,
 ) -> FovealObservationModel:
     """Fit the model with the method in the settings."""
     if config.method != "discriminative":
-        return fit_published(config, sampler, statistics, config.method)
-    start = fit_published(config, sampler, statistics, "newton", expected="empirical")
+        return fit_published(config, eye, scenes, statistics, config.method)
+    start = fit_published(config, eye, scenes, statistics, "newton", expected="empirical")
     return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
 def fit_published(
     config: FitObservationConfig,
-    sampler: _Looker,
+    eye: Eye | WindowEye,
+    scenes: Scenes,
     statistics: DirichletStatistics,
     method: Method,
     **options: Any,
@@ -114,8 +116,7 @@ def fit_published(
 
     A pair of class and level with enough detections is fitted by maximum likelihood, as published. Others are shrunk.
     """
-    classes = sampler.eye.detector.classes
-    model = FovealObservationModel.identity(classes, config.edges)
+    model = FovealObservationModel.identity(eye.detector.classes, config.edges)
     with warnings.catch_warnings():
         # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
@@ -126,17 +127,19 @@ def fit_published(
             shrinkage=config.shrinkage,
             enough=config.enough,
             **options,
-            **sampler.eye.settings(),
+            **eye.settings(),
             samples=int(statistics.count.sum()),
-            data=sampler.scenes.fingerprint,
+            data=scenes.fingerprint,
             fixations=config.fixations,
             seed=config.seed,
         ).eval()
 
 
-def statistics_of(config: FitObservationConfig, sampler: _Looker, shards: Iterable[Samples]) -> DirichletStatistics:
+def statistics_of(
+    config: FitObservationConfig, classes: Sequence[str], shards: Iterable[Samples]
+) -> DirichletStatistics:
     """Sum the sufficient statistics of detections by class and level, shard by shard."""
-    model = FovealObservationModel.identity(sampler.eye.detector.classes, config.edges)
+    model = FovealObservationModel.identity(classes, config.edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
     for samples in shards:
@@ -166,23 +169,21 @@ class ObservationFit(PartFit):
     """Fit the observation model with its miss rates."""
 
     name: ClassVar[str] = "observation"
+    settings: FitObservationConfig
 
-    @property
-    def settings(self) -> FitObservationConfig:
-        """The settings of the observation model."""
-        return self.inputs.settings(FitObservationConfig)
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
-        return {"fitting": 1 + 0.1 * len(self.run.scenes)}
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(FitObservationConfig)
+        self.tasks = {"fitting": 1 + 0.1 * len(self.run.scenes)}
 
     def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
         config, run, samples = self.settings, self.run, self.inputs.samples
         held_out = split(samples.scene, config.holdout)
         judged = samples[held_out]
-        model = fit_model(config, run, statistics_of(config, run, [samples[~held_out]]), samples[~held_out])
+        fitted = samples[~held_out]
+        statistics = statistics_of(config, run.eye.detector.classes, [fitted])
+        model = fit_model(config, run.eye, run.scenes, statistics, fitted)
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = partial(all_cells, cells=self.config.cells)
         misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)

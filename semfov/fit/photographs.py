@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
-from semfov.fit.searches import SearchLimits, TargetSearch
+from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import (
     VerificationResult,
     choose_confirm,
@@ -23,6 +23,7 @@ from semfov.fit.verification import (
     verify,
 )
 from semfov.fit.windows_certainty import fit_certainty, logistic_regression
+from semfov.fit.windows_settings import FitZoomConfig
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.window_looking import right_boxes
@@ -45,20 +46,6 @@ _AREA = 0.2
 """Classes that cover a larger share of a photograph are not searched for."""
 
 
-class _Limits(SearchLimits, Protocol):
-    """Settings of the fit (see `FitZoomConfig`)."""
-
-    @property
-    def photographs(self) -> int:
-        """Number of photographs to look at."""
-        ...
-
-    @property
-    def worth(self) -> float:
-        """Least worth of a closer look."""
-        ...
-
-
 class _WholeSearch(TargetSearch[WindowLook]):
     """A search of a photograph after the look at the whole; objects `(M, 4)`, closer looks by their box."""
 
@@ -75,7 +62,8 @@ class _WholeSearch(TargetSearch[WindowLook]):
         *,
         spare: bool = False,
     ) -> None:
-        super().__init__(number, target, present=len(objects) > 0, spare=spare)
+        places = partial(PhotographPlaces, target, glances.lattice)
+        super().__init__(number, target, places, self._look_closely, present=len(objects) > 0, spare=spare)
         self.glances, self.whole, self.objects, self.model = glances, whole, objects, model
         self.closely: dict[tuple[float, ...], Detections] = {}
 
@@ -92,11 +80,7 @@ class _WholeSearch(TargetSearch[WindowLook]):
         presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
         return WindowLook(candidates(self.whole), number, float(presence), self.best, 0.0)
 
-    def candidates(self) -> PhotographPlaces:
-        """Make the source of places to look at closely."""
-        return PhotographPlaces(self.target, self.glances.lattice)
-
-    def close_up(self, box: Tensor) -> Detections:
+    def _look_closely(self, box: Tensor) -> Detections:
         """Look closely at a box `(4,)`, once."""
         key = tuple(box.tolist())
         if key not in self.closely:
@@ -108,21 +92,9 @@ class _WholeSearch(TargetSearch[WindowLook]):
         centre = (box[:2] + box[2:]) / 2
         return bool(((self.objects[:, :2] <= centre) & (centre <= self.objects[:, 2:])).all(-1).any())
 
-    def last(self, index: int, room: float) -> bool:
-        """No other look follows."""
-        return True
-
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """No decision without closer looks."""
-        return 0
-
-    def found(self, index: int) -> bool:
-        """Never asked for."""
-        raise NotImplementedError
-
 
 def fit_photographs(
-    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: _Limits, prior: Verification | None = None
+    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: FitZoomConfig, prior: Verification | None = None
 ) -> str:
     """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
 
@@ -184,7 +156,7 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], h
 
 
 def _fit_closer(
-    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: _Limits, prior: Verification | None
+    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitZoomConfig, prior: Verification | None
 ) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
     closer = examine(searches, _FOLDS)

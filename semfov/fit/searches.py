@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
-from typing import ClassVar, Generic, Protocol
+from functools import cached_property, partial
+from typing import ClassVar, Generic
 
 import torch
 from torch import Tensor
@@ -15,8 +15,8 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
-from semfov.decision import CandidateCells, CandidatePlaces, cell_of, conclude, decide
-from semfov.decision.candidates import LookType
+from semfov.decision import OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
+from semfov.decision.candidates import LookAt, LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
 from semfov.eye import Eye
@@ -30,20 +30,6 @@ from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_sear
 from semfov.runs.store import DetectionStore, RememberedLooks
 
 
-class SearchLimits(Protocol):
-    """Settings of a fit of a verification (see `FitZoomConfig`)."""
-
-    @property
-    def surest(self) -> float:
-        """Upper limit of the probability from which on a target counts as found."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of the choice of classes."""
-        ...
-
-
 class TargetSearch(ABC, Generic[LookType]):
     """Base of the searches for a class in a picture, with all their looks but the closer ones.
 
@@ -53,9 +39,18 @@ class TargetSearch(ABC, Generic[LookType]):
     after: ClassVar[tuple[int, ...]]
 
     def __init__(
-        self, picture: int, target: int, *, present: bool, spare: bool = False, passes: float = math.inf
+        self,
+        picture: int,
+        target: int,
+        candidates: Callable[[], CandidatePlaces[LookType]],
+        close_up: LookAt,
+        *,
+        present: bool,
+        spare: bool = False,
+        passes: float = math.inf,
     ) -> None:
-        self.picture, self.target, self.present, self.spare, self.passes = picture, target, present, spare, passes
+        self.picture, self.target, self.candidates, self.close_up = picture, target, candidates, close_up
+        self.present, self.spare, self.passes = present, spare, passes
 
     @abstractmethod
     def __len__(self) -> int:
@@ -66,28 +61,16 @@ class TargetSearch(ABC, Generic[LookType]):
         """Return the look of this index; `number` looks of both kinds were made up to it."""
 
     @abstractmethod
-    def candidates(self) -> CandidatePlaces[LookType]:
-        """Make the source of places to look at closely."""
-
-    @abstractmethod
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-
-    @abstractmethod
     def right(self, box: Tensor) -> bool:
         """Whether the target is at a box `(4,)`."""
 
-    @abstractmethod
     def last(self, index: int, room: float) -> bool:
         """Whether no look follows the one of this index, when `room` looks of both kinds are left."""
+        return index + 1 == len(self)
 
-    @abstractmethod
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """Number of the outcome after a look without closer looks, 0 for a search that continues (`settle`)."""
-
-    @abstractmethod
-    def found(self, index: int) -> bool:
-        """Whether the place is right at which a search without closer looks finds the target after a look."""
+    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
+        """The outcome after a look without closer looks, 0 to go on, and whether the target is at the place found."""
+        return 0, None
 
 
 class SearchedPhotograph:
@@ -188,7 +171,10 @@ class _PhotographSearch(TargetSearch[Step]):
     def __init__(
         self, photograph: SearchedPhotograph, target: DrawnSearch, evidence: TargetEvidence, looks: int
     ) -> None:
-        super().__init__(photograph.number, target.target, present=target.present, spare=target.spare)
+        places = partial(CandidateCells, photograph.grid, target.target)
+        super().__init__(
+            photograph.number, target.target, places, photograph.close_up, present=target.present, spare=target.spare
+        )
         self.photograph, self.goal = photograph, target.goal
         self._search = lambda: _search_photograph(photograph, target, Target(evidence), looks)
 
@@ -204,31 +190,18 @@ class _PhotographSearch(TargetSearch[Step]):
         """Return a step."""
         return self.steps[index]
 
-    def candidates(self) -> CandidateCells:
-        """Make the source of cells to look at closely."""
-        return CandidateCells(self.photograph.grid, self.target)
-
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-        return self.photograph.close_up(box)
-
     def right(self, box: Tensor) -> bool:
         """Whether an object of the class overlaps the cell of a box `(4,)`."""
         return bool(self.goal[cell_of(box, self.photograph.grid)])
 
-    def last(self, index: int, room: float) -> bool:
-        """Whether it is the last step."""
-        return index + 1 == len(self.steps)
-
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """Number of the outcome by the belief alone."""
-        return int(decide(self.steps[index], self.target, thresholds))
-
-    def found(self, index: int) -> bool:
-        """Whether an object of the class overlaps the cell with the strongest evidence."""
+    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
+        """The outcome by the belief alone; the place is right if an object overlaps the cell of strongest evidence."""
+        outcome = int(decide(self.steps[index], self.target, thresholds))
+        if OUTCOMES[outcome] != "found":
+            return outcome, None
         looks = [step.detections for step in self.steps[: index + 1]]
         decision = conclude(1, self.steps[index].belief, looks, self.photograph.grid, self.target)
-        return bool(self.goal[decision.cell])
+        return outcome, bool(self.goal[decision.cell])
 
 
 def photograph_searches(

@@ -15,7 +15,7 @@ from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, in_words, percent_of, section
-from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartResult
+from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
 from semfov.runs.progress import track
@@ -129,17 +129,13 @@ class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
 
     name: ClassVar[str] = "tempering"
+    settings: FitTemperingConfig
 
-    @property
-    def settings(self) -> FitTemperingConfig:
-        """The settings of the choice."""
-        return self.inputs.settings(FitTemperingConfig, min_objects=1)
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(FitTemperingConfig, min_objects=1)
         tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in self.settings.exponents]
-        return dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
+        self.tasks = dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
 
     def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""

@@ -19,7 +19,7 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, in_words
 from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import training_of
-from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.parts.base import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
@@ -219,9 +219,9 @@ def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _Sea
     if thresholds is None:
         return None, len(search)
     for index in range(len(search)):
-        outcome = search.outcome(index, thresholds)
+        outcome, right = search.decided(index, thresholds)
         if outcome:
-            return (search.found(index) if OUTCOMES[outcome] == "found" else None), index + 1
+            return right, index + 1
     return None, len(search)
 
 
@@ -377,17 +377,13 @@ class VerificationFit(PartFit):
     """
 
     name: ClassVar[str] = "verification"
+    settings: FitVerificationConfig
 
-    @property
-    def settings(self) -> FitVerificationConfig:
-        """The settings of the fit."""
-        return self.inputs.settings(FitVerificationConfig, absent=self.inputs.absent)
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
-        judged = len(self.inputs.judged)
-        return {"looking": judged, "verifying": 0.5 * judged}
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(FitVerificationConfig, absent=inputs.absent)
+        judged = len(inputs.judged)
+        self.tasks = {"looking": judged, "verifying": 0.5 * judged}
 
     def fit(self) -> PartResult:
         """Fit in folds, and compare decisions with those of the same agent without closer looks."""

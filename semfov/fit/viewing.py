@@ -74,13 +74,9 @@ class ViewingData(Settings):
 
     def people(self, number: int) -> dict[str, list[Fixations]]:
         """The scanpaths of more than one fixation of a data set, by picture."""
-        size = _at(self.sizes, number, None)
+        size = self.sizes[number] if number < len(self.sizes) else None
         everyone = read_fixations(self.fixations[number], **({} if size is None else {"size": frame_of(size)}))
         return dict([*by_picture(each for each in everyone if len(each) > 1).items()][: self.limit])
-
-
-def _at(values: Sequence[Any], number: int, default: Any) -> Any:
-    return values[number] if number < len(values) else default
 
 
 @dataclass(frozen=True)
@@ -189,31 +185,23 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
                 digest = scenes.digest(index)
                 kept = store.read(digest)
                 if kept is None:
-                    kept = _packed(source.maps(scenes[index].image[None]))
+                    features = source.maps(scenes[index].image[None])
+                    place = features.placement
+                    placed = [*place.size, *place.scale, *place.offset, *features.canvas]
+                    halves = {name: each[0].half() for name, each in features.maps.items()}
+                    kept = halves | {"placed": torch.tensor(placed, dtype=torch.float64)}
                     store.write(digest, kept)
-                yield _unpacked(kept, source.layers), people[str(name)]
+                width, height, across, down, left, top, *canvas = kept["placed"].tolist()
+                placement = Placement((int(width), int(height)), (across, down), (left, top))
+                maps = {name: kept[name][None] for name in source.layers}
+                yield FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing()), people[str(name)]
 
-        groups += _grouped(seen(), _at(data.seconds, number, 3.0), number)
+        groups += _grouped(seen(), data.seconds[number] if number < len(data.seconds) else 3.0, number)
     return groups
 
 
 _Seen = tuple[FeatureMaps, Sequence[Fixations]]
 """The maps of a picture, and the fixations in it."""
-
-
-def _packed(features: FeatureMaps) -> dict[str, Tensor]:
-    place = features.placement
-    placed = [*place.size, *place.scale, *place.offset, *features.canvas]
-    halves = {name: each[0].half() for name, each in features.maps.items()}
-    return halves | {"placed": torch.tensor(placed, dtype=torch.float64)}
-
-
-def _unpacked(tensors: Mapping[str, Tensor], layers: Sequence[str]) -> FeatureMaps:
-    """Maps in the order of `layers`, on which the first weights of a model depend; a file has them sorted by name."""
-    width, height, across, down, left, top, *canvas = tensors["placed"].tolist()
-    placement = Placement((int(width), int(height)), (across, down), (left, top))
-    maps = {name: tensors[name][None] for name in layers}
-    return FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing())
 
 
 def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:

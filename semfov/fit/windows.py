@@ -9,9 +9,6 @@ import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Literal, get_args
 
 import torch
 
@@ -21,7 +18,6 @@ from semfov.data.scattered import Scattered
 from semfov.data.scene import ChosenScenes, Scenes
 from semfov.errors import check
 from semfov.fit.outputs import training_of
-from semfov.fit.settings import FitConfig
 from semfov.fit.windows_certainty import certainty_again, spread_again
 from semfov.fit.windows_decision import Searches, fit_closer, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
@@ -38,20 +34,16 @@ from semfov.fit.windows_evidence import (
     rate_loss,
     windows_of,
 )
+from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, PictureKind
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import DetectorConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count, Range, Share, Whole
 from semfov.runs.setup import make_detector, split_photographs
-from semfov.runs.window_looking import TileSize
 from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.networks import Survey
-
-RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]
 
 
 def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
@@ -63,90 +55,6 @@ def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
     chosen = sorted(order[: math.ceil(share * len(scenes))])
     ids: list[int] | list[str] = [scenes.ids[index] for index in chosen]  # type: ignore[assignment]
     return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
-
-
-PictureKind = Literal["few", "many", "one class", "photographs", "objects"]
-"""Mosaics of 3 × 3 photographs; of 12 × 12 of half the size; of 8 × 6 that share a class; photographs, and single
-objects of few classes, scattered over one ground."""
-
-PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)
-
-
-@dataclass(frozen=True)
-class FitZoomConfig(FitConfig):
-    """Fit evidence by magnification on mosaics.
-
-    Args:
-        data: photographs to compose the mosaics from.
-        detector: the detector.
-        holdout: one in every n photographs is held out.
-        mosaics: number of training mosaics of 4 × 4 photographs.
-        far: number of training mosaics of 8 × 6 photographs, in which objects are half as large, and largest number of
-            those of 12 × 12 photographs of half the size, for fitting the certainty.
-        crowded: number of training mosaics of 4 × 4 photographs of the third that hold most objects, for fitting the
-            number of objects of any class.
-        judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
-            search and thresholds; and of the third of them that hold most objects.
-        judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
-        kinds: kinds of pictures to fit on beside these mosaics (`PictureKind`): `few`, `many`,
-            `one class`, `photographs` and `objects`.
-        each: number of training pictures of each of these kinds.
-        judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
-        tile: width in pixels of the slot of a photograph; its height is three quarters of that.
-        searched: number of training mosaics of 4 × 4 photographs for fitting the decisions of searches.
-        sought: number of present classes, and of absent classes, to search for in each of these mosaics.
-        passes: maximum number of passes of the detector in such a search.
-        false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
-        surest: upper limit of that threshold, even if more false alarms result.
-        lost: maximum share of the targets that may be missed because the search gives up.
-        place: least probability that the target is at a place, for a closer look there when no other look follows.
-        photographs: number of photographs that are looked at by themselves, those with most pixels first, to fit the
-            evidence for photographs; 0 leaves it out.
-        worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
-        evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
-            further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
-            closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
-            closer looks find, `certainty`, the probability that an object is there, with the spread of expected
-            numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification has to
-            follow new decisions; without it they are made without closer looks.
-        steps: number of training steps for predicting the results of closer looks.
-        survey_steps: number of training steps for the number of objects of any class.
-        judging: number of training steps for the decisions of searches.
-        seed: seed of the mosaics and the fit.
-        out: folder for the model and the report.
-        cache: folder for the looks (None: the user's cache).
-        workers: number of processes (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
-    """
-
-    unused = ("sensor", "name")
-    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
-    holdout: Annotated[int, Range(2, 10**9)] = 5
-    mosaics: Count = 400
-    far: Count = 40
-    crowded: Count = 240
-    judged: Count = 80
-    judged_far: Count = 4
-    kinds: tuple[PictureKind, ...] = PICTURE_KINDS
-    each: Count = 20
-    judged_each: Count = 6
-    tile: TileSize = 480
-    searched: Count = 50
-    sought: Count = 4
-    passes: Count = 24
-    false_alarms: Share = 0.03
-    surest: Share = 0.9
-    lost: Share = 0.02
-    place: Share = 0.2
-    photographs: Whole = 320
-    worth: Share = 0.05
-    evidence: Path | None = None
-    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
-    steps: Count = 800
-    survey_steps: Count = 1500
-    judging: Count = 300
-    out: Path = Path("runs/fit_zoom")
 
 
 _OTHER = ("kinds", "each", "judged_each", "tile", "seed")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,12 +14,12 @@ from torch.nn import functional as F
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
-from semfov.decision import SAME, settle
-from semfov.detection.detections import Detections
+from semfov.decision import OUTCOMES, SAME, settle
 from semfov.fit.descent import descend
 from semfov.fit.evidence import Bounds, choose_thresholds
-from semfov.fit.searches import SearchLimits, TargetSearch
+from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import VerificationResult, choose_confirm, examine, fit, verification_report, verify
+from semfov.fit.windows_settings import FitZoomConfig
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.presence import area_under_roc
 from semfov.observation.matching import box_iou
@@ -157,9 +158,16 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         states: Sequence[WindowLook],
         boxes: Sequence[Tensor | None],
     ) -> None:
-        super().__init__(mosaic, target, present=len(objects) > 0, passes=passes)
-        self.looks, self.objects, self.likely = looks, objects, likely
-        self.glances, self.states, self.boxes = glances, states, boxes
+        places = partial(CandidateBoxes, target, likely)
+        super().__init__(
+            mosaic,
+            target,
+            places,
+            lambda box: look_closely(looks, box).detections,
+            present=len(objects) > 0,
+            passes=passes,
+        )
+        self.looks, self.objects, self.glances, self.states, self.boxes = looks, objects, glances, states, boxes
 
     def __len__(self) -> int:
         return len(self.states)
@@ -167,14 +175,6 @@ class _MosaicSearch(TargetSearch[WindowLook]):
     def look(self, index: int, number: int) -> WindowLook:
         """Return a look with the number of looks up to it."""
         return self.states[index]._replace(number=number)
-
-    def candidates(self) -> CandidateBoxes:
-        """Make the source of boxes to look at closely."""
-        return CandidateBoxes(self.target, self.likely)
-
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-        return look_closely(self.looks, box).detections
 
     def right(self, box: Tensor) -> bool:
         """Whether a box `(4,)` is that of an annotated object of the class."""
@@ -184,46 +184,20 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         """Whether no pass is left after a closer look."""
         return room <= 1
 
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """Number of the outcome by the evidence alone."""
-        state = self.states[index]
-        looked = torch.tensor([self.boxes[index] is not None])
-        return int(settle(torch.tensor([state.presence]), looked, torch.tensor([state.left]), thresholds))
-
-    def found(self, index: int) -> bool:
-        """Whether the box with the highest score is that of an annotated object of the class."""
-        box = self.boxes[index]
+    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
+        """The outcome by the evidence alone; the place is that of the box with the highest score."""
+        state, box = self.states[index], self.boxes[index]
+        presence, looked, left = (torch.tensor([each]) for each in (state.presence, box is not None, state.left))
+        outcome = int(settle(presence, looked, left, thresholds))
+        if OUTCOMES[outcome] != "found":
+            return outcome, None
         assert box is not None
-        return self.right(box)
-
-
-class _Limits(SearchLimits, Protocol):
-    """Settings of the fit (see `FitZoomConfig`)."""
-
-    @property
-    def sought(self) -> int:
-        """Number of present classes, and of absent classes, to search for in each mosaic."""
-        ...
-
-    @property
-    def passes(self) -> int:
-        """Maximum number of passes of the detector in a search."""
-        ...
-
-    @property
-    def place(self) -> float:
-        """Least probability of a place that is worth a closer look when no other look follows."""
-        ...
-
-    @property
-    def false_alarms(self) -> float:
-        """Maximum share of absent targets that may be reported as found."""
-        ...
+        return outcome, self.right(box)
 
 
 @torch.inference_mode()
 def _mosaic_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: _Limits, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
 ) -> Iterator[_MosaicSearch]:
     """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
@@ -247,7 +221,7 @@ def _mosaic_searches(
 def fit_closer(
     model: GlimpseEvidence,
     pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
-    config: _Limits,
+    config: FitZoomConfig,
     prior: Verification | None = None,
 ) -> str:
     """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model."""

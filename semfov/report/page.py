@@ -93,7 +93,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         "sections": sections,
         "about": _about_html(episodes),
         "looks": "".join(
-            looks_html(episode, _place(number), headed=number == 0)
+            looks_html(episode, f"large-{number}", headed=number == 0)
             for number, episode in enumerate(episodes)
             if "looks" in episode
         ),
@@ -128,11 +128,6 @@ def _about_html(episodes: Sequence[Data]) -> str:
     return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
 
 
-def _place(number: int) -> str:
-    """Id of the element with the looks of an episode."""
-    return f"large-{number}"
-
-
 def pictures_of(episode: Data) -> list[str]:
     """The pictures of an episode as data URIs, each as often as it is shown."""
     views = [each["view"] for each in episode["looks" if "looks" in episode else "fixations"]]
@@ -146,7 +141,7 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
         return {**episode, "image": pictures.get(episode["image"]), "fixations": fixations}
     looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
     about = {key: episode[key] for key in (*ABOUT, "summary")}
-    return {**about, "article": _place(number), "looks": looks}
+    return {**about, "article": f"large-{number}", "looks": looks}
 
 
 def json_script(data: Any) -> str:

@@ -28,9 +28,9 @@ from semfov.fit.verification import (
 )
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.io.storage import read
-from semfov.runs.samples import _look_from
 from semfov.runs.store import cell_store
 from tests.small import CLASSES, Blobs
+from train.samples import _look_from
 
 
 def examined(count=200, seed=0):

@@ -16,9 +16,9 @@ from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import unverified, verify
-from semfov.fit.windows import FitZoomConfig
 from semfov.fit.windows_decision import _mosaic_searches, fit_closer
 from semfov.fit.windows_evidence import example_of
+from semfov.fit.windows_settings import FitZoomConfig
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from semfov.fit.windows import PICTURE_KINDS, _compose_pictures
+from semfov.fit.windows import _compose_pictures
 from semfov.fit.windows_evidence import windows_of
+from semfov.fit.windows_settings import PICTURE_KINDS
 from semfov.zoom.lattice import Lattice
 from tests.small import RedBoxes
 

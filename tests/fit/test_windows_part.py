@@ -10,7 +10,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.parts.windows import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.windows import FitZoomConfig
+from semfov.fit.windows_settings import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig

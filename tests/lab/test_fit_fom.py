@@ -9,9 +9,9 @@ from eval.calibration import main as calibrate
 from semfov.fit.observation import FitObservationConfig
 from semfov.observation import FovealObservationModel, match
 from semfov.runs.config import DataConfig
-from semfov.runs.samples import Sampler
 from semfov.runs.seeds import generator_for
 from train.fit_fom import fit_fom, main
+from train.samples import Sampler
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 

@@ -103,19 +103,13 @@ class PartFit(ABC):
     """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it."""
 
     name: ClassVar[str]
+    settings: Any
+    """The settings of the part, a dataclass. The part is fitted again if they change."""
+    tasks: dict[str, float]
+    """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
 
     def __init__(self, inputs: PartInputs) -> None:
         self.inputs, self.config, self.run = inputs, inputs.config, inputs.run
-
-    @property
-    @abstractmethod
-    def settings(self) -> Any:
-        """The settings of the part, a dataclass. The part is fitted again if they change."""
-
-    @property
-    @abstractmethod
-    def tasks(self) -> dict[str, float]:
-        """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
 
     @abstractmethod
     def fit(self) -> PartResult:

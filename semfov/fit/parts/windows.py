@@ -12,10 +12,11 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector_report import Difference, in_words, mean_percent, section
-from semfov.fit.parts.base import PartFit, PartResult
+from semfov.fit.parts.base import PartFit, PartInputs, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
-from semfov.fit.windows import FitZoomConfig, MosaicFit, judge_windows, some_explored
+from semfov.fit.windows import MosaicFit, judge_windows, some_explored
+from semfov.fit.windows_settings import FitZoomConfig
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
 from semfov.runs.looks import one_thread
@@ -57,23 +58,46 @@ class WindowsFit(PartFit):
 
     name: ClassVar[str] = "windows"
 
-    @property
-    def settings(self) -> FitZoomConfig | _LeftOut:
-        """The settings of the fit."""
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        photographs, held_out = len(self.run.scenes), len(inputs.held_out)
+        why = None
         if not self.config.windows:
-            return _LeftOut("not fitted, since the setting `windows` is false")
-        photographs, held_out = len(self.run.scenes), len(self.inputs.held_out)
-        if held_out < _ENOUGH:
-            return _LeftOut(
+            why = "not fitted, since the setting `windows` is false"
+        elif held_out < _ENOUGH:
+            why = (
                 f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
-        return self.mosaics(photographs)
+        self.settings: FitZoomConfig | _LeftOut
+        if why is not None:
+            self.settings, self.tasks = _LeftOut(why), {}
+            return
+        self.settings = config = self.mosaics(photographs)
+        sets = {"searched": config.searched, "judged": config.judged}
+        self.tasks = {
+            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
+            "learning what closer looks show": 0.1 * config.steps,
+            "learning the expected number of objects": 0.2 * config.steps,
+            "learning the survey": 0.4 * config.survey_steps,
+            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
+            "fitting decisions": 0.01 * config.judging,
+            "looking closely": 4 * config.searched,
+            "looking closely at held-out pictures": 4 * config.judged,
+            "looking at photographs": 25 * _LOOK * config.photographs,
+            **{f"exploring, {kind}": 2 * count for kind, count in (sets | some_explored(config.searched)).items()},
+        }
 
     def mosaics(self, photographs: int) -> FitZoomConfig:
         """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
         own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
         training = min(photographs - held_out, _FOR_MOSAICS)
+        # The photographs are not enlarged.
+        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
+        width = min(
+            median(max(width, height * 4 / 3) for width, height in sizes),
+            _OF_INPUT * self.run.eye.detector.input_size[0],
+        )
         return FitZoomConfig(
             data=own.data,
             detector=own.detector,
@@ -88,7 +112,7 @@ class WindowsFit(PartFit):
             sought=3,
             passes=16,
             photographs=min(photographs, _ALONE),
-            tile=self._tile(),
+            tile=max(16, round(width)),
             steps=own.window_steps,
             survey_steps=own.window_steps,
             seed=own.seed,
@@ -97,32 +121,6 @@ class WindowsFit(PartFit):
             workers=own.workers,
             scheduler=own.scheduler,
         )
-
-    def _tile(self) -> int:
-        """Width of the photographs' slots in pixels: the photographs are not enlarged."""
-        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
-        own = median(max(width, height * 4 / 3) for width, height in sizes)
-        return max(16, round(min(own, _OF_INPUT * self.run.eye.detector.input_size[0])))
-
-    @property
-    def tasks(self) -> dict[str, float]:
-        """The tasks and their seconds."""
-        config = self.settings
-        if isinstance(config, _LeftOut):
-            return {}
-        sets = {"searched": config.searched, "judged": config.judged}
-        return {
-            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
-            "learning what closer looks show": 0.1 * config.steps,
-            "learning the expected number of objects": 0.2 * config.steps,
-            "learning the survey": 0.4 * config.survey_steps,
-            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
-            "fitting decisions": 0.01 * config.judging,
-            "looking closely": 4 * config.searched,
-            "looking closely at held-out pictures": 4 * config.judged,
-            "looking at photographs": 25 * _LOOK * config.photographs,
-            **{f"exploring, {kind}": 2 * count for kind, count in (sets | some_explored(config.searched)).items()},
-        }
 
     def fit(self) -> PartResult:
         """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
