@@ -17,6 +17,7 @@ import json
 import platform
 import sys
 from dataclasses import asdict
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -181,14 +182,11 @@ def fit_fom(config: FitObservationConfig) -> None:
     edges, classes = config.edges, sampler.eye.detector.classes
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
+    published = partial(fit_published, config, sampler.eye, sampler.scenes, statistics)
     for method in methods:
-        models[f"Dirichlet, {method}"] = fit_published(config, sampler.eye, sampler.scenes, statistics, method)
-    models["Dirichlet with class prior"] = fit_published(
-        config, sampler.eye, sampler.scenes, statistics, "newton", prior=True
-    )
-    models["the same, tempered 0.1"] = fit_published(
-        config, sampler.eye, sampler.scenes, statistics, "newton", prior=True, tempering=0.1
-    )
+        models[f"Dirichlet, {method}"] = published(method)
+    models["Dirichlet with class prior"] = published("newton", prior=True)
+    models["the same, tempered 0.1"] = published("newton", prior=True, tempering=0.1)
     if config.method == "discriminative":
         models["discriminative"] = model
     written = _write_report(config, model, models, samples[held_out])

@@ -1,4 +1,4 @@
-"""Labelled detections of photographs, looked at from random fixations shard by shard, on the processors of a command."""
+"""Labelled detections of photographs, looked at from random fixations, shard by shard, on a command's processors."""
 
 from __future__ import annotations
 
