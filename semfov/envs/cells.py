@@ -80,13 +80,20 @@ class _SceneLooks(Looks):
 
 
 class CellGazes(Gazes):
-    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own; cell `(B,)`."""
+    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own; cell `(B,)`.
+
+    The planes of the belief are the probabilities of the target or of all `classes`, and two more.
+    """
 
     coordinates = 2
     scenery: Scenery
     memory: Memory
 
-    def __init__(self, scenery: Scenery, count: int = 1, *, together: bool = False, **options: Any) -> None:
+    def __init__(
+        self, scenery: Scenery, count: int = 1, *, classes: int, together: bool = False, **options: Any
+    ) -> None:
+        self.action_space = spaces.Discrete(scenery.shape[0] * scenery.shape[1])
+        self.belief_space = spaces.Box(0, 1, (classes + 2, *scenery.shape), np.float32)
         super().__init__(scenery, count, **options)
         self.observer: Observer = scenery.together() if together else scenery.observer
         self.looks = _SceneLooks(scenery.open, self.observer, count)
@@ -94,21 +101,6 @@ class CellGazes(Gazes):
         self.size = torch.zeros(count, 2)
         self._steps: list[Step] = []
         self._stimulus: Stimulus | None = None
-
-    @property
-    def action_space(self) -> spaces.Discrete:
-        """The cells."""
-        return spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
-
-    @property
-    def belief_space(self) -> spaces.Box:
-        """Space of the probabilities of the target or of all classes, and of two more planes."""
-        return spaces.Box(0, 1, (self._classes() + 2, *self.scenery.shape), np.float32)
-
-    @property
-    def belief(self) -> Belief:
-        """Belief after the last look of each episode."""
-        return self.memory.belief
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
         """The episode that the options of a reset ask for, or one at random."""
@@ -220,7 +212,7 @@ class CellGazes(Gazes):
         sight = Sight(None, lambda: detections, {})  # type: ignore[arg-type]
         visited = self.memory.visited
         values = torch.zeros(visited.shape)
-        step = Step(len(self._steps), _FIRST, cell, point, sight, self.belief, visited, values, cell, point, {})
+        step = Step(len(self._steps), _FIRST, cell, point, sight, self.memory.belief, visited, values, cell, point, {})
         self._steps.append(step)
 
     def _view(self, row: int) -> Tensor:
@@ -232,11 +224,7 @@ class CellGazes(Gazes):
 
     def _all_or(self, rows: Tensor) -> Belief:
         """The belief of some rows, without a copy where these are all."""
-        return self.belief if len(rows) == len(self.episodes) else self.belief[rows]
-
-    @abstractmethod
-    def _classes(self) -> int:
-        """Number of probabilities in each cell."""
+        return self.memory.belief if len(rows) == len(self.episodes) else self.memory.belief[rows]
 
     @abstractmethod
     def _map(self, rows: Tensor) -> Tensor:
@@ -255,15 +243,12 @@ class _SearchGazes(CellGazes):
     """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
 
     def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
-        super().__init__(scenery, count, **options)
+        super().__init__(scenery, count, classes=1, **options)
         self._goal = torch.zeros(count, scenery.shape[0] * scenery.shape[1], dtype=torch.bool)
 
     def result(self, rows: Tensor) -> Tensor:
         """1 where the gaze is on the target."""
         return self._goal[rows, self.cell[rows]].float()
-
-    def _classes(self) -> int:
-        return 1
 
     def _map(self, rows: Tensor) -> Tensor:
         """Probability of the target in each cell if no fixated cell holds it; 0 in fixated cells."""
@@ -285,16 +270,13 @@ class _Explorations(CellGazes):
     """Explorations: an episode is over when every cell was fixated."""
 
     def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
-        super().__init__(scenery, count, **options)
+        super().__init__(scenery, count, classes=len(scenery.classes), **options)
         self._answers = torch.zeros(count, scenery.shape[0] * scenery.shape[1], len(scenery.classes), dtype=torch.bool)
         self._success = torch.zeros(count)
 
     def result(self, rows: Tensor) -> Tensor:
         """Fraction of the cells with objects whose most probable class is that of one of these objects."""
         return self._success[rows]
-
-    def _classes(self) -> int:
-        return len(self.scenery.classes)
 
     def _map(self, rows: Tensor) -> Tensor:
         """Probability of every class in each cell, background first."""
@@ -314,5 +296,5 @@ class _Explorations(CellGazes):
         return count_right(self._all_or(rows).class_probabilities(), answers) / answers.any(-1).sum(-1)
 
 
-GAZES: dict[str, type[CellGazes]] = {"search": _SearchGazes, "exploration": _Explorations}
+GAZES: dict[str, Callable[..., CellGazes]] = {"search": _SearchGazes, "exploration": _Explorations}
 """Kind of gazes for each task."""

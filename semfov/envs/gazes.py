@@ -39,6 +39,12 @@ class Gazes(ABC):
     coordinates: ClassVar[int]
     """Number of coordinates of a gaze."""
 
+    action_space: Any
+    """Space of the actions of one episode."""
+
+    belief_space: spaces.Box
+    """Space of `planes` of one episode."""
+
     def __init__(
         self,
         scenery: Scenery | ZoomScenery,
@@ -67,16 +73,6 @@ class Gazes(ABC):
             check_whole(glimpse, "glimpse", 1, 4096)
             entries["glimpse"] = spaces.Box(0, 255, (glimpse, glimpse, 3), np.uint8)
         self.observation_space = spaces.Dict(entries)
-
-    @property
-    @abstractmethod
-    def action_space(self) -> spaces.Space[Any]:
-        """Space of the actions of one episode."""
-
-    @property
-    @abstractmethod
-    def belief_space(self) -> spaces.Box:
-        """Space of `planes` of one episode."""
 
     @abstractmethod
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:

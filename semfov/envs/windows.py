@@ -19,8 +19,7 @@ from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath
-from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.glances import Glance, Window, on_lattice, overview
+from semfov.zoom.glances import Window, on_lattice, overview
 from semfov.zoom.lattice import Lattice
 
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
@@ -46,29 +45,11 @@ class WindowGaze(Gazes):
 
     def __init__(self, scenery: ZoomScenery, task: str, *, grid: tuple[int, int] = (10, 10), **options: Any) -> None:
         self.task, self.shape = task, (grid[1], grid[0])
+        # Place and magnification; a space of this type holds numbers of any other kind.
+        self.action_space = spaces.Box(0, 1, (3,), np.float64)
+        self.belief_space = spaces.Box(0, 1, (2, *self.shape), np.float32)
         super().__init__(scenery, **options)
         self.done: set[Window] = set()
-
-    @property
-    def action_space(self) -> spaces.Box:
-        """Place and magnification, each from 0 to 1."""
-        return spaces.Box(0, 1, (3,), np.float64)  # which holds numbers of any other kind
-
-    @property
-    def looks(self) -> list[Glance]:
-        """The looks of the episode, in their order."""
-        return self.looking.glances
-
-    @property
-    def belief(self) -> ZoomBelief:
-        """The belief after the last look."""
-        assert self.looking.belief is not None
-        return self.looking.belief
-
-    @property
-    def belief_space(self) -> spaces.Box:
-        """Space of two planes over the picture."""
-        return spaces.Box(0, 1, (2, *self.shape), np.float32)
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> _WindowEpisode:
         """The episode that the options of a reset ask for, or one at random."""
@@ -102,8 +83,9 @@ class WindowGaze(Gazes):
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """The probability that closer looks find an object, and how closely each place was looked at."""
-        lattice = self.glances.lattice
-        expected = [self.belief.expected(level) for level in range(1, lattice.levels)]
+        lattice, belief = self.glances.lattice, self.looking.belief
+        assert belief is not None
+        expected = [belief.expected(level) for level in range(1, lattice.levels)]
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
         # Objects of each place: the mean of its cells times their number.
         count = adaptive_avg_pool2d(most[None], self.shape) * most.numel() / (self.shape[0] * self.shape[1])
@@ -134,7 +116,7 @@ class WindowGaze(Gazes):
 
     def detections(self, rows: Tensor) -> Detections:
         """Detections of the last look."""
-        return next(glance for glance in self.looks if glance.window == self.window).detections
+        return next(glance for glance in self.looking.glances if glance.window == self.window).detections
 
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the windows that were looked at, and of the objects that were found."""
@@ -167,7 +149,7 @@ class WindowGaze(Gazes):
 
     def _rate(self) -> Tensor:
         scene, target = self.episodes[0]
-        looks = self.looks
+        looks = self.looking.glances
         result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
         return torch.tensor([result], dtype=torch.float64)
 

@@ -43,7 +43,7 @@ class PolicyAgent:
         grid, candidate = scenery.grid(episode.scene), scenery._looking.candidate(scenery.policy, episode.scene)
         targets = gazes.targets[row] if isinstance(episode, Trial) else None
         visited = gazes.memory.visited[row]
-        values = candidate.acquisition(targets, grid, gazes.cell[row])(gazes.belief[row], visited)
+        values = candidate.acquisition(targets, grid, gazes.cell[row])(gazes.memory.belief[row], visited)
         draw = tie_noise if isinstance(episode, Trial) else explore_noise
         noise = draw(scenery._data, episode, len(grid), scenery.protocol)
         # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.
@@ -58,7 +58,7 @@ class WindowAgent:
         self.gaze = env.gazes
 
     def __call__(self):
-        gaze, belief, lattice = self.gaze, self.gaze.belief, self.gaze.glances.lattice
+        gaze, belief, lattice = self.gaze, self.gaze.looking.belief, self.gaze.glances.lattice
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
         return _action_of(lattice, overview(lattice) if choice is None else choice[0])

@@ -198,7 +198,7 @@ def test_observations_have_the_belief_and_the_glimpse_of_the_eye(sceneries):
     assert abs(observation["glimpse"].mean() - picture.mean()) < 6
     assert observation["glimpse"].std() > 10
     moved = env.step(0 if here[0] == 0 else 1)[0]["belief"].reshape(3, -1)
-    believed = env.gazes.belief.chance(env.gazes.targets)[0].numpy()
+    believed = env.gazes.memory.belief.chance(env.gazes.targets)[0].numpy()
     assert moved[0][moved[1] == 0] == pytest.approx(believed[moved[1] == 0])
     assert (moved[1].sum(), moved[2].sum()) == (2, 1)
 

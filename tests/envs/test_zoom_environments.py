@@ -71,11 +71,11 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
         while not over:
             _, reward, terminated, truncated, info = env.step(agent())
             over = terminated or truncated
-        seen = [glance.window for glance in env.gazes.looks]
+        seen = [glance.window for glance in env.gazes.looking.glances]
         steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target, confirm=2.0)
         assert seen == [turn.glance.window for turn, _ in zip(steps, seen, strict=False)]
-        assert terminated == zoom_scenery.found(env.gazes.looks, 0, target)
-        assert not zoom_scenery.found(env.gazes.looks[:-1], 0, target)
+        assert terminated == zoom_scenery.found(env.gazes.looking.glances, 0, target)
+        assert not zoom_scenery.found(env.gazes.looking.glances[:-1], 0, target)
         assert reward == pytest.approx(terminated - 0.05)
         assert info["passes"] == len(seen)
         lengths.add(len(seen))
@@ -92,10 +92,10 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
     while not truncated:
         _, reward, _, truncated, info = env.step(agent())
         total += reward
-    assert len(env.gazes.looks) == info["passes"] == 6
+    assert len(env.gazes.looking.glances) == info["passes"] == 6
     steps = find_everything(zoom_scenery.glances(0), zoom_scenery.evidence)
     expected = [turn.glance.window for turn, _ in zip(steps, range(6), strict=False)]
-    assert [glance.window for glance in env.gazes.looks] == expected
+    assert [glance.window for glance in env.gazes.looking.glances] == expected
     assert total == pytest.approx(10 * (info["result"] - before) - 0.5 * 5)
     assert info["result"] > before
 
@@ -142,7 +142,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
         while not over:
             _, _, terminated, truncated, _ = env.step(env.action_space.sample())
             over = terminated or truncated
-        shown = [float(glance.show[env.gazes.episodes[0].target - 1]) for glance in env.gazes.looks]
+        shown = [float(glance.show[env.gazes.episodes[0].target - 1]) for glance in env.gazes.looking.glances]
         assert max(shown[:-1], default=0) < 0.3
         assert terminated == (shown[-1] >= 0.3)
     explore = ZoomExplore(scenery)
@@ -173,7 +173,7 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
 
     monkeypatch.setattr(again.eye, "glance", refuse)
     kept = again.glances(0).see([overview(again.glances(0).lattice)])[0]
-    assert torch.equal(kept.show, env.gazes.looks[0].show)
+    assert torch.equal(kept.show, env.gazes.looking.glances[0].show)
 
 
 def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_scenery):
