@@ -231,7 +231,8 @@ def _sequences(
     number = len(config.people(0))
     rows: dict[str, list[dict[str, float]]] = {name: [], PEOPLE: []}
     what = {"name": name, "fit": config.fit.plain(), "folds": config.folds, "code": modules_digest(__name__)}
-    for picture in tqdm(range(0, number, max(1, number // config.sequences)), desc="sequences", unit="picture"):
+    chosen = [number * each // config.sequences for each in range(config.sequences)]
+    for picture in tqdm(dict.fromkeys(chosen), desc="sequences", unit="picture"):
 
         def measured(picture: int = picture) -> dict[str, Tensor]:
             fold = folds[picture % config.folds]  # the one that holds it out

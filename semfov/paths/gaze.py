@@ -18,7 +18,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, write_table
+from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
+from semfov.detection.feature_maps import FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -101,7 +103,9 @@ class GazePrediction:
         size = int(image.shape[-1]), int(image.shape[-2])
         with torch.no_grad():
             if seen is None:
-                features = detector.features(image[None], [*model.layers])
+                canvas, placement = detector.fit(image[None])
+                _, maps = detector.propose_with_features(canvas, [*model.layers])
+                features = FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
             elif isinstance(looking, Eye):
                 _check_frame(seen, size, "seen")
                 points = torch.from_numpy(seen.resized(size).points).to(image)

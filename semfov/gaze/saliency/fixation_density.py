@@ -1,6 +1,8 @@
 """The density of people's fixations, read out of the feature maps that a detector computes anyway."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -153,13 +155,15 @@ class FixationDensity(Pretrained):
         Raises:
             InputError: none is shipped for it; the message has the command that fits one.
         """
-        model = cls.if_shipped(detector.name)
-        if model is None:
+        path = cls.shipped / f"{detector.name}.safetensors"
+        if not path.is_file():
             names = ", ".join(sorted(path.stem for path in cls.shipped.glob("*.safetensors")))
             raise InputError(
                 f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
                 f"fixations with `semfov fit {detector.name} --gaze.fixations FILE --gaze.pictures FOLDER`"
             )
+        model = deepcopy(_read(path))
+        assert isinstance(model, cls)
         model.check_compatible(detector)
         return model
 
@@ -394,6 +398,12 @@ class FixationDensity(Pretrained):
         return model
 
 
+@cache
+def _read(path: Path) -> FixationDensity:
+    """The model of a file that does not change."""
+    return FixationDensity.from_pretrained(path)
+
+
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:
     """Rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
@@ -435,5 +445,11 @@ def _interpolation(
 
 def _gaussian(cells: int, sigma: Tensor) -> Tensor:
     """Blur of a line of cells by a Gaussian, whose weights within the line sum to 1, `(cells, cells)`."""
-    place = torch.arange(cells, device=sigma.device, dtype=sigma.dtype)
-    return (-(place[:, None] - place).square() / (2 * sigma.square())).softmax(-1)
+    return (_squares(cells, sigma.dtype, sigma.device) / (-2 * sigma.square())).softmax(-1)
+
+
+@constant
+def _squares(cells: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Squared distances between the cells of a line, `(cells, cells)`."""
+    place = torch.arange(cells, device=device, dtype=dtype)
+    return (place[:, None] - place).square()
