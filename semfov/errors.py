@@ -126,6 +126,7 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
 
     >>> check_shape(torch.zeros(2, 3, 4), "boxes", None, 4)
     """
+    check_tensor(tensor, argument)
     sizes = tuple(tensor.shape[-len(shape) :])
     if tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True)):
         return

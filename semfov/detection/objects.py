@@ -22,6 +22,7 @@ LEAST = 0.3
 FAINTEST = 0.05
 """Score from which on boxes are merged into candidates."""
 
+_FAR = 1e9  # pixels of an edge, beyond which areas of single precision overflow
 _PRINTED = 20  # largest number of objects in the text form
 
 _BORDER = 2 / 416
@@ -154,9 +155,13 @@ def merge_boxes(
     ([[502.0, 91.0, 700.0, 202.0]], [1])
     """
     box, value = _numbers(boxes, "boxes"), _numbers(scores, "scores")
-    label = torch.as_tensor(labels, dtype=torch.long, device="cpu")
+    number = _numbers(labels, "labels").double()
+    label = number.long()
+    check(torch.equal(label.double(), number), "labels", "whole numbers of classes", number.tolist()[:3])
     box = box.view(0, 4) if not box.numel() else box
     check_shape(box, "boxes", None, 4)
+    far = float(box.abs().max()) if box.numel() else 0.0
+    check(far <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{far:g}")
     check_shape(value, "scores", len(box))
     check_shape(label, "labels", len(box))
     check(bool((box[:, :2] <= box[:, 2:]).all()), "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")

@@ -36,7 +36,7 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
     labels = numbers.to(p.device, torch.int64)
     broken = numbers[numbers != numbers.floor()].tolist()
     check(not broken, "labels", "whole numbers", broken[0] if broken else "")
-    check_shape(labels, "labels", p.shape[0])
+    check(labels.shape == p.shape[:1], "labels", f"{len(p)} numbers, one for each row", f"shape {(*labels.shape,)}")
     check(bins >= 1, "bins", "at least 1", bins)
     if not len(labels):
         return Calibration(0, *[float("nan")] * 5)

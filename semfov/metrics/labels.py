@@ -6,14 +6,44 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.errors import InputError, check, values_known
 
 
+def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
+    """Real numbers of any common type as an array of doubles."""
+    given = values.detach().cpu() if isinstance(values, Tensor) else values
+    try:
+        array = np.asarray(given)
+        numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
+    except (TypeError, ValueError, RuntimeError):
+        numbers = None
+    if numbers is None:
+        raise InputError(f"{argument}: expected real numbers in rows of one length, got {_named(values)}")
+    if finite:
+        check(bool(np.isfinite(numbers).all()), argument, "finite numbers", "infinite ones or NaN; leave these out")
+    return numbers
+
+
+def as_path(points: Any, argument: str) -> NDArray[np.float64]:
+    """Points of fixations, `(n, 2)`, finite."""
+    path = as_array(points, argument, finite=True)
+    path = path.reshape(0, 2) if path.shape == (0,) else path
+    check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
+    return path
+
+
+def _named(values: Any) -> str:
+    kind = getattr(values, "dtype", None)
+    return type(values).__name__ if kind is None else f"{type(values).__name__} of {kind}"
+
+
 def as_numbers(values: Any, argument: str) -> Tensor:
     """Numbers of any common type as a tensor of floats; NaN is refused, because it compares with nothing."""
     tensor = _as_tensor(values, argument)
+    check(not tensor.is_complex(), argument, "real numbers", "complex ones")
     floats = tensor if tensor.is_floating_point() else tensor.double()
     if values_known(floats):
         missing = int(floats.isnan().sum())
@@ -35,6 +65,7 @@ def as_outcomes(values: Any, argument: str) -> Tensor:
 
 def as_labels(labels: Any, argument: str) -> list[Hashable]:
     """Labels as values that are equal where they are; a tensor's elements are each equal to themselves alone."""
+    check(hasattr(labels, "__iter__"), argument, "labels in a row", f"a {type(labels).__name__}")
     given = labels if isinstance(labels, Tensor | np.ndarray) else [*labels]
     check(not hasattr(given, "ndim") or given.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(given))}")
     values = given.tolist() if isinstance(given, Tensor | np.ndarray) else [_plain(each) for each in given]
@@ -56,7 +87,7 @@ def _plain(label: Any) -> Any:
 
 def _as_tensor(values: Any, argument: str) -> Tensor:
     if isinstance(values, Tensor):
-        return values
+        return values.to_dense() if values.layout != torch.strided else values
     try:
         array = np.asarray([*values] if isinstance(values, Sequence) else values)
         return torch.as_tensor(array if array.flags.writeable else array.copy())

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape
+from semfov.errors import check
 from semfov.metrics.labels import as_numbers, as_outcomes
 
 
@@ -11,7 +11,7 @@ def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Scores of the cases with the target, and of those without; there is at least one of each."""
     scores = as_numbers(score, "score")
     there = as_outcomes(present, "present").to(scores.device)
-    check_shape(there, "present", *scores.shape)
+    check(there.shape == scores.shape, "present", f"one outcome for each score {(*scores.shape,)}", (*there.shape,))
     check(bool(there.any() and not there.all()), "present", "both true and false values", "only one of the two")
     return scores[there].double(), scores[~there].double()
 

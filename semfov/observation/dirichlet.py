@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_finite, check_shape, values_known
+from semfov.errors import check, check_finite, check_shape, check_tensor, values_known
 from semfov.observation.mle import inverse_digamma, mle, shrink, vacuous
 from semfov.observation.special import log_gamma_divergence
 
@@ -24,6 +24,10 @@ __all__ = [
     "shrink",
     "vacuous",
 ]
+
+
+_LARGEST = 1e10
+"""Parameter up to which double precision leaves entropies and divergences to the third decimal."""
 
 
 def log_normaliser(alpha: Tensor) -> Tensor:
@@ -64,6 +68,7 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
     >>> log_prob(torch.tensor([1.0, 1.0, 1.0]), torch.tensor([0.2, 0.3, 0.5]).log())
     tensor(0.6931)
     """
+    check_tensor(alpha, "alpha")
     check_shape(log_scores, "log_scores", alpha.shape[-1])
     constant = _log_normaliser(alpha, "alpha")
     # A score of 0 counts for nothing where its parameter is 1: 0 · ln 0 is 0 there.
@@ -149,7 +154,7 @@ def entropy(alpha: Tensor) -> Tensor:
     >>> entropy(torch.tensor([1.0, 1.0]))
     tensor(0.)
     """
-    constant, exact = _log_normaliser(alpha, "alpha"), alpha.double()
+    constant, exact = _log_normaliser(alpha, "alpha", _LARGEST), alpha.double()
     surprise = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
     return (constant - ((exact - 1) * surprise).sum(-1)).to(alpha.dtype)
 
@@ -176,8 +181,9 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
     >>> kl_divergence(torch.tensor([2.0, 1.0]), torch.tensor([1.0, 1.0]))
     tensor(0.1931)
     """
+    check_tensor(alpha, "alpha")
     check_shape(other, "other", alpha.shape[-1])
-    constants = _log_normaliser(other, "other") - _log_normaliser(alpha, "alpha")
+    constants = _log_normaliser(other, "other", _LARGEST) - _log_normaliser(alpha, "alpha", _LARGEST)
     exact, dtype = alpha.double(), torch.promote_types(alpha.dtype, other.dtype)
     expected = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
     return (constants + ((exact - other.double()) * expected).sum(-1)).to(dtype)
@@ -242,16 +248,20 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     return raised / raised.sum(-1, keepdim=True)
 
 
-def _log_normaliser(alpha: Tensor, argument: str) -> Tensor:
+def _log_normaliser(alpha: Tensor, argument: str, largest: float = math.inf) -> Tensor:
     """`log_normaliser` in float64: ln Γ of large parameters is far larger than the differences that are wanted."""
-    _check_parameters(alpha, argument)
+    _check_parameters(alpha, argument, largest)
     exact = alpha.double()
     return exact.lgamma().sum(-1) - exact.sum(-1).lgamma()
 
 
-def _check_parameters(alpha: Tensor, argument: str) -> None:
+def _check_parameters(alpha: Tensor, argument: str, largest: float = math.inf) -> None:
     check_shape(alpha, argument, None)
+    check(alpha.shape[-1] > 0, argument, "at least one parameter", "none")
+    floating = alpha.is_floating_point()
+    check(floating, argument, "floating-point parameters", f"{alpha.dtype}; give {argument}.float()")
     if alpha.numel() and values_known(alpha):
         # The minimum and the maximum of a tensor with a NaN are NaN.
         least, most = torch.stack(alpha.detach().aminmax()).tolist()
         check(least > 0 and most < math.inf, argument, "positive, finite parameters", f"{least:g} to {most:g}")
+        check(most <= largest, argument, f"parameters up to {largest:g}", f"{most:g}; beyond, rounding is all there is")

@@ -134,3 +134,15 @@ def test_survivors_are_those_of_removing_one_box_after_the_other(count):
         assert _survivors(count, better, worse).tolist() == stays
         lengths.add(len(stays))
     assert (len(lengths) > 1) == (count > 1)
+
+
+def test_labels_that_are_no_numbers_of_classes_and_boxes_that_overflow_are_refused():
+    boxes, scores = [[0, 0, 9, 9], [1, 1, 9, 9]], [0.9, 0.8]
+    assert len(merge_boxes(boxes, scores, np.array([1, 1], np.uint8))) == 1
+    for given, labels, said in (
+        (boxes, [1.7, 1.2], "labels: expected whole numbers of classes"),
+        (boxes, ["cup", "cup"], "labels: expected numbers"),
+        ([[0, 0, 1e30, 1e30], [0, 0, 1e30, 1e30]], [1, 1], r"boxes: expected edges up to 1e\+09 pixels, got 1e\+30"),
+    ):
+        with pytest.raises(InputError, match=said):
+            merge_boxes(given, scores, labels)

@@ -13,7 +13,20 @@ from semfov.metrics.averages import standard_error
 from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
 from semfov.metrics.exploration import count_right
 from semfov.metrics.presence import area_under_roc
-from semfov.metrics.scanpath import edit_distance, mean_performance, sequence_score, tfp_auc
+from semfov.metrics.scanpath import (
+    auc,
+    cell_labels,
+    cluster_labels,
+    edit_distance,
+    information_gain,
+    length_distance,
+    log_density,
+    mean_performance,
+    merge_close,
+    nss,
+    sequence_score,
+    tfp_auc,
+)
 from semfov.metrics.search import cumulative_performance
 
 SCORE = [0.9, 0.8, 0.35, 0.2, 0.1]
@@ -75,7 +88,7 @@ def test_labels_of_any_type(kind):
         (lambda: area_under_roc(SCORE, [-1, 1, 1, 1, -1]), "present: expected true and false"),
         (lambda: area_under_roc(SCORE, [0.0, 1.0, float("nan"), 1, 0]), "present: expected true and false"),
         (lambda: area_under_roc(SCORE, ["yes"] * 5), "present: expected numbers, got list"),
-        (lambda: area_under_roc(SCORE, [0, 1]), "present: expected a tensor of shape"),
+        (lambda: area_under_roc(SCORE, [0, 1]), "present: expected one outcome for each score"),
         (lambda: area_under_roc([0.1, float("nan")], [0, 1]), "score: expected numbers, got NaN in 1 of 2"),
         (lambda: hits_at([0.1, float("nan")], [0, 1], 0.5), "score: expected numbers, got NaN"),
         (lambda: roc([0.1, float("nan")], [0, 1]), "score: expected numbers, got NaN"),
@@ -118,3 +131,27 @@ def test_measures_of_searches_take_lists_and_tensors():
     for found in ([1, 3, -1, 1], torch.tensor([1, 3, -1, 1]), np.array([1, 3, -1, 1], np.int16)):
         np.testing.assert_array_equal(cumulative_performance(found, 3), [0, 0.5, 0.5, 0.75])
         np.testing.assert_allclose(standard_error(found), np.std([1, 3, -1, 1], ddof=1) / 2)
+
+
+def test_numbers_of_other_kinds_are_refused_by_name():
+    """Complex ones, words, rows of several lengths, and outcomes in another shape; sparse and traced ones are read."""
+    square, present = torch.tensor([[0.7, 0.3], [0.2, 0.8]]), torch.tensor(PRESENT)
+    assert area_under_roc(SCORE, present.to_sparse()) == area_under_roc(SCORE, PRESENT)
+    traced = torch.rand(4, 5).requires_grad_()
+    np.testing.assert_array_equal(nss(traced, [1], [2]), nss(traced.detach().numpy(), [1], [2]))
+    for call, said in (
+        (lambda: area_under_roc(SCORE, present[None]), r"present: expected one outcome for each score \(5,\)"),
+        (lambda: area_under_roc(torch.tensor(SCORE) + 1j, present), "score: expected real numbers, got complex"),
+        (lambda: calibration(square, torch.eye(2)), "labels: expected 2 numbers, one for each row"),
+        (lambda: edit_distance(3, 4), "ours: expected labels in a row, got a int"),
+        (lambda: nss(np.ones((2, 2)) + 1j, [0], [0]), "maps: expected real numbers.*complex128"),
+        (lambda: auc(np.ones((2, 2)), ["left"], [0]), "x, y: expected real numbers"),
+        (lambda: information_gain([[1, 2], [3]], [[1, 2]], [0], [0]), "density: expected real numbers in rows of one"),
+        (lambda: log_density([0.5, 0.5]), r"maps: expected an array of shape \(\.\.\., H, W\)"),
+        (lambda: cell_labels([[1, 2, 3]], 2, 2, (9, 9)), r"points: expected fixations of shape \(n, 2\)"),
+        (lambda: merge_close([[1, np.nan]], (9, 9)), "points: expected finite numbers"),
+        (lambda: cluster_labels([], []), "others: expected at least one fixation"),
+        (lambda: length_distance([1, np.nan], [1]), "ours: expected finite numbers"),
+    ):
+        with pytest.raises(InputError, match=f"^{said}"):
+            call()

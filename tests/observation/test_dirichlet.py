@@ -175,3 +175,18 @@ def test_bad_arguments_and_weights_of_cells_are_named():
     for weight in [math.nan, 2.0, -0.5, math.inf]:
         with pytest.raises(InputError, match="footprint: expected weights from 0 to 1"):
             fuse(torch.ones(1, 2, 2), torch.ones(1, 1, 2), torch.tensor([[[1.0, weight]]]))
+
+
+def test_parameters_that_are_no_floats_or_too_large_are_refused():
+    """Entropies of integers would be integers, and of huge parameters the rounding of far larger terms."""
+    exact = float(scipy.stats.dirichlet(np.array([1e9, 2e9, 3e9])).entropy())
+    np.testing.assert_allclose(float(dirichlet.entropy(torch.tensor([1e9, 2e9, 3e9]))), exact, atol=1e-3)
+    for alpha, said in (
+        (torch.tensor([1, 2, 3]), r"alpha: expected floating-point parameters.*; give alpha\.float\(\)"),
+        ([1.0, 2.0], r"alpha: expected a tensor, got a list; give torch\.as_tensor\(alpha\)"),
+        (torch.tensor([]), "alpha: expected at least one parameter"),
+        (torch.tensor([1e12, 2.0]), "alpha: expected parameters up to 1e[+]10"),
+    ):
+        for call in (dirichlet.entropy, lambda given: dirichlet.kl_divergence(given, torch.ones(2))):
+            with pytest.raises(InputError, match=said if call is dirichlet.entropy else "alpha|other"):
+                call(alpha)

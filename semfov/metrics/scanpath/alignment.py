@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check, check_number, check_whole
+from semfov.metrics.labels import as_array, as_path
 from semfov.metrics.scanpath.multimatch import aligned
 from semfov.metrics.scanpath.sequence import cell_labels
 
@@ -64,7 +65,7 @@ def scanmatch(
     for number, path in enumerate((_path(ours, "ours"), _path(theirs, "theirs"))):
         word = cell_labels(path, *cells, size)
         if durations is not None:
-            lasting = np.asarray(durations[number], dtype=np.float64)
+            lasting = as_array(durations[number], "durations")
             check(lasting.shape == word.shape, "durations", f"{len(word)} numbers", lasting.shape)
             fits = bool((lasting >= 0).all()) and lasting.sum() <= _MOST_LETTERS * bin_ms
             check(fits, "durations", f"numbers from 0, of at most {_MOST_LETTERS:,} letters in all", lasting.tolist())
@@ -136,7 +137,6 @@ def time_delay_embedding(ours: ArrayLike, theirs: ArrayLike, *, length: int = 3)
 
 
 def _path(points: ArrayLike, name: str) -> _Array:
-    path = np.asarray(points, dtype=np.float64)
-    check(path.ndim == 2 and path.shape[1:] == (2,) and len(path) > 0, name, "fixations of shape (n, 2)", path.shape)
-    check(bool(np.isfinite(path).all()), name, "finite numbers", "others; leave these fixations out")
+    path = as_path(points, name)
+    check(len(path) > 0, name, "at least one fixation", "none")
     return path

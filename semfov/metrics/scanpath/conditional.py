@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check, check_number
+from semfov.metrics.labels import as_array
 
 _Array = NDArray[np.float64]
 
@@ -104,7 +105,8 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     array([[-1.386, -0.288]])
     """
     check_number(floor, "floor", 0, 1)
-    values = np.asarray(maps, dtype=np.float64)
+    values = as_array(maps, "maps")
+    check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
     total = values.sum((-1, -2), keepdims=True)
     usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
@@ -156,7 +158,8 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     >>> information_gain(log_density([[1.0, 3.0]]), log_density([[1.0, 1.0]]), [1], [0]).round(3)
     array([0.585])
     """
-    ours, theirs = (np.shape(each)[-2:] for each in (density, baseline))
+    density, baseline = as_array(density, "density"), as_array(baseline, "baseline")
+    ours, theirs = density.shape[-2:], baseline.shape[-2:]
     check(ours == theirs, "baseline", f"densities over {ours} pixels, as `density`", theirs)
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
@@ -169,9 +172,9 @@ def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Arr
 
     Shapes: maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`.
     """
-    values = np.asarray(maps, dtype=np.float64)
+    values = as_array(maps, "maps")
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
-    column, row = (np.floor(np.asarray(each, dtype=np.float64) + 0.5) for each in (x, y))
+    column, row = (np.floor(as_array(each, "x, y") + 0.5) for each in (x, y))
     leading = values.shape[:-2]
     fits = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
     check(fits, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
+from semfov.metrics.labels import as_array
 from semfov.metrics.scanpath.conditional import looked_up, share_below
 
 _Array = NDArray[np.float64]
@@ -35,7 +36,8 @@ def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
     values, at = looked_up(saliency, x, y)
     check(values.ndim == 2 and at.size > 0, "saliency", "one map and at least one fixation", (values.shape, at.shape))
     free = np.ones(values.shape, dtype=bool)
-    free[np.floor(np.asarray(y) + 0.5).astype(int), np.floor(np.asarray(x) + 0.5).astype(int)] = False
+    column, row = (np.floor(as_array(each, "x, y") + 0.5).astype(int) for each in (x, y))
+    free[row, column] = False
     others = np.sort(values[free])
     check(len(others) > 0, "saliency", "at least one pixel that nobody fixated", "none")
     thresholds = np.sort(at)[::-1]
@@ -165,7 +167,7 @@ def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
 
 def _pair(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
     """Two maps of one shape, flat."""
-    one, other = (np.asarray(each, dtype=np.float64) for each in (first, second))
+    one, other = (as_array(each, "maps") for each in (first, second))
     check(one.shape == other.shape and one.ndim >= 2 and one.size > 0, "maps", "two of one shape (..., H, W)",
           (one.shape, other.shape))  # fmt: skip
     return one.reshape(*one.shape[:-2], -1), other.reshape(*other.shape[:-2], -1)

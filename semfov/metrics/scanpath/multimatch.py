@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
+from semfov.metrics.labels import as_array, as_path
 
 _Array = NDArray[np.float64]
 
@@ -77,10 +78,7 @@ def multimatch(
     >>> multimatch(path, path, (300, 400)).mean
     1.0
     """
-    a, b = (np.asarray(path, dtype=np.float64) for path in (ours, theirs))
-    for name, path in (("ours", a), ("theirs", b)):
-        check(path.ndim == 2 and path.shape[1] == 2, name, "fixations of shape (n, 2)", path.shape)
-        check(bool(np.isfinite(path).all()), name, "finite numbers", "others; leave these fixations out")
+    a, b = as_path(ours, "ours"), as_path(theirs, "theirs")
     check(all(np.isfinite(side) and side > 0 for side in size), "size", "(width, height), positive numbers", size)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
@@ -92,7 +90,7 @@ def multimatch(
     lengths = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
     duration = float("nan")
     if durations is not None:
-        s, t = (np.asarray(each, dtype=np.float64) for each in durations)
+        s, t = (as_array(each, "durations") for each in durations)
         expected = f"{len(a)} and {len(b)} numbers, one for each fixation"
         check(len(s) == len(a) and len(t) == len(b), "durations", expected, (len(s), len(t)))
         lasting = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())

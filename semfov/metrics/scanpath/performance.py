@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import check
-from semfov.metrics.labels import as_labels, as_numbers
+from semfov.metrics.labels import as_array, as_labels, as_numbers, as_path
 from semfov.metrics.search import cumulative_performance
 
 _Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ def performance_area(curve: ArrayLike) -> float:
     >>> performance_area([0.0, 0.5, 1.0])
     0.5
     """
-    values = np.asarray(curve, dtype=np.float64)
+    values = as_array(curve, "curve", finite=True)
     check(values.ndim == 1 and len(values) >= 2, "curve", "an array of shape (N,) with N of 2 or more", values.shape)
     return float(np.trapezoid(values, np.linspace(0, 1, len(values))))
 
@@ -132,7 +132,7 @@ def probability_mismatch(curve: ArrayLike, reference: ArrayLike) -> float:
     >>> probability_mismatch([0.0, 0.5, 0.5], [0.0, 0.25, 1.0])
     0.75
     """
-    ours, theirs = np.asarray(curve, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    ours, theirs = as_array(curve, "curve", finite=True), as_array(reference, "reference", finite=True)
     check(ours.shape == theirs.shape, "reference", f"a curve of shape {ours.shape}, as `curve`", theirs.shape)
     return float(np.abs(ours - theirs).sum())
 
@@ -167,15 +167,13 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
 
 
 def _points(points: ArrayLike) -> _Array:
-    array = np.asarray(points, dtype=np.float64)
-    usable = array.ndim == 2 and array.shape[1] == 2 and len(array) > 0
-    check(usable, "points", "an array of shape (n, 2), not empty", array.shape)
-    check(bool(np.isfinite(array).all()), "points", "finite numbers", "others; leave these fixations out")
-    return array
+    path = as_path(points, "points")
+    check(len(path) > 0, "points", "at least one fixation", "none")
+    return path
 
 
 def _corners(box: ArrayLike) -> _Array:
-    corners = np.asarray(box, dtype=np.float64)
+    corners = as_array(box, "box")
     check(corners.shape == (4,), "box", "(x1, y1, x2, y2)", f"shape {corners.shape}")
     check(bool((corners[:2] <= corners[2:]).all()), "box", "x1 <= x2 and y1 <= y2", corners.tolist())
     return corners

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semfov.errors import check
+from semfov.metrics.labels import as_array, as_path
 
 _Array = NDArray[np.float64]
 
@@ -29,12 +29,8 @@ def saccades(paths: Sequence[ArrayLike]) -> tuple[_Array, _Array]:
     >>> lengths, directions.round(2)
     (array([5., 4.]), array([ 0.93, -1.57]))
     """
-    steps = [np.zeros((0, 2))]
-    for path in paths:
-        points = np.asarray(path, dtype=np.float64)
-        check(points.ndim == 2 and points.shape[1] == 2, "paths", "fixations of shape (n, 2)", points.shape)
-        steps.append(np.diff(points, axis=0))
-    x, y = np.concatenate(steps).T
+    steps = [np.diff(as_path(path, "paths"), axis=0) for path in paths]
+    x, y = np.concatenate([np.zeros((0, 2)), *steps]).T
     moved = np.hypot(x, y) > 0
     return np.hypot(x, y)[moved], np.arctan2(y, x)[moved]
 
@@ -54,7 +50,7 @@ def length_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> length_distance([1.0, 2.0], [2.0, 3.0])
     1.0
     """
-    a, b = (np.sort(np.asarray(each, dtype=np.float64)) for each in (ours, theirs))
+    a, b = (np.sort(as_array(each, name, finite=True)) for each, name in ((ours, "ours"), (theirs, "theirs")))
     if not (len(a) and len(b)):
         return float("nan")
     every = np.sort(np.concatenate([a, b]))
@@ -77,7 +73,8 @@ def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> direction_distance([3.0], [-3.0]).__round__(3)
     0.283
     """
-    a, b = (np.sort((np.asarray(each, dtype=np.float64) + np.pi) % (2 * np.pi)) for each in (ours, theirs))
+    samples = (as_array(each, name, finite=True) for each, name in ((ours, "ours"), (theirs, "theirs")))
+    a, b = (np.sort((each + np.pi) % (2 * np.pi)) for each in samples)
     if not (len(a) and len(b)):
         return float("nan")
     every = np.concatenate([[0.0], np.sort(np.concatenate([a, b])), [2 * np.pi]])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import InputError, check
-from semfov.metrics.labels import as_labels
+from semfov.metrics.labels import as_array, as_labels, as_path
 
 _Labels = NDArray[np.int64]
 
@@ -33,7 +33,7 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
-    inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size)
+    inside = (as_path(points, "points") + 0.5) / as_array(size, "size")
     outside = int((~((inside >= 0) & (inside <= 1))).any(-1).sum())
     check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
     column, row = np.minimum(inside * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
@@ -73,11 +73,13 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
         from sklearn.cluster import MeanShift
     except ImportError:
         raise InputError("cluster_labels needs scikit-learn: pip install semfov[human]") from None
+    points = as_path(others, "others")
+    check(len(points) > 0, "others", "at least one fixation", "none")
     shift = MeanShift(bandwidth=bandwidth, bin_seeding=True)
     with warnings.catch_warnings():
         # The warning says that no two fixations share a bin. All of them are seeds then, which does no harm.
         warnings.filterwarnings("ignore", message="Binning data failed")
-        return shift.fit(np.asarray(others, dtype=np.float64))
+        return shift.fit(points)
 
 
 def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
@@ -87,7 +89,7 @@ def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
     >>> bool(labels[0] == labels[1] != labels[2])
     True
     """
-    return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
+    return np.asarray(clusters.predict(as_path(points, "points")), dtype=np.int64)
 
 
 def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> float:
@@ -171,9 +173,8 @@ def merge_close(points: ArrayLike, size: tuple[float, float]) -> NDArray[np.floa
     array([[1., 0.],
            [9., 9.]])
     """
-    path = list(np.asarray(points, dtype=np.float64))
-    check(all(np.isfinite(point).all() for point in path), "points", "finite numbers", "others")
-    half = np.asarray(size) / 2
+    path = list(as_path(points, "points"))
+    half = as_array(size, "size") / 2
     index = 0
     while index < len(path) - 1:
         if (np.abs(path[index] - path[index + 1]) < half).all():
