@@ -12,25 +12,13 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from semfov.words import OTHER_WORDS
+
 _ROUNDING = 1e-3
 
 _Name = TypeVar("_Name", bound=str)
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
-
-_SCORES = ("conf", "confidence", "min_score", "score", "score_threshold", "threshold")
-_OTHER_WORDS = {
-    "grid": ("cells", "columns", "rows"),
-    "picture": ("file", "image", "img", "path", "photo", "source"),
-    "target": ("class_name", "classes", "cls", "label", "labels", "name", "query", "targets", "what"),
-    "passes": ("budget", "glimpses", "iterations", "looks", "max_passes", "max_steps", "n", "steps"),
-    "shifts": ("fixations", "max_fixations", "n_fixations", "num_fixations", "saccades"),
-    "seconds": ("max_seconds", "time", "time_limit", "timeout"),
-    "on_look": ("callback", "on_step"),
-    "least": _SCORES,
-    "confirm": _SCORES,
-}
-"""What others, and other libraries, call an option."""
 
 
 def printable(text: str) -> str:
@@ -280,7 +268,7 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
-            near = [each for each in names if name in _OTHER_WORDS.get(each, ())] or get_close_matches(name, names)
+            near = [each for each in OTHER_WORDS.get(name, ()) if each in names] or get_close_matches(name, names)
             hint = f"did you mean {' or '.join(f'{each}=' for each in near)}?" if near else f"known: {', '.join(names)}"
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 

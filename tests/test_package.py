@@ -28,8 +28,8 @@ SURFACE = {
 
 # A subpackage imports only from itself and from the subpackages before it.
 SUBPACKAGES = [
-    "version", "errors", "threads", "io", "data", "sensor", "detection", "observation", "belief", "gaze", "eye",
-    "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
+    "version", "words", "errors", "threads", "io", "data", "sensor", "detection", "observation", "belief", "gaze",
+    "eye", "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
     "agent", "metrics", "viz", "report", "runs", "envs", "fit", "cli", "__main__",
 ]  # fmt: skip
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are

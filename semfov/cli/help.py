@@ -237,28 +237,6 @@ shipped models runs with --agent raw, or after semfov fit.
 }
 """The help of each subcommand: one screen."""
 
-SYNONYMS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("conf", "confidence", "conf_thres", "threshold", "score"), ("least", "confirm")),
-    **dict.fromkeys(("class", "label", "query"), ("target",)),
-    **dict.fromkeys(("model", "yolo"), ("detector",)),
-    "models": ("model",),
-    **dict.fromkeys(("gpu", "cuda"), ("device",)),
-    **dict.fromkeys(("fp16", "float16"), ("half",)),
-    **dict.fromkeys(("output", "save", "csv", "json", "project"), ("out",)),
-    **dict.fromkeys(("html", "page"), ("report",)),
-    **dict.fromkeys(("save_crop", "save_crops", "crop"), ("crops",)),
-    **dict.fromkeys(("save_txt", "txt", "label_dir", "yolo_labels"), ("labels",)),
-    **dict.fromkeys(("max_passes", "steps"), ("passes",)),
-    **dict.fromkeys(("max_shifts", "fixations", "saccades"), ("shifts",)),
-    **dict.fromkeys(("time", "timeout", "max_seconds"), ("seconds",)),
-    **dict.fromkeys(("jobs", "processes", "num_workers", "threads"), ("workers",)),
-    "verbose": ("looks", "quiet"),
-    "silent": ("quiet",),
-    **dict.fromkeys(("batch_size",), ("batch",)),
-    **dict.fromkeys(("names",), ("classes",)),
-}
-"""Words that other programs have for an option, and what it may be here."""
-
 _SHELLS = {
     "bash": """\
 _semfov() {{

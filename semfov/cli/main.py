@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 from semfov.cli import help as texts
 from semfov.version import __version__
+from semfov.words import OTHER_WORDS
 
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
 
@@ -169,7 +170,7 @@ def _of_others(own: str, rest: Sequence[str]) -> str | None:
     names = {each: set(_option_names(each)) for each in (*_LOOKING, own)}
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
-        meant = next((each for each in texts.SYNONYMS.get(option, ()) if each in names[own]), None)
+        meant = next((each for each in OTHER_WORDS.get(option, ()) if each in names[own]), None)
         if meant is not None and option not in names[own]:
             return f"unknown option --{option.replace('_', '-')}; did you mean --{meant.replace('_', '-')}?"
         having = [each for each in _LOOKING if option in names[each] - names[own]]

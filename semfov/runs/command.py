@@ -27,7 +27,7 @@ from typing import (
     get_type_hints,
 )
 
-from semfov.errors import SemfovError
+from semfov.errors import InputError, SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.runs.settings import Settings, check_settings
 
@@ -208,7 +208,7 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
     """Bring arguments into the form that the parser understands.
 
     Names of options may have dashes instead of underscores. A flag needs no value. A list of words needs no brackets,
-    and `none` is the empty list.
+    and `none` is the empty list. An option is given once.
 
     >>> from semfov.runs.settings import Settings
     >>> from dataclasses import dataclass
@@ -232,6 +232,8 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
         if not word.startswith("--") or option not in option_names:
             usual.append(word)
             continue
+        if any(each.partition("=")[0] == option for each in usual):
+            raise InputError(f"{option[2:]}: expected once, got it again; several values are given as a,b")
         hint, has_value = hints.get(option[2:]), bool(equals)
         if hint is bool and not has_value:
             value = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
@@ -252,9 +254,9 @@ def _in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str
         option = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
         if option is None:
             return f"unexpected argument {unknown[1]!r}; put a name with spaces in quotes"
-        plain = {each.replace("_", "-"): each for each in options}
-        near = get_close_matches(option.replace("_", "-"), plain, n=1, cutoff=0.6)
-        remedy = f"did you mean {near[0]}?" if near else "--help-all lists all options"
+        plain = [each[2:].replace("_", "-") for each in options]
+        near = get_close_matches(option.lstrip("-").replace("_", "-"), plain, n=1, cutoff=0.6)
+        remedy = f"did you mean --{near[0]}?" if near else "--help-all lists all options"
         return f"unknown option {option}; {remedy}"
     missing = re.match(r"argument (--\S+): expected one argument", message)
     if missing:

@@ -15,6 +15,7 @@ from semfov.runs.command import make_parser
 
 REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
+    "search --target cup --target dog": "target: expected once, got it again; several values are given as a,b",
     "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
     "search --target qqq": "airplane and 75 more; `semfov detectors NAME` lists them",
     "search --target cup,fork": "; a search is for one class, and `semfov find` takes several",
@@ -58,6 +59,7 @@ REFUSED = {
 }
 
 WRONG_USE = {
+    "find . --imgsz 640": "unknown option --imgsz; --help-all lists all options",
     "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
     "--target cup": "expected a command before --target: search, find",
     "FOLDER --target cup": "try `semfov search FOLDER --target CLASS`",

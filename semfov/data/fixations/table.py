@@ -160,6 +160,8 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     remedy = _REMEDIES.get(path.suffix.lower())
     if remedy is not None and path.exists():
         raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
+    if not path.exists():
+        raise DataError(f"{path}: no such file; check the path")
     check_regular(path)
     try:
         text = read_text(path)

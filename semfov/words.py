@@ -1,0 +1,26 @@
+"""What others, and other programs, call an option; read by the command before it loads anything."""
+
+OTHER_WORDS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("conf", "conf_thres", "confidence", "min_score", "score", "threshold"), ("least", "confirm")),
+    **dict.fromkeys(("class", "class_name", "cls", "label", "labels", "name", "query", "targets"), ("target",)),
+    **dict.fromkeys(("file", "image", "img", "path", "photo", "source"), ("picture",)),
+    **dict.fromkeys(("cells", "columns", "rows"), ("grid",)),
+    **dict.fromkeys(("model", "yolo"), ("detector",)),
+    "models": ("model",),
+    **dict.fromkeys(("gpu", "cuda"), ("device",)),
+    **dict.fromkeys(("fp16", "float16"), ("half",)),
+    **dict.fromkeys(("csv", "format", "json", "output", "project", "save"), ("out",)),
+    **dict.fromkeys(("html", "page"), ("report",)),
+    **dict.fromkeys(("crop", "save_crop", "save_crops"), ("crops",)),
+    **dict.fromkeys(("label_dir", "save_txt", "txt", "yolo_labels"), ("labels",)),
+    **dict.fromkeys(("budget", "iterations", "looks", "max_passes", "max_steps", "n", "steps"), ("passes",)),
+    **dict.fromkeys(("fixations", "max_fixations", "max_shifts", "n_fixations", "saccades"), ("shifts", "passes")),
+    **dict.fromkeys(("max_seconds", "time", "time_limit", "timeout"), ("seconds",)),
+    **dict.fromkeys(("jobs", "num_workers", "processes", "threads"), ("workers",)),
+    **dict.fromkeys(("callback", "on_step"), ("on_look",)),
+    "verbose": ("looks", "quiet"),
+    "silent": ("quiet",),
+    "batch_size": ("batch",),
+    "classes": ("target",),
+    "names": ("classes",),
+}
