@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
-from typing import Any, Self, get_args
+from typing import Any, NoReturn, Self, get_args
 
 from torch import Tensor, nn
 
@@ -212,9 +212,12 @@ class ActivePerception(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         """The parts of the module; other libraries' words for what an agent does are refused with its own."""
-        if name in ("detect", "find", "locate", "predict"):
+        if name in ("detect", "find", "locate", "predict", "track"):
             raise AttributeError(f"an agent has search, find_all and explore, not {name!r}")
         return super().__getattr__(name)
+
+    def forward(self, *_: Any, **__: Any) -> NoReturn:
+        raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
 
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""
@@ -303,12 +306,10 @@ class ActivePerception(nn.Module):
         Without closer looks the search ends with `found` when the picture holds the target with enough probability, and
         a fixated cell is nearly as probable as the most probable one (`semfov.decision.decide`).
 
-        The belief by Kaplan's rule has no calibrated thresholds, so it never gives up. Such a search finds the target
-        when a detection that overlaps the fixated cell has the target as its best class, with a score of at least
-        `confirm`.
+        By Kaplan's rule, which has no calibrated thresholds, a search never gives up. It finds the target when a
+        detection that overlaps the fixated cell has it as its best class, with a score of at least `confirm`.
 
-        With `boxes` the search makes no decision: it ends when the gaze is on a cell that a box overlaps, which is the
-        protocol of the paper.
+        With `boxes`, as in the paper, the search makes no decision. It ends with the gaze on a cell that a box meets.
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
@@ -318,8 +319,7 @@ class ActivePerception(nn.Module):
                 with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
                 the most probable of them.
             how: the kind of look, `fovea`, `windows` or `head`; `auto` chooses it by the picture.
-            passes: largest number of passes of the detector, closer looks included; None takes 24 for windows and 40
-                for a head.
+            passes: largest number of passes of the detector, closer looks included; None takes 24, and 40 for a head.
             shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 30, or with `passes` no limit.
             seconds: longest time in seconds on this machine.
             duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.

@@ -274,12 +274,18 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
 
 
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """A method that refuses keywords that it does not have with the nearest ones, where Python names none."""
-    known = [*signature(function).parameters][1:]
+    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither."""
+    form = signature(function)
+    _, *known = form.parameters
+    words = [each.name if each.default is each.empty else f"{each.name}=" for each in form.parameters.values()][1:]
 
     @wraps(function)
     def call(*given: _Given.args, **options: _Given.kwargs) -> _Result:
         check_options(options, known, function.__name__)
+        try:
+            form.bind(*given, **options)
+        except TypeError as error:
+            raise InputError(f"{function.__name__}: {error}; expected {', '.join(words)}") from None
         return function(*given, **options)
 
     return call

@@ -1,4 +1,6 @@
-"""What others, and other programs, call an option; read by the command before it loads anything."""
+"""What others, and other programs, call an option or an attribute; the command reads it before it loads anything."""
+
+from collections.abc import Mapping
 
 OTHER_WORDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("conf", "conf_thres", "confidence", "min_score", "score", "threshold"), ("least", "confirm")),
@@ -24,3 +26,32 @@ OTHER_WORDS: dict[str, tuple[str, ...]] = {
     "classes": ("target",),
     "names": ("classes",),
 }
+
+RECORD_WORDS = {
+    **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
+    **dict.fromkeys(("box", "confidence", "probability", "score"), "its decision, such as record.decision.box"),
+    **dict.fromkeys(("count", "counts", "number"), "len(record.objects), or record.expected with what was not seen"),
+    **dict.fromkeys(("dataframe", "df", "to_dataframe", "to_df", "to_pandas"), "record.to_frame()"),
+    **dict.fromkeys(("draw", "show", "visualize"), "record.plot()"),
+    **dict.fromkeys(("names",), "record.classes"),
+    **dict.fromkeys(("detections", "results"), "record.objects, or the detections of a look, record[0].detections"),
+    **dict.fromkeys(("to_html", "save_html"), "record.report(path)"),
+}
+GAZE_WORDS = {
+    **dict.fromkeys(("draw", "show", "visualize"), "gaze.plot()"),
+    **dict.fromkeys(("save", "to_png"), "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)"),
+    **dict.fromkeys(("heatmap", "map", "saliency"), "gaze.density"),
+    **dict.fromkeys(("fixations", "sample", "scanpath"), "gaze.scanpaths(people)"),
+}
+_AGENT = "agent = semfov.ActivePerception.recommended(), which has search, find_all, explore, gaze and live"
+PACKAGE_WORDS = {
+    **dict.fromkeys(("Agent", "detect", "explore", "find", "find_all", "load", "predict", "search"), _AGENT),
+    **dict.fromkeys(("plot", "show"), "record.plot(), or semfov.viz"),
+    **dict.fromkeys(("imread", "open"), "semfov.read_image"),
+}
+
+
+def missing(owner: str, name: str, words: Mapping[str, str]) -> AttributeError:
+    """The error of an attribute that is not there, with ours where others have another word for it."""
+    ours = words.get(name)
+    return AttributeError(f"{owner} has no attribute {name!r}" + ("" if ours is None else f"; use {ours}"))

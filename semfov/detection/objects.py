@@ -155,13 +155,13 @@ def merge_boxes(
     ([[502.0, 91.0, 700.0, 202.0]], [1])
     """
     box, value = _numbers(boxes, "boxes"), _numbers(scores, "scores")
-    number = _numbers(labels, "labels").double()
-    label = number.long()
-    check(torch.equal(label.double(), number), "labels", "whole numbers of classes", number.tolist()[:3])
+    given = _numbers(labels, "labels")
+    label = given.long()
+    check(torch.equal(label.to(given), given), "labels", "whole numbers of classes", given.tolist()[:3])
     box = box.view(0, 4) if not box.numel() else box
     check_shape(box, "boxes", None, 4)
-    far = float(box.abs().max()) if box.numel() else 0.0
-    check(far <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{far:g}")
+    most = float(box.abs().max()) if box.numel() else 0.0
+    check(most <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{most:g}")
     check_shape(value, "scores", len(box))
     check_shape(label, "labels", len(box))
     check(bool((box[:, :2] <= box[:, 2:]).all()), "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")

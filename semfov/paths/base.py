@@ -585,7 +585,7 @@ class GazeRecord(Record):
         return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
 
     def compare(
-        self, people: Fixations | Sequence[Fixations] | str | PathLike[str]
+        self, people: Fixations | GazeRecord | Sequence[Fixations | GazeRecord] | str | PathLike[str]
     ) -> Mapping[str, tuple[float, float]]:
         """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
 

@@ -23,6 +23,7 @@ from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
+from semfov.words import RECORD_WORDS, missing
 
 if TYPE_CHECKING:
     import pandas
@@ -47,6 +48,11 @@ class Conversion(ABC):
 
     _columns: ClassVar[tuple[str, ...]] = COLUMNS
     """Columns of the table of objects."""
+
+    if not TYPE_CHECKING:  # to which any name would be one of a record
+
+        def __getattr__(self, name: str) -> Any:
+            raise missing(type(self).__name__, name, RECORD_WORDS)
 
     @property
     @abstractmethod

@@ -27,6 +27,7 @@ from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
 from semfov.paths.stimulus import reduced_copy
+from semfov.words import GAZE_WORDS, missing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,6 +64,11 @@ class GazePrediction:
     size: tuple[int, int]
     photograph: Tensor
     source: str | None = None
+
+    if not TYPE_CHECKING:  # to which any name would be one of a prediction
+
+        def __getattr__(self, name: str) -> Any:
+            raise missing(type(self).__name__, name, GAZE_WORDS)
 
     @classmethod
     def of(

@@ -1,6 +1,7 @@
 """The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, get_args
 
 import torch
@@ -142,7 +143,8 @@ class Foveation(Sensor):
     ) -> None:
         super().__init__()
         for name, value in (("sigma", sigma), ("growth", growth)):
-            check(torch.as_tensor(value).numel() == 1, name, "a number", f"shape {tuple(torch.as_tensor(value).shape)}")
+            got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else value
+            check(value.numel() == 1 if isinstance(value, Tensor) else isinstance(value, Real), name, "a number", got)
             check(bool(value > 0), name, "a positive number", value)
         check(levels >= 0, "levels", "0 or more", levels)
         lookup(convention, get_args(Convention), "pyramid convention")

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+import semfov
 from semfov import ActivePerception, MapEvidence, TargetEvidence, WindowEye, ZoomAgent, as_image, foveate, read_image
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
@@ -303,6 +304,41 @@ def test_invalid_arguments_of_a_search_are_refused_by_name(name, value, agent):
 def test_unknown_keywords_are_refused_with_the_near_ones(method, name, remedy, agent):
     with pytest.raises(SemfovError, match=f"^{name}: expected an option of {method}, got an unknown one; {remedy}"):
         getattr(agent, method)(PIXELS, "cup", **{name: 1})
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (
+            lambda agent: agent.search(PIXELS),
+            "search: missing a required argument: 'target'; expected picture, target, how=",
+        ),
+        (
+            lambda agent: agent.search(PIXELS, "cup", 3),
+            "search: too many positional arguments; expected picture, target, ",
+        ),
+        (lambda agent: agent.search(PIXELS, "cup", target="cup"), "search: multiple values for argument 'target'"),
+        (lambda agent: agent(PIXELS), "an agent is not called itself: it has search, find_all, explore"),
+        (lambda agent: agent.track, "an agent has search, find_all and explore, not 'track'"),
+        (lambda agent: agent.explore(PIXELS, shifts=1).boxes, "Scanpath has no attribute 'boxes'; use its objects"),
+        (lambda agent: agent.explore(PIXELS, shifts=1).nothing, "Scanpath has no attribute 'nothing'$"),
+        (lambda agent: semfov.search, "semfov has no attribute 'search'; use agent = semfov.ActivePerception"),
+        (lambda agent: semfov.nothing, "semfov has no attribute 'nothing'$"),
+        (lambda agent: agent.explore(PIXELS, shifts=1).compare([3]), "people: expected fixations, records of an agent"),
+        (lambda agent: semfov.Foveation("wide"), "sigma: expected a number, got wide"),
+        (lambda agent: semfov.Foveation(None), "sigma: expected a number, got None"),
+    ],
+)
+def test_what_others_call_it_and_other_forms_of_a_call_are_refused_with_ours(call, said, agent):
+    with pytest.raises((SemfovError, AttributeError), match=f"^{said}"):
+        call(agent)
+
+
+def test_records_of_agents_are_compared_as_people_are(agent):
+    path = agent.explore(PIXELS, how="fovea", shifts=3, seed=1)
+    assert path.compare(path)["sequence score"].scanpath == 1
+    same = path.compare([path.as_fixations("a.png"), path])
+    assert same["edit distance"] == (0, 0)
 
 
 @pytest.mark.parametrize(

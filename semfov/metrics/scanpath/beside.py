@@ -60,8 +60,8 @@ class ScanpathComparison(dict[str, BesidePeople]):
         return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
 
 
-_People = Fixations | Sequence[Fixations] | str | PathLike[str]
-"""Fixations of one person or several, or a file of them (`semfov.data.fixations.read_fixations`)."""
+_People = Fixations | GazeRecord | Sequence[Fixations | GazeRecord] | str | PathLike[str]
+"""Fixations of one person or several, records of agents, or a file (`semfov.data.fixations.read_fixations`)."""
 
 
 def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> ScanpathComparison:
@@ -104,22 +104,26 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
         table = read_fixations(people)
         people = [each for each in table if name is None or Path(each.picture).stem == name]
         check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
-    people = [people] if isinstance(people, Fixations) else [*people]
-    check(len(people) > 0, "people", "fixations of at least one person", "none")
-    pictures = sorted({each.picture for each in people})
+    people = [people] if isinstance(people, Fixations | GazeRecord) else [*people]
+    named = own or next((each.picture for each in people if isinstance(each, Fixations)), "")
+    viewed = [each.as_fixations(each.source or named) if isinstance(each, GazeRecord) else each for each in people]
+    others = [type(each).__name__ for each in viewed if not isinstance(each, Fixations)]
+    check(not others, "people", "fixations, records of an agent, or a file", f"a {others[0]}" if others else "")
+    check(len(viewed) > 0, "people", "fixations of at least one person", "none")
+    pictures = sorted({each.picture for each in viewed})
     check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
     same = name is None or Path(pictures[0]).stem == name
     check(same, "people", f"fixations in {name!r}, as those of the scanpath", f"in {pictures[0]!r}")
     ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
-    targets = sorted({each.target for each in (ours, *people) if each.target is not None})
+    targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
     check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
-    size = people[0].size
-    for each in (ours, *people):
+    size = viewed[0].size
+    for each in (ours, *viewed):
         stretch = (each.size[0] * size[1]) / (each.size[1] * size[0])
         got = f"{each.size[0]} × {each.size[1]} of {each.subject!r}"
         expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
         check(abs(stretch - 1) <= STRETCH, "people", expected, got)
-    records = [each.resized(size) for each in (ours, *people)]
+    records = [each.resized(size) for each in (ours, *viewed)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]
     comparison = ScanpathComparison()
