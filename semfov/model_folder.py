@@ -80,11 +80,11 @@ class ModelFolder:
         if weights is not None:
             options["weights"] = os.fspath(weights)
         elif place is not None:
-            options["weights"] = str(self._find(place))
+            options["weights"] = str(find_file(place, self.path))
         if detector is not None:
             return os.fspath(detector), options
         place = record.get("model_file")
-        return (record["model"] if place is None else str(self._find(place))), options
+        return (record["model"] if place is None else str(find_file(place, self.path))), options
 
     def load_detector(
         self,
@@ -178,12 +178,3 @@ class ModelFolder:
             "windows": self.windows(),
             "grid": grid,
         }
-
-    def _find(self, place: dict[str, str]) -> Path:
-        path = find_file(place, self.path)
-        if path is None:
-            raise DataError(
-                f"detector: expected {place['absolute']}, the file that {self.path} was fitted to, got none; give its "
-                "new place as detector= (on a command line --detector FILE), or put it back"
-            )
-        return path

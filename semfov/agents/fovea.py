@@ -125,11 +125,6 @@ class FoveaAgent:
         episode.open(image)
         return replace(episode.run(), target=None, targets=targets)
 
-    def deciding(self, closer: int) -> Verification | None:
-        """The model for closer looks, if they are wanted and it can decide."""
-        model = self.verification
-        return model if closer and model is not None and model.thresholds is not None else None
-
 
 def _first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
     """The first cell of an episode, and the generator that breaks its ties."""
@@ -206,7 +201,8 @@ class FoveaEpisode(Episode[Scanpath]):
         # The belief of one episode is on the CPU, wherever the eye is.
         self.strategy = on_cpu(chosen)
         self._beside = None if mapper is chosen.observer else on_cpu(mapper)
-        model = None if target is None else agent.deciding(closer)
+        model = None if target is None or not closer else agent.verification
+        model = None if model is None or model.thresholds is None else model
         self.verification, self.closer = None if model is None else on_cpu(model), closer
         own = self.strategy.observer.thresholds
         usually = own if self.verification is None else self.verification.thresholds
@@ -366,17 +362,18 @@ class FoveaEpisode(Episode[Scanpath]):
         if self.target is None or self.to_goal or self._last is None or self._looks is None:
             return None
         step, grid = self._last[0], self._looks.grid
+        seen = tuple(detections for _, detections in self._recent)
         if self.forgetting is not None:
             if self.thresholds is None:
                 return None
             outcome = int(decide(step, self.target, self.thresholds))
-            return conclude(outcome, step.belief, self._detections, grid, self.target)
+            return conclude(outcome, step.belief, seen, grid, self.target)
         if self.ends is None:
             return None
         # Without thresholds the target was found in the fixated cell.
         cell = None if self.thresholds is not None else int(step.cell)
         meant = class_meant(step.belief, self.target)
-        return conclude(self._outcome, step.belief, self._detections, grid, meant, cell)
+        return conclude(self._outcome, step.belief, seen, grid, meant, cell)
 
     @property
     def criterion(self) -> str | None:
@@ -437,11 +434,6 @@ class FoveaEpisode(Episode[Scanpath]):
             closer=None if closer is None else replace(closer, fixation=0),
             photograph=photograph,
         )
-
-    @property
-    def _detections(self) -> tuple[Detections, ...]:
-        """The detections of the looks that count."""
-        return tuple(detections for _, detections in self._recent)
 
     @property
     def _candidate(self) -> int | None:

@@ -51,16 +51,13 @@ def look_live(options: LiveOptions) -> int:
     return 0
 
 
-def _one_class(text: str | None, classes: Sequence[str] | None) -> str | None:
-    """The class that a text names, None for none; without names of classes it is not checked."""
-    if text is None or classes is None:
-        return text
-    return classes[class_index(text, classes, "target") - 1]
-
-
 def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:
-    """The class that is searched for, or the list of those whose objects are all to be found."""
-    return _one_class(options.target, classes) if options.find is None else several_classes(options.find, classes)
+    """The class that is searched for, or the list of those to be found; without names of classes it is not checked."""
+    if options.find is not None:
+        return several_classes(options.find, classes)
+    if options.target is None or classes is None:
+        return options.target
+    return classes[class_index(options.target, classes, "target") - 1]
 
 
 def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:

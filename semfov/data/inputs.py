@@ -135,9 +135,8 @@ def pixels_of(image: ImageLike, argument: str = "image", white: White | None = N
     if isinstance(image, np.ndarray):
         kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}
         name = f"{image.dtype.kind}{image.dtype.itemsize}"
-        check(
-            name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {image.dtype}{_integers(image)}"
-        )
+        way = "; convert it to bytes, array.astype('uint8'), or give white=" if image.dtype.kind == "i" else ""
+        check(name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {image.dtype}{way}")
         native = np.float64 if name == "f16" else np.dtype(name)
         return torch.from_numpy(np.array(image, dtype=native, order="C"))
     if isinstance(image, str | PathLike):
@@ -209,10 +208,6 @@ def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
     """
     base = values if like is None else like
     return values.to(base.device, torch.promote_types(base.dtype, torch.float32))
-
-
-def _integers(array: NDArray[Any]) -> str:
-    return "; convert it to bytes, array.astype('uint8'), or give white=" if array.dtype.kind == "i" else ""
 
 
 def _in_unit(pixels: Tensor, like: Tensor | None, argument: str) -> Tensor:

@@ -138,8 +138,13 @@ def open_large(
     kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
     expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
     check(bands is None or kind in BY_WINDOWS, "bands", expected, bands)
-    plain = isinstance(source, np.ndarray) and source.dtype == np.uint8 and white is None
-    if isinstance(source, np.ndarray) and plain and source.size and _by_rows(source.shape):
+    if (
+        isinstance(source, np.ndarray)
+        and source.dtype == np.uint8
+        and white is None
+        and source.size
+        and (source.ndim == 2 or (source.ndim == 3 and source.shape[2] == 3 and source.shape[0] != 3))
+    ):
         swap = lookup(color, get_args(Color), "order of channels") == "bgr" and source.ndim == 3
         return _ArrayPicture(source[..., ::-1] if swap else source)
     if not isinstance(source, str | PathLike):
@@ -221,8 +226,3 @@ def _upright_size(image: "Image") -> tuple[int, int]:
     tags = getattr(image, "tag_v2", {})
     width, height = tags.get(_WIDTH, image.size[0]), tags.get(_HEIGHT, image.size[1])
     return height, width
-
-
-def _by_rows(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
-    return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and shape[0] != 3)

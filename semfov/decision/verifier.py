@@ -99,7 +99,12 @@ class Verifier(Generic[LookType]):
             place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         look = self.places.record(box, place, presence)
         # A place that was free to be examined again has a new verdict now.
-        self.verdicts = [old for old in self.verdicts if self._recent(old) or not _same(old.look, look)]
+        self.verdicts = [
+            old
+            for old in self.verdicts
+            if self._recent(old)
+            or (old.look.cell != look.cell and float(box_iou(old.look.box[None], look.box[None])) < SAME)
+        ]
         self.verdicts.append(_Verdict(look))
         self._choose(last=self._last)
         return look
@@ -236,8 +241,3 @@ def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
         return box
     shift = (boxes[best] - box).view(2, 2).mean(0)
     return box + shift.repeat(2)
-
-
-def _same(one: CloseUp, other: CloseUp) -> bool:
-    """Whether two closer looks show the same place of a scene that changes."""
-    return one.cell == other.cell or float(box_iou(one.box[None], other.box[None])) >= SAME

@@ -67,27 +67,14 @@ class MaxPool(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Pool `(B, C, H, W)` to `(B, C, H', W')`."""
         before = self.padding // 2
-        right, bottom = (self._after(n, before) for n in (image.shape[-1], image.shape[-2]))
+        sides = image.shape[-1], image.shape[-2]
+        outputs = [(length + self.padding - self.size) // self.stride for length in sides]
+        reached = [count * self.stride + self.size - before for count in outputs]
+        right, bottom = (max(0, reach - length) for reach, length in zip(reached, sides, strict=True))
         if before == right == bottom and 2 * before <= self.size:
             return F.max_pool2d(image, self.size, self.stride, before)
         padded = F.pad(image, (before, right, before, bottom), value=float("-inf"))
         return F.max_pool2d(padded, self.size, self.stride)
-
-    def _after(self, length: int, before: int) -> int:
-        outputs = (length + self.padding - self.size) // self.stride + 1
-        return max(0, (outputs - 1) * self.stride + self.size - length - before)
-
-
-class Upsample(nn.Module):
-    """Repeat every pixel `stride` times in both axes."""
-
-    def __init__(self, stride: int) -> None:
-        super().__init__()
-        self.stride = stride
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Enlarge `(B, C, H, W)` to `(B, C, stride H, stride W)`."""
-        return F.interpolate(image, scale_factor=float(self.stride), mode="nearest")
 
 
 class Route(nn.Module):
@@ -115,7 +102,7 @@ class Shortcut(nn.Module):
         return _ACTIVATIONS[self.activation](image + earlier)
 
 
-class Head(nn.Module):
+class Head(nn.Identity):
     """A yolo layer: it returns its map unchanged, and holds the settings for decoding it; anchors `(width, height)`."""
 
     def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
@@ -126,10 +113,6 @@ class Head(nn.Module):
     def channels(self) -> int:
         """Number of channels of the map: centre, size, objectness and classes of every anchor."""
         return len(self.anchors) * (5 + self.classes)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Return the map unchanged."""
-        return image
 
 
 # YOLOv3 has 62 million parameters and a map of 12 million numbers; the limits keep a typing error from filling memory.
@@ -163,7 +146,7 @@ class _Builder:
         self._parameters = 0
         self.shapes: list[Shape] = []
         self.sources: list[tuple[int, ...]] = []
-        self._image = Shape(channels, Fraction(1))
+        self._here = Shape(channels, Fraction(1))
         self._makers: dict[str, Callable[[Section], nn.Module]] = {
             "convolutional": self._convolution,
             "maxpool": self._maxpool,
@@ -186,10 +169,6 @@ class _Builder:
                 raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")
         return self._makers[section.kind](section)
 
-    @property
-    def _here(self) -> Shape:
-        return self.shapes[-1] if self.shapes else self._image
-
     def _note(self, channels: int, step: Fraction, *sources: int) -> None:
         self._append(Shape(channels, step), (len(self.shapes) - 1, *sources))
 
@@ -201,6 +180,7 @@ class _Builder:
             )
         self.sources.append(sources)
         self.shapes.append(shape)
+        self._here = shape
 
     def _convolution(self, section: Section) -> nn.Module:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
@@ -242,7 +222,7 @@ class _Builder:
     def _upsample(self, section: Section) -> nn.Module:
         stride = section.integer("stride", 2)
         self._note(self._here.channels, self._here.step / stride)
-        return Upsample(stride)
+        return nn.Upsample(scale_factor=float(stride), mode="nearest")
 
     def _route(self, section: Section) -> nn.Module:
         sources = tuple(self._layer(section, "layers", layer) for layer in section.integers("layers"))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut, Upsample
+from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.scores import Candidates
 from semfov.detection.weights import cache_folder
@@ -98,8 +98,9 @@ class _NetworkGraph(Graph):
                 strides=[layer.stride] * 2,
                 pads=[before, before, after, after],
             )
-        if isinstance(layer, Upsample):
-            scales = self.constant([1.0, 1.0, float(layer.stride), float(layer.stride)])
+        if isinstance(layer, nn.Upsample):
+            scale = float(layer.scale_factor)  # type: ignore[arg-type]
+            scales = self.constant([1.0, 1.0, scale, scale])
             return self.add("Resize", sources[0], "", scales, mode="nearest", nearest_mode="floor",
                             coordinate_transformation_mode="asymmetric")  # fmt: skip
         if isinstance(layer, Route):

@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,6 +58,8 @@ class Detector(StatedModule, ABC):
     >>> detections.boxes[0], detections.scores[0]
     (tensor([[ 0.,  0., 40., 30.]]), tensor([[0.1000, 0.9000]]))
     """
+
+    _told = ("classes",)
 
     def __init__(
         self,
@@ -241,10 +242,6 @@ class Detector(StatedModule, ABC):
         raise InputError(
             f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"
         )
-
-    def _stated(self) -> dict[str, Any]:
-        """Names of the classes, in the order of the scores."""
-        return {"classes": self.classes}
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.

@@ -68,11 +68,13 @@ def decode_yolov8(columns: Tensor) -> Candidates:
     return Candidates(_corners(rows[..., :4]), rows[..., 4:])
 
 
-def _decode_end_to_end(rows: Tensor, classes: int) -> Candidates:
+def _decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     """Decode rows `x1 y1 x2 y2 score class` that a network has selected itself (YOLOv10): all other scores are 0.
 
     Shapes: rows `(B, N, 6)`.
     """
+    if classes is None:
+        raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
     check_shape(rows, "rows", None, None, 6)
     scores, numbers = rows[..., 4], rows[..., 5]
     if values_known(rows):
@@ -413,12 +415,6 @@ def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Cand
     return _decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
 
 
-def _end_to_end(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
-    if count is None:
-        raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
-    return _decode_end_to_end(_first(outputs), count)
-
-
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if "pred_boxes" in outputs:
         return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
@@ -431,7 +427,7 @@ HEADS: dict[str, _DetectionHead] = {
     "yolox-decoded": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_first(outputs)), _YOLOX),
     "yolov5": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_rows(outputs, canvas))),
     "yolov8": _DetectionHead(lambda outputs, canvas, _: decode_yolov8(_rows(outputs, canvas, across=True).mT)),
-    "end2end": _DetectionHead(_end_to_end),
+    "end2end": _DetectionHead(lambda outputs, _, count: _decode_end_to_end(_first(outputs), count)),
     "picodet": _DetectionHead(_level_maps, _IMAGENET),
     "nanodet": _DetectionHead(_level_maps, _NANODET),
     # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have

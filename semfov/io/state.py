@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -18,9 +18,12 @@ class StatedModule(nn.Module):
     A state without settings, such as that of an earlier version, is loaded as it is.
     """
 
+    _told: ClassVar[tuple[str, ...]] = ()
+    """Names of the settings that are no parameters."""
+
     def _stated(self) -> dict[str, Any]:
         """The settings that are no parameters, as JSON values."""
-        return {}
+        return {name: getattr(self, name) for name in self._told}
 
     def get_extra_state(self) -> Tensor:
         """The settings as bytes of JSON."""

@@ -54,7 +54,9 @@ class AreaUnderRoc(Metric):
 
     def compute(self) -> Tensor:
         """The area over all cases; both kinds are needed."""
-        return torch.tensor(area_under_roc(*(_joined(part) for part in (self.score, self.present))))
+        # After a synchronisation the cases of all updates are one tensor already.
+        both = (part if isinstance(part, Tensor) else torch.cat(part) for part in (self.score, self.present))
+        return torch.tensor(area_under_roc(*both))
 
 
 class Reliability(Metric):
@@ -97,8 +99,3 @@ class Reliability(Metric):
         """Number of predictions, mean negative log likelihood in nats, Brier score and expected calibration error."""
         sums = BinarySums(self.bins.cpu(), *self.sums.tolist())
         return {name: torch.tensor(float(getattr(sums, name))) for name in ("count", "nll", "brier", "ece")}
-
-
-def _joined(parts: list[Tensor] | Tensor) -> Tensor:
-    """The cases of all updates; after a synchronisation they are one tensor already."""
-    return parts if isinstance(parts, Tensor) else torch.cat(parts)

@@ -55,24 +55,19 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
 
 
 def _picture(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
-    """The data of a picture: maps before and after each fixation, contours and scanpaths."""
+    """The data of a picture: maps relative to their largest values as bytes, contours and scanpaths."""
     steps = min(max(map(len, scanpaths)), _MOST_STEPS)
     maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
+    relative = [(each / each.max() * 255).round().byte() for each in maps]
     return {
         "name": prediction.name,
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
-        "maps": [_quantised(each) for each in maps],
+        "maps": [base64.b64encode(each.numpy().tobytes()).decode() for each in relative],
         "contours": [_contours(each, prediction.size) for each in maps],
         "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in scanpaths],
     }
-
-
-def _quantised(cells: Tensor) -> str:
-    """A map relative to its largest value, a byte for each cell, as base64."""
-    values = (cells / cells.max() * 255).round().byte().numpy()
-    return base64.b64encode(values.tobytes()).decode()
 
 
 _MASSES = (0.8, 0.5, 0.25)

@@ -99,12 +99,13 @@ def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
+_type_hints = cache(get_type_hints)
 _WORDS = {int: "a whole number", float: "a number", str: "a name"}
 
 
 def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: bool = True) -> None:
     """Raise `InputError`, with the dotted name and the range, if a setting is out of the range of its type."""
-    hints = _hints(config)  # type: ignore[arg-type]
+    hints = _type_hints(config, include_extras=True)  # type: ignore[arg-type]
     for field in fields(config):
         if field.name not in values:
             continue
@@ -114,11 +115,6 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
                 check_settings(hint, value, f"{prefix}{field.name}.")  # type: ignore[arg-type]
         else:
             _check(hint, value, prefix + field.name)
-
-
-@cache
-def _hints(config: type[Any]) -> dict[str, Any]:
-    return get_type_hints(config, include_extras=True)
 
 
 def _check(hint: Any, value: Any, name: str) -> None:

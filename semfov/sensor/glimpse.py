@@ -1,7 +1,7 @@
 """Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
 
 import math
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -125,6 +125,8 @@ class Glimpse(StatedModule):
     torch.Size([1, 1, 3, 32, 32])
     """
 
+    _told = ("size", "padding_mode", "fill_value")
+
     def __init__(
         self, size: tuple[int, int], *, padding_mode: _Padding = "fill", fill_value: float = 114 / 255
     ) -> None:
@@ -133,10 +135,6 @@ class Glimpse(StatedModule):
         self.size = size
         self.padding_mode: _Padding = lookup(padding_mode, get_args(_Padding), "padding mode")
         self.fill_value = fill_value
-
-    def _stated(self) -> dict[str, Any]:
-        """All settings."""
-        return {"size": self.size, "padding_mode": self.padding_mode, "fill_value": self.fill_value}
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
         """Compute views of images at points and magnifications.

@@ -1,7 +1,6 @@
 """Perspective views of a panorama, in any direction and with any field of view."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -122,14 +121,12 @@ class Perspective(StatedModule):
     torch.Size([1, 3, 30, 40])
     """
 
+    _told = ("size", "antialias")
+
     def __init__(self, size: tuple[int, int], *, antialias: bool = True) -> None:
         super().__init__()
         check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
         self.size, self.antialias = size, antialias
-
-    def _stated(self) -> dict[str, Any]:
-        """All settings."""
-        return {"size": self.size, "antialias": self.antialias}
 
     def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
         """Compute views of panoramas.
