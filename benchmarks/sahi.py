@@ -31,6 +31,7 @@ from eval.bootstrap import Bootstrap
 from eval.zoom.objects import average_precision
 from eval.zoom.orders import in_order, quad_tree, sparse
 from eval.zoom.run import SEMFOV, ZoomConfig, ZoomRun
+from eval.zoom.slices import adaptive_slices
 from semfov.agents.windows import ZoomAgent
 from semfov.data.large import to_bytes
 from semfov.detection.objects import FAINTEST, Objects
@@ -45,7 +46,7 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import LiveGlances, Window, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.slices import adaptive_slices, slices
+from semfov.zoom.slices import slices
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -225,7 +226,7 @@ def _ordered(run: ZoomRun, pixels: _Pixels, *, order: Callable[[Lattice, list[Wi
     glances = LiveGlances(run.eye, run.eye.open(pixels))
     lattice, config = glances.lattice, run.config
     turns: Iterable[WindowStep[Any]] = look_by_look(
-        glances, order(lattice, slices(lattice, config.slice, config.overlap)), None
+        glances, order(lattice, slices(lattice, config.slice, config.step)), None
     )
     looks = [turn.glance for turn in islice(turns, config.passes)]
     return merge(looks, run.target), len(looks)

@@ -21,7 +21,7 @@ from semfov.detection.onnx import OnnxDetector, probe
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
-from semfov.zoom.evidence import GlimpseEvidence, pool_all
+from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import FINEST, Gist
 from semfov.zoom.networks import STEPS
@@ -166,7 +166,7 @@ class _Predicting(nn.Module):
         predictions = [torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)])]
         for step in range(1, STEPS + 1):
             span = self.cells >> step
-            scores, summary = pool_all(strongest, span)
+            scores, summary = (each.flatten(0, 1) for each in pool_spans(strongest, [span])[0])
             odds = self.evidence.presence(scores, summary, torch.full((len(scores),), step))
             side = self.cells - span + 1
             predictions.append(odds.mT.unflatten(-1, (side, side)))

@@ -5,11 +5,12 @@ from itertools import chain, islice
 
 import torch
 
+from eval.zoom.slices import look_for_slice
 from semfov.data.scene import Annotation
 from semfov.fit.windows import MosaicFit
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
-from semfov.zoom.episode import find_everything, look_for
+from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, around
 
@@ -88,6 +89,6 @@ def _mean_passes(
     for looks, photographs in zip(glances, slots, strict=True):
         presence = torch.stack([glance.show for glance in looks.see(photographs)]) >= least
         for target in (presence.any(0).nonzero()[:, 0] + 1).tolist():
-            path = look_for(looks, model, target, confirm=least, slices=photographs)
+            path = look_for_slice(looks, model, target, photographs, least)
             counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
     return sum(counts) / max(len(counts), 1)

@@ -17,6 +17,7 @@ from eval.zoom.decisions import decide_all
 from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
 from eval.zoom.orders import in_order, oracle, quad_tree, shuffled, sparse
+from eval.zoom.slices import adaptive_slices, look_for_slice
 from semfov.agents.windows import WindowEpisode
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
@@ -37,12 +38,12 @@ from semfov.runs.window_looking import (
     right_boxes,
 )
 from semfov.zoom.decision import CLOSER
-from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.slices import adaptive_slices, ranked, slices, usual_slices
+from semfov.zoom.slices import ranked, slices, usual_slices
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
 
@@ -83,6 +84,11 @@ class ZoomConfig(WindowLookingConfig):
     observation: str | None = None
     out: Path = Path("runs/zoom")
 
+    @property
+    def step(self) -> int:
+        """Distance in pixels between neighbouring slices."""
+        return max(1, int(self.slice * (1 - self.overlap)))
+
 
 class ZoomRun(WindowLooking, SceneRun):
     """Ways of looking at large pictures; every process builds its own run from the settings."""
@@ -108,7 +114,7 @@ class ZoomRun(WindowLooking, SceneRun):
             return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
         if lattice.levels == 1:
             return usual_slices(lattice)
-        return slices(lattice, self.config.slice, self.config.overlap)
+        return slices(lattice, self.config.slice, self.config.step)
 
     @cached_property
     def numbers(self) -> list[int]:
@@ -263,8 +269,8 @@ class ZoomRun(WindowLooking, SceneRun):
             }
             ways: dict[str, Iterator[WindowStep[Any]]] = {
                 **{name: look_by_look(glances, order, None) for name, order in orders.items()},
-                "semfov": look_for(glances, self.evidence, target, slices=cut),
-                "semfov, free windows": look_for(glances, self.evidence, target, closest=True),
+                "semfov": look_for_slice(glances, self.evidence, target, cut),
+                "semfov, free windows": look_for_slice(glances, self.evidence, target, None),
             }
             for name, turns in ways.items():
                 passes, hit = 0, False

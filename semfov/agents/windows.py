@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from math import inf, isfinite
+from math import isfinite
 from time import perf_counter
 from typing import Any, NamedTuple, Self
 
@@ -353,7 +353,7 @@ class WindowEpisode(Episode[ZoomPath]):
             order = ranked(not_blank(usual_slices(glances.lattice), glances.blank), sought)
             self._turns = look_by_look(glances, order, None, forgetting=self.forgetting)
         elif self.searches and self.target is not None:
-            self._turns = look_for(glances, self.evidence, self.target, confirm=inf, forgetting=self.forgetting)
+            self._turns = look_for(glances, self.evidence, self.target, forgetting=self.forgetting)
         else:
             self._turns = find_everything(
                 glances, self.evidence, self.target, batch=self.batch, worth=self.worth, forgetting=self.forgetting

@@ -71,7 +71,7 @@ def _searches_of(
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
         for target in choose_classes(pictures, index, annotation, classes, 1.0, seed):
-            turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)
+            turns = islice(look_for(looks, model, target), passes)
             yield index, annotation, target, _with_facts(turns)
         looks.save()
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.zoom.evidence import GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
@@ -124,7 +124,6 @@ class ZoomBelief:
         self.gists: list[Gist] = []
         self._sums: dict[tuple[int, int], _WindowSums] = {}
         self._odds: WindowOdds | None = None
-        self._odds_of: dict[Window, float] = {}
 
     @property
     def evidence(self) -> GlimpseEvidence:
@@ -157,7 +156,6 @@ class ZoomBelief:
             return
         look, source = glance.gist, self.source.numpy()
         self.gists.append(look)
-        self._odds_of.clear()
         x1, y1, x2, y2 = box = self._box(look)
         np.maximum(source[y1:y2, x1:x2], look.level, out=source[y1:y2, x1:x2])
         self._mark(box, left=False)
@@ -232,10 +230,6 @@ class ZoomBelief:
         unseen: NDArray[np.bool_] = self.source.numpy()[at] < level
         return unseen
 
-    def finds(self, level: int) -> Tensor:
-        """Number of objects that a look at each window of a level is expected to find, `(down, across)`."""
-        return torch.from_numpy(self._sum(level, 1).copy())
-
     def value(self, level: int, foresight: float) -> Cells:
         """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`); → `(down, across)`."""
         values = self._sum(level, 1)
@@ -269,10 +263,6 @@ class ZoomBelief:
             self._sums[level, octaves] = _WindowSums(weight, (self.lattice.rows, self.lattice.columns), cells)
         return self._sums[level, octaves].update()
 
-    def odds(self, level: int) -> Tensor:
-        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
-        return torch.from_numpy(self._level_odds(level).copy())
-
     def chances(self, level: int) -> Cells:
         r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
 
@@ -288,35 +278,10 @@ class ZoomBelief:
         return probability * self.unseen(level)
 
     def _level_odds(self, level: int) -> Cells:
+        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
         if self._odds is None:
             self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.gists, self.left.numpy())
         return self._odds.update()[level]
-
-    def odds_of(self, window: Window) -> float:
-        """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
-        if window in self._odds_of:
-            return self._odds_of[window]
-        value: Tensor | None = None
-        for look in sorted(self.gists, key=lambda gist: gist.level):
-            steps = window.level - look.level
-            x1, y1, x2, y2 = window.cells
-            left, top = look.first
-            inside = x1 >= left and y1 >= top and x2 <= left + look.scores.shape[1] * look.scale
-            inside = inside and y2 <= top + look.scores.shape[0] * look.scale
-            if not (inside or look.level == 0) or not 1 <= steps <= STEPS:
-                continue
-            box = (
-                (x1 - left) // look.scale,
-                (y1 - top) // look.scale,
-                max(-(-(x2 - left) // look.scale), (x1 - left) // look.scale + 1),
-                max(-(-(y2 - top) // look.scale), (y1 - top) // look.scale + 1),
-            )
-            pooled, summary = pool(look.scores, box)
-            with torch.no_grad():
-                before = None if value is None or look.level == 0 else value
-                value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, before)
-        self._odds_of[window] = float("-inf") if value is None else float(value)
-        return self._odds_of[window]
 
 
 def before_of(rate: Cells, look: Gist) -> Tensor:

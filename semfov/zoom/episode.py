@@ -8,7 +8,7 @@ from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, overview
-from semfov.zoom.policy import WindowChoice, best_find, best_hit, best_slice, jointly
+from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
 
@@ -96,7 +96,6 @@ def look_by_look(
     order: Order,
     belief: _Belief,
     *,
-    ends: Callable[[Glance], bool] = lambda glance: False,
     hints: bool = True,
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[_Belief]]:
@@ -124,36 +123,20 @@ def look_by_look(
             recent.add(glance, glances.frame)
             turn = WindowStep(glance, worth, belief, tuple(recent.looks), choose)
             yield turn
-            if ends(glance):
-                return
         choices = turn.choices
 
 
 def look_for(
-    glances: Glances,
-    evidence: GlimpseEvidence,
-    target: int,
-    *,
-    confirm: float = 0.3,
-    slices: Sequence[Window] | None = None,
-    closest: bool = False,
-    forgetting: Forgetting | None = None,
+    glances: Glances, evidence: GlimpseEvidence, target: int, *, forgetting: Forgetting | None = None
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at."""
+    """Look for one object of a class, look by look, until nothing is left to look at."""
     belief = ZoomBelief(glances.lattice, evidence, target, glances.blank)
-    last = glances.lattice.levels - 1
-    allowed = None if slices is None else set(slices)
 
     def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
-        choice = best_hit(belief, done, closest=closest) if slices is None else best_slice(belief, slices, done)
+        choice = best_hit(belief, done)
         return [] if choice is None else [choice]
 
-    def ends(glance: Glance) -> bool:
-        window = glance.window
-        confirms = window in allowed if allowed is not None else window.level == last or not closest
-        return confirms and float(glance.show[target - 1]) >= confirm
-
-    yield from look_by_look(glances, best, belief, ends=ends, forgetting=forgetting)
+    return look_by_look(glances, best, belief, forgetting=forgetting)
 
 
 def find_everything(
@@ -172,4 +155,4 @@ def find_everything(
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
-    yield from look_by_look(glances, best, belief, hints=False, forgetting=forgetting)
+    return look_by_look(glances, best, belief, hints=False, forgetting=forgetting)

@@ -350,14 +350,8 @@ def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor
     return cells.amax(0), torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])
 
 
-def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
-    """Pool the hints in all windows of `span` × `span` cells; scores `(rows, columns, K)` → `(N, K)`."""
-    top, sums = pool_spans(scores, [span])[0]
-    return top.flatten(0, 1), sums.flatten(0, 1)
-
-
 def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """`pool_all` for windows of several sizes; each size is pooled from the next smaller one.
+    """`pool` for all windows of several sizes; each size is pooled from the next smaller one.
 
     Shapes: scores `(rows, columns, K)` → `(down, across, K)`.
     """

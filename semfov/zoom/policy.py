@@ -1,10 +1,9 @@
 """Policies of where to look next, and how closely: the value of a look at each window."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import reduce
 
 import numpy as np
-import torch
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Window, on_lattice
@@ -87,43 +86,6 @@ def _better(
         flat = flat.copy()
         flat[place] = -np.inf
     return best
-
-
-def best_slice(belief: ZoomBelief, slices: Sequence[Window], done: set[Window]) -> WindowChoice | None:
-    """As `best_hit`, but only given slices can confirm the target; coarser windows are those of the lattice."""
-    odds = {window: belief.odds_of(window) for window in slices if window not in done}
-    if not odds:
-        return None
-    chances = {window: float(torch.tensor(value).sigmoid()) for window, value in odds.items()}
-    window = max(chances, key=chances.__getitem__)
-    best: WindowChoice = window, chances[window]
-    lattice = belief.lattice
-    finest = min(window.level for window in slices)
-    for level in range(1, finest):
-        half, (across, down) = max(1, lattice.span(level) // 4), lattice.places(level)
-        for row in sorted({*range(0, down, half), down - 1}):
-            for column in sorted({*range(0, across, half), across - 1}):
-                coarse = on_lattice(lattice, (level, column, row))
-                if coarse in done:
-                    continue
-                inside = [p for w, p in chances.items() if _inside(w, coarse) and _coarser(belief, w, level)]
-                value = sum(inside) / belief.evidence.patience
-                if value > best[1]:
-                    best = coarse, value
-    return best
-
-
-def _inside(window: Window, other: Window) -> bool:
-    a, b = window.cells, other.cells
-    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
-
-
-def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
-    """Tell whether the middle of a window was only looked at from coarser levels than a given one."""
-    x1, y1, x2, y2 = window.cells
-    row = min(max((y1 + y2) // 2, 0), belief.lattice.rows - 1)
-    column = min(max((x1 + x2) // 2, 0), belief.lattice.columns - 1)
-    return int(belief.source[row, column]) < level
 
 
 def jointly(

@@ -15,29 +15,8 @@ _OVERLAP = 0.2
 """Share of a slice by which neighbours overlap."""
 
 
-def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
+def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
     """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
-    return _squares(lattice, side, max(1, int(side * (1 - overlap))))
-
-
-def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
-    r"""Square slices whose number and side follow from the size of the picture, as in ASAHI.
-
-    A picture whose longer side exceeds :math:`512 (4 - 3 l) + 1` pixels is covered by 4 × 3 slices with an overlap l,
-    another one by 3 × 2; n × m slices need the side
-
-    .. math:: p = \max\left(\frac{W}{n - (n - 1) l}, \frac{H}{m - (m - 1) l}\right) + 1
-
-    Zhang, H. et al. (2023), Adaptive slicing-aided hyper inference for small object detection in high-resolution remote
-    sensing images, Remote Sensing 15(5):1249.
-    """
-    many = max(lattice.size) > 512 * (4 - 3 * overlap) + 1
-    counts = (4, 3) if many else (3, 2)
-    side = int(max(length / (n - (n - 1) * overlap) for length, n in zip(lattice.size, counts, strict=True))) + 1
-    return _squares(lattice, side, side - int(side * overlap))
-
-
-def _squares(lattice: Lattice, side: int, step: int) -> list[Window]:
     width, height = lattice.size
 
     def starts(length: int) -> list[int]:
@@ -55,9 +34,10 @@ def usual_slices(lattice: Lattice) -> list[Window]:
     has four, each 0.6 as long as its longer side.
     """
     if lattice.levels == 1:
-        return slices(lattice, max(1, round(PART * max(lattice.size))), _OVERLAP)
-    wider = 1.5 if lattice.levels > 2 else 1.0
-    return slices(lattice, round(wider * min(lattice.canvas) / lattice.magnifications[-1]), _OVERLAP)
+        side = max(1, round(PART * max(lattice.size)))
+    else:
+        side = round((1.5 if lattice.levels > 2 else 1.0) * min(lattice.canvas) / lattice.magnifications[-1])
+    return slices(lattice, side, max(1, int(side * (1 - _OVERLAP))))
 
 
 def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:

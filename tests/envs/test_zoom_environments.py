@@ -72,7 +72,7 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
             _, reward, terminated, truncated, info = env.step(agent())
             over = terminated or truncated
         seen = [glance.window for glance in env.gazes.looking.glances]
-        steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target, confirm=2.0)
+        steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target)
         assert seen == [turn.glance.window for turn, _ in zip(steps, seen, strict=False)]
         assert terminated == zoom_scenery.found(env.gazes.looking.glances, 0, target)
         assert not zoom_scenery.found(env.gazes.looking.glances[:-1], 0, target)

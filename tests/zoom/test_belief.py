@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from eval.zoom.slices import odds_of
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief, _WindowSums
 from semfov.zoom.episode import look_for
-from semfov.zoom.evidence import pool, pool_all, pool_spans
+from semfov.zoom.evidence import pool, pool_spans
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
@@ -61,7 +62,7 @@ def test_long_pictures_are_searched(detector, evidence, size):
 
 def test_pooling_of_all_windows_equals_pooling_of_each():
     scores = torch.rand(9, 11, 4, generator=torch.Generator().manual_seed(0)) ** 8
-    top, summary = pool_all(scores, 3)
+    top, summary = (each.flatten(0, 1) for each in pool_spans(scores, [3])[0])
     assert top.shape == (63, 4)
     for number, (row, column) in enumerate((r, c) for r in range(7) for c in range(9)):
         one, one_summary = pool(scores, (column, row, column + 3, row + 3))
@@ -105,7 +106,7 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
             np.testing.assert_allclose(belief.expected(level), expected[level], rtol=1e-4, atol=1e-7)
             taper, ones = evidence.taper(lattice.span(level)).numpy(), np.ones(lattice.span(level))
             finds = plain.sums(lattice, expected[level], level, taper)
-            np.testing.assert_allclose(belief.finds(level), finds, rtol=1e-3, atol=1e-6)
+            np.testing.assert_allclose(belief.value(level, 0.0), finds, rtol=1e-3, atol=1e-6)
             if level + 1 < lattice.levels:
                 finds += 0.5 * plain.sums(lattice, expected[level + 1] * (closest < level), level, ones)
             np.testing.assert_allclose(belief.value(level, 0.5), finds, rtol=1e-3, atol=1e-6)
@@ -113,7 +114,7 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
             unseen = plain.sums(lattice, left * (closest < level), level, ones) / whole
             np.testing.assert_allclose(belief.unseen(level), unseen, atol=1e-6)
             odds = plain.odds(lattice, evidence, target, seen, level)
-            np.testing.assert_allclose(belief.odds(level), odds, rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(belief._level_odds(level), odds, rtol=1e-3, atol=1e-4)
             np.testing.assert_allclose(belief.chances(level), unseen / (1 + np.exp(-odds)), atol=1e-4)
         most = np.max([expected[level] for level in range(1, lattice.levels)], 0)
         remaining = most[most >= 0.1].sum(), most[most < 0.1].sum()
@@ -124,7 +125,7 @@ def test_changes_in_cells_without_hints_change_no_odds(belief):
     """They are not computed anew there, and elsewhere they are."""
     lattice, look = belief.lattice, belief.gists[0]
     finest = lattice.levels - 1
-    before = {level: belief.odds(level) for level in range(1, lattice.levels)}
+    before = {level: belief._level_odds(level).copy() for level in range(1, lattice.levels)}
     shown = look.scores.amax(-1) > 0
     empty = [
         (row, column)
@@ -137,28 +138,28 @@ def test_changes_in_cells_without_hints_change_no_odds(belief):
     ]
     row, column = empty[len(empty) // 2]
     belief.discount(on_lattice(lattice, (finest, column, row)))
-    assert all(torch.equal(belief.odds(level), odds) for level, odds in before.items())
+    assert all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
     row, column = (int(n) * look.scale for n in shown.nonzero()[0])
     belief.discount(on_lattice(lattice, (finest, min(column, lattice.columns - CELLS), min(row, lattice.rows - CELLS))))
-    assert not all(torch.equal(belief.odds(level), odds) for level, odds in before.items())
+    assert not all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
 
 
 def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
     lattice = belief.lattice
-    table = belief.odds(lattice.levels - 1)
+    table = torch.from_numpy(belief._level_odds(lattice.levels - 1).copy())
     # The picture ends inside a cell of the overview, so only windows on whole cells are compared.
     for row, column in ((0, 0), (6, 8), (12, 4)):
         window = on_lattice(lattice, (lattice.levels - 1, column, row))
-        assert belief.odds_of(window) == pytest.approx(float(table[row, column]), abs=1e-4)
+        assert odds_of(belief, window) == pytest.approx(float(table[row, column]), abs=1e-4)
 
 
 def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
     lattice = belief.lattice
     window, value = best_find(belief, set())
     finest = on_lattice(lattice, (lattice.levels - 1, *window.cells[:2]))
-    before = belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]].clone()
+    before = belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]].clone()
     belief.add(glances.see([finest])[0])
-    assert belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]] < before
+    assert belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]] < before
     assert value > 0
 
 
@@ -167,7 +168,7 @@ def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(gl
     lattice = glances.lattice
     closest = np.full((lattice.rows, lattice.columns), -1)
     count = 0
-    for turn in look_for(glances, evidence, target, confirm=float("inf")):
+    for turn in look_for(glances, evidence, target):
         window = turn.glance.window
         x1, y1, x2, y2 = window.cells
         shown = closest[y1:y2, x1:x2]
@@ -237,10 +238,10 @@ def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
         for belief in (asked, waiting):
             belief.add(glance)
         for level in levels:
-            asked.finds(level)
+            asked.value(level, 0.0)
     for level in levels:
         torch.testing.assert_close(waiting.expected(level), asked.expected(level), rtol=0, atol=0)
-        torch.testing.assert_close(waiting.finds(level), asked.finds(level))
+        np.testing.assert_allclose(waiting.value(level, 0.0), asked.value(level, 0.0), rtol=1e-6)
 
 
 def test_a_search_for_one_object_predicts_no_rates(detector, picture, evidence, monkeypatch):

@@ -44,7 +44,7 @@ def eye(detector):
 def turns(eye, picture, target, most=6):
     torch.manual_seed(0)
     glances = LiveGlances(eye, eye.open(picture))
-    steps = look_for(glances, GlimpseEvidence(3, 8).eval(), target, confirm=math.inf)
+    steps = look_for(glances, GlimpseEvidence(3, 8).eval(), target)
     with torch.inference_mode():
         return [turn for turn, _ in zip(steps, range(most), strict=False)]
 
@@ -123,7 +123,7 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
     evidence, glances = GlimpseEvidence(3, 8).eval(), LiveGlances(eye, eye.open(picture))
     facts, passes, ended = None, 0, 0
     with torch.inference_mode():
-        for turn in look_for(glances, evidence, target, confirm=math.inf):
+        for turn in look_for(glances, evidence, target):
             facts = facts or SearchFacts(turn.belief)
             facts.add(turn.glance)
             presence, passes = facts.presence(turn.ahead), passes + 1

@@ -13,7 +13,7 @@ from semfov import InputError, Selection, WindowEye
 from semfov.detection.onnx import load_onnx
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import pool_all
+from semfov.zoom.evidence import pool_spans
 from semfov.zoom.glances import LiveGlances, on_lattice
 
 ort = pytest.importorskip("onnxruntime")
@@ -147,7 +147,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
         assert float(rates.std()) > 20 * tolerance
         for step in (1, 2, 3):
             span = 32 >> step
-            scores, summary = pool_all(gist.scores, span)
+            scores, summary = (each.flatten(0, 1) for each in pool_spans(gist.scores, [span])[0])
             odds = evidence.presence(scores, summary, torch.full((len(scores),), step))
             expected = odds.mT.unflatten(-1, (33 - span, 33 - span))
             torch.testing.assert_close(found[f"odds_{step}"], expected, rtol=0, atol=tolerance)

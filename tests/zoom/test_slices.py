@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from eval.zoom.slices import adaptive_slices
 from semfov import InputError, WindowEye, ZoomAgent
 from semfov.agents.episode import EpisodeLimits
 from semfov.zoom.glances import LiveGlances
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.slices import adaptive_slices, ranked, raw, usual_slices
+from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.small import Coloured
 
 
