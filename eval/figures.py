@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from eval.comparison.saliency import open_at_reference
 from semfov import ActivePerception, Scanpath
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
@@ -31,7 +32,6 @@ from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
-from semfov.runs.saliency_store import open_at_reference
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.runs.store import look_everywhere

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.summary import Curve, collect_records
 from eval.explore.report import success
 from eval.explore.run import ExploreConfig, ExploreRun
@@ -39,7 +40,6 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
@@ -175,7 +175,7 @@ def _observation(config: _SensorsConfig, name: str) -> Path:
     return file
 
 
-def _curves(run: PolicyLooking, name: str, measure: Any) -> dict[str, Curve]:
+def _curves(run: ComparedLooking, name: str, measure: Any) -> dict[str, Curve]:
     """Finish a run, and average its records."""
     finish(run, name)
     curves: dict[str, Curve] = measure(collect_records(run)[0])

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from eval.decide.run import detected_on_landing, landing
 from eval.search.run import SearchConfig
@@ -25,7 +26,6 @@ from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches
@@ -55,7 +55,7 @@ _ALL_CLASSES = {
 LEARNED, MAP = "learned", "learned map"
 
 
-class BeliefCalibrationRun(PolicyLooking):
+class BeliefCalibrationRun(ComparedLooking):
     """Two searches in every scene, for a present class and for an absent class, that do not stop at the target.
 
     The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief

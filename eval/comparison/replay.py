@@ -5,18 +5,18 @@ from functools import partial
 
 import torch
 
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath, trace
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_learned
 
 
-def replay(run: PolicyLooking, index: int, record: ResultRecord) -> Scanpath:
+def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
     """Replay a recorded episode.
 
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from eval.comparison.curves_html import curves_html
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.replay import replay
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
@@ -19,7 +20,6 @@ from semfov.report.episode import Data, episode_data
 from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page
 from semfov.runs.config import WHERE
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 
 _MOST_BYTES = 4_500_000
@@ -27,7 +27,7 @@ _MOST_BYTES = 4_500_000
 
 
 def write_run_report(
-    run: PolicyLooking,
+    run: ComparedLooking,
     records: list[ResultRecord],
     curves: Mapping[str, dict[str, Curve]],
     *,
@@ -77,7 +77,7 @@ def _choose_episodes(records: list[ResultRecord], policies: Sequence[str], count
     return chosen
 
 
-def _episodes(run: PolicyLooking, records: Sequence[ResultRecord]) -> list[Data]:
+def _episodes(run: ComparedLooking, records: Sequence[ResultRecord]) -> list[Data]:
     data, size, settings, pictures = [], 0, run.eye.settings(), set[str]()
     for record in records:
         if sum(map(len, pictures)) + size > _MOST_BYTES:

@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.records import gather
 from semfov.io.files import inside, replacing, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
 from semfov.io.tables import csv_text
 from semfov.metrics.averages import FloatArray, standard_error
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import percent
@@ -52,7 +52,7 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
     return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(rows))
 
 
-def collect_records(run: PolicyLooking) -> tuple[list[ResultRecord], dict[str, float]]:
+def collect_records(run: ComparedLooking) -> tuple[list[ResultRecord], dict[str, float]]:
     """Records of all scenes, sorted by policy, and the seconds that each stage took."""
     stored = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
@@ -91,7 +91,7 @@ def _write_lines(path: Path, records: Iterable[ResultRecord]) -> Path:
 
 
 def write_files(
-    run: PolicyLooking,
+    run: ComparedLooking,
     program: str,
     tables: dict[str, str],
     records: Iterable[ResultRecord],
@@ -143,7 +143,7 @@ MANIFEST = "manifest.json"
 """Name of the file that says where the results of a run come from; it is written when the run has ended."""
 
 
-def manifest(run: PolicyLooking, program: str, seconds: dict[str, float]) -> str:
+def manifest(run: ComparedLooking, program: str, seconds: dict[str, float]) -> str:
     """Provenance of the results as JSON: commit, day, versions, checksums, seed, and the time of each stage."""
     record = {
         "command": ["python", "-m", program, *sys.argv[1:]],
@@ -172,7 +172,7 @@ def manifest(run: PolicyLooking, program: str, seconds: dict[str, float]) -> str
     return json.dumps(record, indent=2) + "\n"
 
 
-def sensing(run: PolicyLooking) -> str:
+def sensing(run: ComparedLooking) -> str:
     """Detector, sensor and observation model of a run, as text for titles."""
     sensor, model, seeing = run.config.sensor, run.config.belief.model, run.eye.sensor
     what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"

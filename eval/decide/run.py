@@ -11,6 +11,7 @@ from typing import Annotated, Any, Self
 import torch
 from torch import Tensor
 
+from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
@@ -33,7 +34,6 @@ from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
@@ -109,7 +109,7 @@ class DecideConfig(RunConfig):
         return replace(self, **missing)
 
 
-class DecisionRun(PolicyLooking):
+class DecisionRun(ComparedLooking):
     """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
 
     The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same

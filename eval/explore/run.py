@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from eval.comparison.looking import ComparedLooking
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
@@ -25,7 +26,6 @@ from semfov.runs.exploration_protocol import (
     explore_noise,
     run_explorations,
 )
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 
 FUSED, PAINTED = "one unfoveated pass, fused", "one unfoveated pass, boxes"
@@ -87,7 +87,7 @@ class ExploreConfig(RunConfig):
     out: Path = Path("runs/explore")
 
 
-class ExploreRun(PolicyLooking):
+class ExploreRun(ComparedLooking):
     """Scene exploration."""
 
     task: Task = "exploration"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from eval.comparison.saliency import SALIENCY_CLASSES
 from eval.page.origin import END, PLACE
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
@@ -29,7 +30,6 @@ from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
 from semfov.runs.config import DetectorConfig, SaliencyModel
-from semfov.runs.saliency_store import SALIENCY_CLASSES
 from semfov.runs.settings import Count, Whole
 from semfov.runs.setup import detector_options
 from semfov.runs.tables import plus_minus, table

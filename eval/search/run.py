@@ -7,10 +7,10 @@ from pathlib import Path
 
 import torch
 
+from eval.comparison.looking import ComparedLooking
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import PolicyConfig, RunConfig
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
@@ -44,7 +44,7 @@ class SearchConfig(RunConfig):
     scanpaths: Whole = 3
 
 
-class SearchRun(PolicyLooking):
+class SearchRun(ComparedLooking):
     """Visual search."""
 
     task: Task = "search"

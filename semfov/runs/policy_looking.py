@@ -6,23 +6,20 @@ from dataclasses import asdict
 from functools import cached_property
 from typing import Any
 
-from torch import Tensor
-
 from semfov.belief.observers import Observer
-from semfov.errors import check, lookup
+from semfov.errors import check
 from semfov.gaze.policies import POLICIES, Task
 from semfov.io.code import class_digest
-from semfov.runs.candidates import Candidate, belief_settings, load_models, make_strategy
-from semfov.runs.config import PolicyConfig, RunConfig, SaliencyModel
+from semfov.runs.candidates import belief_settings, load_models, make_strategy
+from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.looking import Looking
 from semfov.runs.presets import label, resolve
-from semfov.runs.saliency_store import SaliencyStore, saliency_table
-from semfov.runs.scene_run import digest_of, store_folder
+from semfov.runs.scene_run import digest_of
 from semfov.strategy import Strategy
 
 
 class PolicyLooking(Looking):
-    """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene."""
+    """Looks at scenes, and policies that choose where to look in them."""
 
     task: Task
     config: RunConfig
@@ -42,12 +39,6 @@ class PolicyLooking(Looking):
             # Policies with the same belief share an observer, which then weighs each look only once.
             observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
-        folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
-        self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
-            for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
-            if name is not None
-        }
 
     @cached_property
     def code(self) -> str:
@@ -57,7 +48,7 @@ class PolicyLooking(Looking):
         return digest_of([super().code, [class_digest(POLICIES[name]) for name in foreign]])
 
     def depends_on(self) -> dict[str, Any]:
-        """List the eye, the models of all policies, and the settings of belief, protocol, policies and saliency."""
+        """List the eye, the models of all policies, and the settings of belief, protocol and policies."""
         config, models = self.config, self.models
         policies = {name: asdict(policy) for name, policy in self.policies.items()}
         return {
@@ -67,27 +58,8 @@ class PolicyLooking(Looking):
             "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
             "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
             "policies": policies,
-            "saliency": asdict(config.saliency) if self.saliency_stores else None,
         }
 
     def stored(self, index: int) -> bytes | None:
         """Nothing: the records are all that a comparison needs."""
         return None
-
-    def candidate(self, name: str, index: int) -> Candidate:
-        """The policy of this name in tables, for a scene."""
-        policy = self.policies[lookup(name, self.policies, "policy of this run")]
-        saliency = None if policy.saliency is None else self.saliency(policy.saliency, index)
-        return Candidate(self.strategies[name], saliency, self.config.saliency.weight)
-
-    def saliency(self, name: SaliencyModel, index: int) -> Tensor:
-        """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
-        digest, store = self.digest(index), self.saliency_stores[name]
-        saliency = store.load(digest) if self.config.store else None
-        if saliency is None:
-            image, how = self.scenes[index].image, self.config.saliency
-            seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
-            saliency = saliency_table(name, how.view, how.reduction, *seen)
-            if self.config.store:
-                store.save(digest, saliency)
-        return saliency

@@ -40,10 +40,10 @@ class PolicyAgent:
     def choose(self, row):
         """The next cell of the episode in a row, by its own scene and target."""
         gazes, scenery, episode = self.gazes, self.gazes.scenery, self.gazes.episodes[int(row)]
-        grid, candidate = scenery.grid(episode.scene), scenery._looking.candidate(scenery.policy, episode.scene)
+        grid, policy = scenery.grid(episode.scene), scenery._looking.strategies[scenery.policy].policy
         targets = gazes.targets[row] if isinstance(episode, Trial) else None
         visited = gazes.memory.visited[row]
-        values = candidate.acquisition(targets, grid, gazes.cell[row])(gazes.memory.belief[row], visited)
+        values = policy(targets, grid)(gazes.memory.belief[row], visited)
         draw = tie_noise if isinstance(episode, Trial) else explore_noise
         noise = draw(scenery._data, episode, len(grid), scenery.protocol)
         # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.

@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.comparison import saliency as saliency_store
+from eval.comparison.saliency import SaliencyStore, saliency_table
 from eval.explore import explore
 from eval.explore.run import FUSED, PAINTED, ExploreConfig, ExploreRun
 from semfov import observers
 from semfov.gaze.saliency import VOCUS2
 from semfov.io.code import _closure
-from semfov.runs import saliency_store
 from semfov.runs.config import DetectorConfig
-from semfov.runs.saliency_store import SaliencyStore, saliency_table
 from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
@@ -133,7 +133,7 @@ def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
 
 def test_stored_saliency_does_not_depend_on_the_code_of_beliefs_and_policies():
     code = {path.stem for path in _closure(saliency_store._SOURCES, lambda name: name.startswith("semfov."))}
-    assert {"vocus2", "itti", "grid", "saliency_store"} <= code
+    assert {"vocus2", "itti", "grid"} <= code
     assert not {"fusion", "belief", "config", "candidates", "choice"} & code
 
 

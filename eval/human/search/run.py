@@ -8,6 +8,7 @@ from typing import Annotated
 
 import torch
 
+from eval.comparison.looking import ComparedLooking
 from eval.human.search.screens import Screens
 from eval.human.search.trials import goal_rectangle, read_searches
 from semfov.belief.grid import Grid
@@ -17,7 +18,6 @@ from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.policies import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
-from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
@@ -75,7 +75,7 @@ class PeopleSearchConfig(RunConfig):
     out: Path = Path("runs/human_search")
 
 
-class PeopleSearchRun(PolicyLooking):
+class PeopleSearchRun(ComparedLooking):
     """Searches for the targets of people, one screen after the other."""
 
     task: Task = "search"

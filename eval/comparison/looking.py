@@ -1,0 +1,50 @@
+"""Looks and policies that are compared in scenes, with the saliency that they need of each scene."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from torch import Tensor
+
+from eval.comparison.saliency import SaliencyStore, saliency_table
+from semfov.errors import lookup
+from semfov.runs.candidates import Candidate
+from semfov.runs.config import RunConfig, SaliencyModel
+from semfov.runs.policy_looking import PolicyLooking
+from semfov.runs.scene_run import store_folder
+
+
+class ComparedLooking(PolicyLooking):
+    """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene."""
+
+    def __init__(self, config: RunConfig) -> None:
+        super().__init__(config)
+        folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
+        self.saliency_stores = {
+            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
+            for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
+            if name is not None
+        }
+
+    def depends_on(self) -> dict[str, Any]:
+        """List what looks and policies depend on, and the settings of saliency."""
+        return {**super().depends_on(), "saliency": asdict(self.config.saliency) if self.saliency_stores else None}
+
+    def candidate(self, name: str, index: int) -> Candidate:
+        """The policy of this name in tables, for a scene."""
+        policy = self.policies[lookup(name, self.policies, "policy of this run")]
+        saliency = None if policy.saliency is None else self.saliency(policy.saliency, index)
+        return Candidate(self.strategies[name], saliency, self.config.saliency.weight)
+
+    def saliency(self, name: SaliencyModel, index: int) -> Tensor:
+        """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
+        digest, store = self.digest(index), self.saliency_stores[name]
+        saliency = store.load(digest) if self.config.store else None
+        if saliency is None:
+            image, how = self.scenes[index].image, self.config.saliency
+            seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
+            saliency = saliency_table(name, how.view, how.reduction, *seen)
+            if self.config.store:
+                store.save(digest, saliency)
+        return saliency
