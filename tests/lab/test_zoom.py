@@ -284,7 +284,7 @@ def test_orders_look_at_every_slice_once(config):
 
 def test_slices_match_those_of_sahi():
     lattice = Lattice.over((3840, 2160), (416, 416))
-    windows = slices(lattice, 640, 0.2)
+    windows = slices(lattice, 640, 512)
     assert len(windows) == 32
     corners = [window.within for window in windows]
     assert corners[0] == (0, 0, 640, 640)

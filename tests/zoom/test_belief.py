@@ -157,7 +157,7 @@ def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
     lattice = belief.lattice
     window, value = best_find(belief, set())
     finest = on_lattice(lattice, (lattice.levels - 1, *window.cells[:2]))
-    before = belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]].clone()
+    before = belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]].copy()
     belief.add(glances.see([finest])[0])
     assert belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]] < before
     assert value > 0
