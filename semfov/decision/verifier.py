@@ -51,8 +51,6 @@ class Verifier(Generic[LookType]):
     place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
     place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
     and the boxes of the verdicts follow the detections of each look.
-
-    Shapes: close_up `(4,)`.
     """
 
     def __init__(

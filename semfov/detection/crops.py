@@ -19,8 +19,6 @@ def merge_crops(
     its border, is left out of the wider ones, whether the finer crop has a box there or not. Of the others, two boxes
     of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole box is
     kept rather than a cut one, and otherwise the one in the finer crop.
-
-    Shapes: windows `(F·L, 4)`.
     """
     merged = []
     for first in range(0, len(detections.mask), crops):

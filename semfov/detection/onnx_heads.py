@@ -45,8 +45,6 @@ def _decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] =
     For the cell (i, j) of a level with stride s, centre and size of the box are
 
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
-
-    Shapes: raw `(B, N, 5 + K)`.
     """
     check_shape(raw, "raw", None, None, None)
     grid = _grid(raw, canvas, strides, 0.0)
@@ -148,8 +146,6 @@ def _decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
 
     >>> _decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
-
-    Shapes: rows `(B, Q, 4 + K)`.
     """
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])

@@ -177,8 +177,6 @@ def _detection_arrays(detections: Detections, detector: Detector) -> Arrays:
     """Detections as arrays of one shape, padded to the largest number L that the detector gives; → `(n, L, 4)`.
 
     Gymnasium's own vectorised environments require infos of constant shape.
-
-    Shapes: → `(n, L, 4)`.
     """
     number, count = detections.mask.shape
     limit, components = max(detector.selection.limit, count), detections.scores.shape[-1]

@@ -22,8 +22,6 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
     It is the probability that a case with the target scores higher than one without:
 
     .. math:: P(s_+ > s_-) + P(s_+ = s_-) / 2
-
-    Shapes: score `(M,)`, present `(M,)`.
     """
     hit, miss = scores_by_presence(score, present)
     miss = miss.sort().values

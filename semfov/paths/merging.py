@@ -64,8 +64,6 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
 
     >>> distances_to(torch.tensor([[10.0, 10, 20, 20], [0, 0, 4, 5]]), torch.tensor([6.5, 8.5])).tolist()
     [3.1622776985168457, 5.0]
-
-    Shapes: boxes `(L, 4)`, point `(2,)` → `(L,)`.
     """
     at = (point + 0.5).to(boxes)
     beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)

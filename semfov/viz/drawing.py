@@ -56,10 +56,7 @@ def choose_fixations(record: Record, most: int) -> list[int]:
 
 
 def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> AxesImage:
-    """Draw a photograph or a view of it, of any size, in the coordinates of the grid; image `(3, h, w)`.
-
-    Shapes: image `(3, h, w)`.
-    """
+    """Draw a photograph or a view of it, of any size, in the coordinates of the grid; image `(3, h, w)`."""
     width, height = grid.extent.tolist()
     drawn = axes.imshow(picture_array(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])

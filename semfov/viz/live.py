@@ -36,8 +36,6 @@ def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = 
 
     Of windows, a frame marks the present window, a thin one the next, and boxes the objects: those that are confirmed
     in their own colour. A frame that is longer than `longest` is reduced.
-
-    Shapes: image `(3, H, W)` → `(h, w, 3)`.
     """
     from PIL import Image, ImageDraw, ImageFont
 

@@ -49,8 +49,6 @@ class _WindowSums:
 
     A sum along an axis is a product with a banded matrix. Only the windows that hold a cell which has changed are
     summed again. A window that reaches beyond the cells sums those that it holds.
-
-    Shapes: weight `(span,)`, shape `(rows, columns)`.
     """
 
     def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[Place], Cells]) -> None:

@@ -134,8 +134,6 @@ class WindowOdds:
     .. math:: o_i(w) = f(u s_i, w, o_{i-1}(w))
 
     The hints s of each look count for the share u of their cell that is left to see.
-
-    Shapes: left `(rows, columns)`.
     """
 
     def __init__(

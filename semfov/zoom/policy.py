@@ -49,10 +49,7 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
 
 
 def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
-    """Sum the chances of closer windows, side by side, in each window of a level; → `(down, across)`.
-
-    Shapes: → `(down, across)`.
-    """
+    """Sum the chances of closer windows, side by side, in each window of a level; → `(down, across)`."""
     lattice, source = belief.lattice, belief.source.numpy()
     down, across = lattice.places(level)[::-1]
     total = np.zeros((down, across), np.float32)

@@ -78,8 +78,6 @@ def share_below(ordered: _Array, values: _Array) -> _Array:
 
     >>> share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
     array([0.5])
-
-    Shapes: values `(n,)` → `(n,)`.
     """
     twice = np.searchsorted(ordered, values) + np.searchsorted(ordered, values, side="right")
     return np.asarray(twice / (2 * len(ordered)))
@@ -169,8 +167,6 @@ def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Arr
 
     >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
     array([1.])
-
-    Shapes: maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`.
     """
     values = as_array(maps, "maps")
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
