@@ -87,19 +87,6 @@ def test_objects_count_from_the_asked_score_on(agent, image, how):
         agent.find_all(image, how=how, passes=2, least=1.5)
 
 
-def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, image):
-    image[:, 8:28, 8:28] = 0.4  # nothing red is left
-    scanpath = agent.search(image, {"red": 1.0, "green": 0.8}, start=0)
-    assert scanpath.found
-    assert scanpath.classes[scanpath.target] == "green"
-    corner = scanpath.decision.box.tolist()
-    assert corner == pytest.approx([130, 100, 140, 110], abs=6)
-    alone = agent.search(image, "green", start=0)
-    assert torch.equal(agent.search(image, {"green": 1.0}, start=0).cells, alone.cells)
-    # A detection of a class with a low weight does not confirm the target.
-    assert not agent.search(image, {"red": 1.0, "green": 0.1}, start=0, shifts=6).found
-
-
 def test_predictive_policies_search_for_one_class_only(image):
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     ahead = ActivePerception(squares_eye(), (Semantic(3), Predictive(model)), (Semantic(3), Random()), grid=(8, 6))
@@ -357,7 +344,17 @@ def test_unknown_options_are_named_with_the_nearest_ones(make, options, refused)
         make("yolov3-tiny", **options)
 
 
-def test_any_of_a_list_of_classes_will_do(agent, image):
+def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, image):
+    image[:, 8:28, 8:28] = 0.4  # nothing red is left
+    scanpath = agent.search(image, {"red": 1.0, "green": 0.8}, start=0)
+    assert scanpath.found
+    assert scanpath.classes[scanpath.target] == "green"
+    corner = scanpath.decision.box.tolist()
+    assert corner == pytest.approx([130, 100, 140, 110], abs=6)
+    alone = agent.search(image, "green", start=0)
+    assert torch.equal(agent.search(image, {"green": 1.0}, start=0).cells, alone.cells)
+    # A detection of a class with a low weight does not confirm the target.
+    assert not agent.search(image, {"red": 1.0, "green": 0.1}, start=0, shifts=6).found
     image[:, 8:28, 8:28] = 0.4  # nothing red is left
     listed, weighted = (
         agent.search(image, wanted, start=0) for wanted in (["red", "green"], {"red": 1.0, "green": 1.0})

@@ -118,7 +118,7 @@ def test_unusable_likelihoods_are_refused(rule, bad, word):
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_rules_have_gradients_and_compile_to_one_graph(rule):
+def test_rules_have_gradients_and_are_one_graph(rule):
     torch.manual_seed(2)
     beta = (torch.rand(3, 4, dtype=torch.float64) + 0.2).requires_grad_()
     likelihood = (torch.rand(3, 4, dtype=torch.float64) + 0.1).requires_grad_()
@@ -201,7 +201,7 @@ class Sharper:
         return torch.where(distance[..., None] < 0.3, scores**2, torch.ones_like(scores))
 
 
-def test_the_observation_model_gets_the_distance_of_each_box():
+def test_likelihoods_of_raw_scores_and_of_a_model_at_the_distance_of_each_box():
     grid = Grid(4, 3, (100, 60))
     fixation = torch.tensor([[10.0, 10.0]])
     near = likelihoods(seen(grid), fixation, grid, Sharper())
@@ -211,9 +211,6 @@ def test_the_observation_model_gets_the_distance_of_each_box():
     assert torch.equal(said.likelihood[0, :2], near[0, :2] / near[0, :2].amax(-1, keepdim=True))
     assert torch.equal(said.footprint[0, :2], grid.footprint(seen(grid).boxes)[0, :2])
     assert not said.footprint[0, 2].any()
-
-
-def test_likelihoods_of_raw_scores_are_the_scores_and_uniform_for_padding():
     grid = Grid(4, 3, (100, 60))
     raw = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid)
     assert torch.equal(raw[0, :2], seen(grid).scores[0, :2])

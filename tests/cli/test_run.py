@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -124,7 +125,6 @@ def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_p
 
 
 def test_crops_show_the_bands_and_the_white_of_the_look(agent, tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     pixels = np.full((4, 120, 160), 1000, np.float32)
     pixels[1:, 8:28, 8:28] = np.array([2300, 200, 200])[:, None, None]
     tifffile.imwrite(tmp_path / "f.tif", pixels, photometric="minisblack", planarconfig="separate")

@@ -9,6 +9,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from semfov import DataError, SemfovError, read_image
@@ -99,7 +100,6 @@ def test_text_is_no_photograph(rasterio, private, address, text, suffix):
 @pytest.mark.parametrize("place", ["tag", "aux.xml", "ovr"])
 def test_reduced_copies_are_those_of_the_file(rasterio, private, address, place):
     """A sound GeoTIFF may name another file, an address or a mosaic as its reduced copies."""
-    tifffile = pytest.importorskip("tifffile")
     url, requests = address
     raw = RAW.format(relative=0, name=private / "secret.txt")
     for name in (raw, f"/vsicurl/{url}/a.tif", str(private / "photo.png")):

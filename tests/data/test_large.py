@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -24,7 +25,6 @@ def pixels(height=150, width=230, seed=0):
 
 @pytest.mark.parametrize("large", [1 << 24, 1 << 15])  # pictures with more pixels are read from reduced copies
 def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch, large):
-    tifffile = pytest.importorskip("tifffile")
     monkeypatch.setattr("semfov.data.windowed._LARGE", large)
     smooth = Image.fromarray(pixels(8, 8)).resize((450, 330), Image.Resampling.BICUBIC)
     smooth.save(tmp_path / "a.jpg", quality=90)
@@ -52,7 +52,6 @@ def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch
 @pytest.mark.parametrize("reader", [TiffPicture, RasterPicture])
 def test_threads_read_windows_of_one_picture_at_once(tmp_path, reader):
     """Each gets the pixels of its window, and afterwards warnings and logs are what they were."""
-    tifffile = pytest.importorskip("tifffile")
     if reader is RasterPicture:
         pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
     array, logs = pixels(512, 512), [logging.getLogger(name) for name in ("PIL", "tifffile")]
@@ -104,7 +103,6 @@ def test_windows_of_a_memory_mapped_file_need_little_memory(tmp_path):
 
 
 def test_tiles_are_decoded_one_at_a_time(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     array = np.zeros((4096, 4096, 3), np.uint8)
     array[1000:1100, 2000:2100] = 77
     tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
@@ -142,7 +140,6 @@ def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
 
 
 def test_truncated_files_are_refused(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     Image.fromarray(pixels()).save(tmp_path / "a.jpg")
     tifffile.imwrite(tmp_path / "a.tif", pixels(), tile=(64, 48), photometric="rgb", compression="zlib")
     for name in ("a.jpg", "a.tif"):
@@ -170,7 +167,6 @@ def test_every_colour_mode_is_read_as_by_read_image(tmp_path, mode):
 @pytest.mark.parametrize("photometric", ["minisblack", "miniswhite", "rgb"])
 def test_sixteen_bit_tiffs_are_scaled_by_their_white(tmp_path, photometric):
     """Tile by tile and as a whole, against the values that were written."""
-    tifffile = pytest.importorskip("tifffile")
     shape = (50, 70, 3) if photometric == "rgb" else (50, 70)
     array = np.random.default_rng(0).integers(65536, size=shape, dtype=np.uint16)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(16, 32), photometric=photometric, compression="zlib")
@@ -183,7 +179,6 @@ def test_sixteen_bit_tiffs_are_scaled_by_their_white(tmp_path, photometric):
 
 
 def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_path, monkeypatch):
-    tifffile = pytest.importorskip("tifffile")
     array = pixels()
     colours = Image.fromarray(array).quantize(16)
     colours.save(tmp_path / "palette.tif")
@@ -199,7 +194,6 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
 
 
 def test_signed_numbers_of_eight_bits_need_their_black_and_white(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     values = np.arange(-128, 128, dtype=np.int8).reshape(16, 16)
     tifffile.imwrite(tmp_path / "a.tif", values)
     for read in (read_image, open_large):

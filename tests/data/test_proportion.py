@@ -7,6 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -58,7 +59,6 @@ def test_blank_pictures_are_in_proportion(tmp_path):
 @pytest.mark.parametrize("kind", ["inflates", "is stored"])
 def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
     """A sound TIFF of 64 × 64 pixels, whose only tile is replaced by one of a hundred million zeros."""
-    tifffile = pytest.importorskip("tifffile")
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, pixels(64, 64), tile=(64, 64), compression="zlib", photometric="rgb")
     bomb = zlib.compress(bytes(60_000_000), 9 if kind == "inflates" else 1)
@@ -80,7 +80,6 @@ def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
 
 
 def test_a_tile_that_claims_more_than_is_stored(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.zeros((64, 64), np.uint8), tile=(64, 64), compression="zlib")
     content = bytearray(path.read_bytes())
@@ -131,7 +130,6 @@ def test_one_file_has_one_answer(tmp_path, mode, kind, monkeypatch):
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("photometric", ["rgb", "minisblack", "miniswhite"])
 def test_turned_tiffs_have_one_answer(tmp_path, orientation, photometric):
-    tifffile = pytest.importorskip("tifffile")
     array = pixels(120, 90) if photometric == "rgb" else pixels(120, 90)[..., 0]
     tags = [(274, "H", 1, orientation, True)]
     tifffile.imwrite(tmp_path / "a.tif", array, photometric=photometric, extratags=tags, rowsperstrip=16)
@@ -143,7 +141,6 @@ def test_turned_tiffs_have_one_answer(tmp_path, orientation, photometric):
 @pytest.mark.parametrize("extra", ["unassalpha", "assocalpha", "unspecified"])
 def test_alpha_of_tiffs_read_by_windows(tmp_path, extra):
     """Blended with white, unless the fourth channel is no alpha."""
-    tifffile = pytest.importorskip("tifffile")
     array = np.dstack([pixels(120, 90), pixels(120, 90, 1)[..., :1]])
     if extra == "assocalpha":
         array[..., :3] = array[..., :3].astype(int) * array[..., 3:] // 255
@@ -177,7 +174,6 @@ def test_jpeg_2000_is_read_without_rasterio(tmp_path, monkeypatch):
 @pytest.mark.parametrize("reader", ["fovea", "windows", "raster"])
 def test_sixteen_bits_with_few_values_are_warned_of(tmp_path, reader, request):
     """Of 12 bits and of reflectances; those that use their range are read without a word, and so are blank ones."""
-    tifffile = pytest.importorskip("tifffile")
     if reader == "raster":
         pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
     read = {"fovea": read_image, "windows": open_large, "raster": RasterPicture}[reader]
@@ -192,7 +188,6 @@ def test_sixteen_bits_with_few_values_are_warned_of(tmp_path, reader, request):
 
 
 def test_a_thumbnail_before_the_picture_is_not_the_picture(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     array = pixels(60, 80)
     for name, turn in (("a.tif", []), ("b.tif", [(274, "H", 1, 3, True)])):
         with tifffile.TiffWriter(tmp_path / name) as file:
@@ -204,7 +199,6 @@ def test_a_thumbnail_before_the_picture_is_not_the_picture(tmp_path):
 
 
 def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
-    tifffile = pytest.importorskip("tifffile")
     tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8)[..., 0], extratags=[(42113, "s", 0, "none", True)])
     open_large(tmp_path / "a.tif")
     many = np.zeros((6, 8, 300), np.uint8)
@@ -219,14 +213,12 @@ def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
 
 def test_a_turned_tiff_that_pillow_does_not_read_is_refused(tmp_path):
     """Nobody would turn it."""
-    tifffile = pytest.importorskip("tifffile")
     tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8), bigtiff=True, byteorder=">", extratags=[(274, "H", 1, 6, True)])
     with pytest.raises(DataError, match="not an image in a format that is read"):
         open_large(tmp_path / "a.tif")
 
 
 def test_the_alpha_of_16_bits_is_no_value_of_the_picture(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     values = np.dstack([pixels(60, 80).astype(np.uint16) * 4, np.full((60, 80), 65535, np.uint16)])
     tags = [(42113, "s", 0, "none", True)]  # a word where a number should be
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=[2], extratags=tags)

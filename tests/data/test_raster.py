@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -115,7 +116,6 @@ def test_objects_of_a_mosaic_of_files_have_its_coordinates(rasterio, tmp_path):
 
 
 def test_other_tiffs_are_read_as_before(rasterio, tmp_path):
-    pytest.importorskip("tifffile")
     assert not isinstance(open_large(write(rasterio, tmp_path / "a.tif", pixels())), RasterPicture)
     planes = write(rasterio, tmp_path / "b.tif", pixels(), interleave="band")
     assert np.array_equal(open_large(planes).pixels((5, 6, 50, 40)), pixels()[6:40, 5:50])
@@ -141,7 +141,6 @@ def test_what_is_no_picture_is_refused(rasterio, tmp_path):
 
 def test_a_missing_rasterio_is_named(tmp_path, monkeypatch):
     """Only where there is no other reader: TIFFs with overviews are still read without it."""
-    tifffile = pytest.importorskip("tifffile")
     array = pixels()
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(array, tile=(64, 48), photometric="rgb")

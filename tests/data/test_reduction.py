@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 from torch.nn import functional
@@ -96,7 +97,6 @@ def test_small_pictures_and_fine_windows_are_read_as_they_are(strips):
 
 
 def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)

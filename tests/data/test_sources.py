@@ -7,6 +7,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,7 +23,6 @@ SHADES = (20, 90, 160, 230)
 @pytest.fixture
 def video(tmp_path):
     """A video of eight frames, two of each shade of blue."""
-    cv2 = pytest.importorskip("cv2")
     path = tmp_path / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
     for shade in SHADES:
@@ -92,7 +92,6 @@ def test_streams_are_opened_by_their_address(video):
 
 
 def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():
-    pytest.importorskip("cv2")
     with pytest.raises(DataError, match=r"rtsp://127.0.0.1:9/a: cannot be opened; check that address, user") as caught:
         open_stream("rtsp://admin:secret@127.0.0.1:9/a")
     assert "secret" not in str(caught.value)
@@ -142,7 +141,6 @@ def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
 
 def test_frames_pass_by_their_time_stamps(monkeypatch):
     """Frames at 0, 40, 80 and 1080 ms, 25 a second; of a camera the same frames are those that are waited for."""
-    cv2 = pytest.importorskip("cv2")
     for source, expected in ((Path("a.mp4"), [1, 1, 1, 25]), (0, [1, 1, 1, 1])):
         recorder = Recorder([[0, 40, 80, 1080], []])
         monkeypatch.setattr(recorder, "get", lambda key, of=recorder: of.now if key == cv2.CAP_PROP_POS_MSEC else 25.0)
@@ -151,7 +149,6 @@ def test_frames_pass_by_their_time_stamps(monkeypatch):
 
 
 def test_frames_of_sixteen_bits_are_shown_between_black_and_white(tmp_path):
-    cv2 = pytest.importorskip("cv2")
     path, kind = tmp_path / "warm.mkv", [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
     film = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 25, (64, 48), kind)
     for value in (300, 1300, 4000):
@@ -195,7 +192,6 @@ class Recorder:
 
 
 def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
-    cv2 = pytest.importorskip("cv2")
     recorder, gaps = Recorder([[1, 2], [], [3, 4]]), Counter()
     monkeypatch.setattr(sources, "_PAUSES", (0.0, 0.0))
     monkeypatch.setattr(sources, "_recorder", lambda *_: recorder)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -26,7 +27,6 @@ KINDS = {"u2": 3000, "i2": 3000, "f4": 40.0, "u4": 10**6, "f8": 1.0, "f2": 30.0}
 @pytest.mark.parametrize("white", ["auto", (0.25, 0.5), 0.5])
 def test_values_of_any_kind_are_shown_between_black_and_white(tmp_path, kind, white):
     """By windows, in a fovea, and as an array."""
-    tifffile = pytest.importorskip("tifffile")
     most = KINDS[kind]
     values = (pixels(96, 128)[..., 0] / 255 * most).astype(kind)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", tile=(32, 32))
@@ -58,7 +58,6 @@ def test_pictures_that_pillow_reads_are_scaled_with_their_precision(tmp_path):
 
 @pytest.mark.parametrize("layout", ["contig", "separate"])
 def test_bands_are_chosen_by_their_numbers(tmp_path, layout):
-    tifffile = pytest.importorskip("tifffile")
     values = np.concatenate([pixels(), pixels(seed=1)[..., :2]], -1)
     stored = np.moveaxis(values, -1, 0) if layout == "separate" else values
     tifffile.imwrite(tmp_path / "a.tif", stored, photometric="minisblack", planarconfig=layout, tile=(64, 48))
@@ -73,7 +72,6 @@ def test_bands_are_chosen_by_their_numbers(tmp_path, layout):
 
 
 def test_no_data_are_no_values_of_a_range(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     values = np.full((96, 128), -9999, np.float32)
     values[:, 64:] = pixels(96, 64)[..., 0] / 10
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", extratags=[(42113, "s", 0, "-9999", True)])
@@ -83,7 +81,6 @@ def test_no_data_are_no_values_of_a_range(tmp_path):
 
 
 def test_what_is_no_white_and_no_band_is_refused(tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     tifffile.imwrite(tmp_path / "a.tif", np.full((48, 64), 20.0, np.float32), photometric="minisblack")
     with pytest.raises(DataError, match="give white="):
         open_large(tmp_path / "a.tif")

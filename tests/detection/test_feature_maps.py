@@ -141,7 +141,6 @@ def test_maps_of_an_onnx_model_equal_a_torch_twin(network):
 
 
 def test_torchvision_gives_its_pyramid():
-    pytest.importorskip("torchvision")
     from torchvision.models.detection import retinanet_resnet50_fpn
 
     torch.manual_seed(0)

@@ -198,7 +198,7 @@ def test_score_vectors_of_every_head_equal_a_plain_implementation(make_onnx, kin
     assert found.boxes.dtype == found.scores.dtype == dtype
 
 
-def test_load_detector_sets_name_digest_and_settings(make_onnx):
+def test_settings_and_preprocessing_follow_head_file_and_arguments(make_onnx):
     path = make_onnx(yolox()[0])
     detector = load_detector(path, classes=NAMES, threshold=0.1)
     assert detector.name == "model"
@@ -208,9 +208,6 @@ def test_load_detector_sets_name_digest_and_settings(make_onnx):
     assert settings["head"] == "yolox"
     assert settings["preprocessing"]["channels"] == "bgr"
     assert load_onnx(path, classes=NAMES, preprocessing={"channels": "rgb"}).settings() != detector.settings()
-
-
-def test_preprocessing_is_set_by_head_file_and_arguments(make_onnx):
     path = make_onnx(yolox()[0])
     assert load_onnx(path, classes=NAMES).preprocessing == Preprocessing("bgr", 255.0, corner=True)
     path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "preprocessing": {"std": [2, 2, 2]}}))
@@ -218,13 +215,6 @@ def test_preprocessing_is_set_by_head_file_and_arguments(make_onnx):
     assert detector.classes == NAMES
     assert detector.preprocessing == Preprocessing("bgr", 255.0, std=(2.0, 2.0, 2.0), corner=True, fill=0.0)
     assert load_onnx(path, preprocessing=Preprocessing("rgb")).preprocessing == Preprocessing("rgb")
-
-
-@pytest.mark.parametrize("side", [SIDE, [SIDE, SIDE]])
-def test_input_size_is_read_from_the_settings_file(make_onnx, side):
-    path = make_onnx(yolox()[0], dynamic=True, batch="batch")
-    path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "input_size": side}))
-    assert load_onnx(path).input_size == (SIDE, SIDE)
 
 
 @pytest.mark.parametrize(
@@ -248,6 +238,10 @@ def test_a_model_with_dynamic_size_needs_an_input_size(make_onnx):
     assert detector.fit(torch.zeros(1, 3, 20, 64))[0].shape == (1, 3, 32, 64)
     with pytest.raises(InputError, match="stride"):
         load_onnx(path, classes=NAMES, input_size=SIDE, stride=0)
+    for side in [SIDE, [SIDE, SIDE]]:
+        path = make_onnx(yolox()[0], dynamic=True, batch="batch")
+        path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "input_size": side}))
+        assert load_onnx(path).input_size == (SIDE, SIDE)
 
 
 def test_options_that_contradict_the_model_are_refused(make_onnx):

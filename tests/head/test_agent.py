@@ -66,17 +66,14 @@ def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
         assert torch.equal(detect(action).boxes, seen.boxes)
 
 
-def test_boxes_of_a_flat_scene_lie_around_the_object(agent):
+def test_boxes_of_a_flat_scene_are_in_pixels_of_the_picture(agent):
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
     path = agent.search(Flat(image, degree=4), "green", passes=4, confirm=1.0)
     seen = [path.places(look, 0.5)[0] for look in range(len(path))]
     boxes = torch.cat([places.boxes for places in seen])
     assert ((boxes[:, 0] > 470) & (boxes[:, 2] < 570) & (boxes[:, 1] > 170) & (boxes[:, 3] < 270)).all()
-
-
-def test_the_box_of_a_decision_is_in_pixels_of_the_picture(agent):
-    """It lies around the object, whatever view it was found in, and is the box of a confirmed object."""
+    # It lies around the object, whatever view it was found in, and is the box of a confirmed object.
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
     first = agent.search(Flat(image, degree=4), "green", passes=1, confirm=1.0)

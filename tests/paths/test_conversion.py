@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import supervision
+import tifffile
 import torch
 from PIL import Image
 from pycocotools.coco import COCO
@@ -66,7 +67,6 @@ def test_labels_of_yolo_are_shares_and_crops_the_pixels_of_the_boxes(record):
 
 
 def test_crops_of_a_file_show_the_values_and_bands_that_were_looked_at(record, tmp_path):
-    tifffile = pytest.importorskip("tifffile")
     values = np.random.default_rng(0).integers(0, 4096, (60, 80, 4), dtype=np.uint16)
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
     opened = open_large(tmp_path / "a.tif", white=4095, bands=(4, 3, 2))

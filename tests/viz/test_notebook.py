@@ -37,5 +37,4 @@ def test_figures_are_displayed_once(fresh):
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
     assert fresh(CODE).split() == ["False", "True", "1"]
     # The last value of a cell is its result, which is shown in another way.
-    pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
     assert fresh(LOOP).split() == ["2", "1", "0", "0"]

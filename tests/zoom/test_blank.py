@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 
 from semfov.data.large import open_large
@@ -40,7 +41,6 @@ def test_blank_cells_are_those_whose_pixels_are_all_blank(monkeypatch, colour, l
 
 def test_one_colour_inside_a_picture_is_something_unless_it_is_no_data(tmp_path):
     """A white roof is no border; a hole of a file that tells which pixels are none is blank."""
-    tifffile = pytest.importorskip("tifffile")
     array = pixels(600, 900)
     lattice = Lattice.over((900, 600), CANVAS)
     assert blank_cells(open_large(array), lattice) is None
