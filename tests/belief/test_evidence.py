@@ -10,6 +10,7 @@ from torch import nn
 
 from semfov import MapEvidence, TargetEvidence
 from semfov.belief.evidence import READOUT, blur, logarithm, nearness, network
+from tests.belief import reference
 
 
 class Recorder(nn.Module):
@@ -21,7 +22,7 @@ class Recorder(nn.Module):
 
 
 @pytest.mark.parametrize("columns", [1, 2, 6, 12, 24])
-def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, reference, dtype, device, columns):
+def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, dtype, device, columns):
     said = gathered(dtype=dtype)
     said = type(said)(*(each.to(device) for each in said))
     model, recorder = toy_map().to(device, dtype), Recorder()
@@ -74,7 +75,7 @@ def test_logarithms_of_odds_are_finite():
     assert bool(logarithm(odds).isfinite().all())
 
 
-def test_networks_have_two_hidden_layers(reference):
+def test_networks_have_two_hidden_layers():
     torch.manual_seed(0)
     made = network(5, 7).double()
     assert [layer.in_features for layer in made if isinstance(layer, nn.Linear)] == [5, 7, 7]

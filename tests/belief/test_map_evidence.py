@@ -6,6 +6,7 @@ import torch
 
 from semfov import Grid, InputError, MapEvidence
 from semfov.belief.look_features import class_features
+from tests.belief import reference
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -14,7 +15,7 @@ def draw(*shape, seed=3):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_evidence_of_looks_is_the_network_applied_to_their_features(random_looks, toy_map, reference):
+def test_evidence_of_looks_is_the_network_applied_to_their_features(random_looks, toy_map):
     model, looks, fixations = (
         toy_map().double(),
         random_looks(dtype=torch.float64),
@@ -31,7 +32,7 @@ def test_evidence_of_looks_is_the_network_applied_to_their_features(random_looks
 
 @pytest.mark.parametrize("classes", [2, 4])
 @pytest.mark.parametrize("columns", [1, 6, 24])
-def test_log_odds_of_a_class_depend_on_its_strongest_rival(toy_map, gathered, reference, classes, columns):
+def test_log_odds_of_a_class_depend_on_its_strongest_rival(toy_map, gathered, classes, columns):
     model, said = toy_map().double(), gathered(classes=classes)
     got = model.log_odds(said, columns, classes)
     assert got.shape == (2, classes, 24)
@@ -62,7 +63,7 @@ def test_classes_with_equal_evidence_are_rivals_of_each_other(toy_map, gathered)
 
 @pytest.mark.parametrize("columns", [1, 6, 24])
 @pytest.mark.parametrize("stands_for", [None, [1.0, 1, 9.5, 2]], ids=["all", "some"])
-def test_emptiness_equals_numpy(toy_map, reference, columns, stands_for):
+def test_emptiness_equals_numpy(toy_map, columns, stands_for):
     model, odds, distance = toy_map().double(), 2 * draw(2, 4, 24) - 2, draw(2, 24, seed=4).abs() / 3
     looks = torch.tensor([1.0, 7.0], dtype=torch.float64)
     share = None if stands_for is None else torch.tensor([stands_for] * 2).double()
@@ -85,7 +86,7 @@ def test_emptiness_is_finite_for_certain_cells():
 
 
 @pytest.mark.parametrize("wide", [False, True], ids=["same for all", "of each"])
-def test_gain_equals_a_loop(toy_map, reference, dtype, wide, device):
+def test_gain_equals_a_loop(toy_map, dtype, wide, device):
     model = toy_map().to(device, dtype)
     generator = torch.Generator().manual_seed(0)
     probabilities = torch.rand(3, 24, 5, generator=generator).to(device, dtype)
@@ -109,7 +110,7 @@ def test_gain_equals_a_loop(toy_map, reference, dtype, wide, device):
             np.testing.assert_allclose(reference.array(got[episode, fixation]), expected, atol=1e-5)
 
 
-def test_gain_with_two_classes_equals_a_loop(toy_map, reference):
+def test_gain_with_two_classes_equals_a_loop(toy_map):
     model, probabilities = toy_map(components=3).double(), draw(1, 24, 3).sigmoid()
     closest, distance = torch.full((1, 24), 0.5, dtype=torch.float64), GRID.cell_distance[[3]].double()
     got = model.gain(probabilities, closest, torch.ones(1).double(), distance)[0, 0]

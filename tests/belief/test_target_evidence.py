@@ -9,6 +9,7 @@ import torch
 from semfov import Detections, Grid, InputError, TargetEvidence
 from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target
+from tests.belief import reference
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -32,7 +33,7 @@ def sigmoid(value):
     return 1 / (1 + math.exp(-value))
 
 
-def read_out(reference, model, known, target):
+def read_out(model, known, target):
     """Log odds of all cells, of all cells if no fixated cell holds the target, and of presence."""
     nearest, best, mean, closest, visited = (
         np.array(known[name]) for name in ("nearest", "best", "mean", "closest", "visited")
@@ -94,12 +95,12 @@ def believe(observer, looks, order, target):
 
 @pytest.mark.parametrize("order", [(0,), (2,), (0, 1, 2), (2, 1, 0), (1, 1, 0)], ids=str)
 @pytest.mark.parametrize("target", [1, 3])
-def test_belief_equals_a_loop_over_looks_and_cells(looks, model, reference, order, target):
+def test_belief_equals_a_loop_over_looks_and_cells(looks, model, order, target):
     with torch.no_grad():
         model.prior.copy_(torch.tensor([0.3, -1.0, 2.0, 0.7]))
         belief = believe(Target(model), looks, order, target)
         known = gather_by_loop(looks, model, order, target)
-        cells, following, anywhere = read_out(reference, model, known, target)
+        cells, following, anywhere = read_out(model, known, target)
     for name in ("nearest", "best", "closest", "total", "weight"):
         assert getattr(belief, name)[0].tolist() == pytest.approx(known[name], abs=1e-5), name
     assert float(belief.score) == pytest.approx(known["score"])

@@ -11,6 +11,7 @@ from semfov import FovealObservationModel, Grid, InputError, MapEvidence, Target
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, MapBelief, Target
 from semfov.gaze.acquisition import KLDivergence
+from tests.belief import reference
 
 GRID = Grid(6, 4, (90, 60))
 FIXATED = [0, 9, 20, 5]
@@ -27,7 +28,7 @@ def believe(observer, looks, order, grid=GRID, fixations=FIXATIONS):
     return belief
 
 
-def gather_in_numpy(model, looks, order, reference, stands_for=None):
+def gather_in_numpy(model, looks, order, stands_for=None):
     """The same in numpy: the gathered evidence, and the probabilities computed from it."""
     fixations, cells = FIXATIONS.to(looks.scores), 24
     features = class_features(looks, fixations, GRID, CLASSES)
@@ -62,11 +63,11 @@ def gather_in_numpy(model, looks, order, reference, stands_for=None):
 
 
 @pytest.mark.parametrize("order", [(2,), (0, 1, 2, 3), (1, 1, 0, 1)], ids=str)
-def test_belief_equals_a_reference_in_numpy(random_looks, toy_map, reference, order, dtype, device):
+def test_belief_equals_a_reference_in_numpy(random_looks, toy_map, order, dtype, device):
     looks, model = random_looks(dtype=dtype), toy_map().to(dtype=dtype)
     with torch.no_grad():
         belief = believe(LearnedMap(model).to(device), looks.to(device), order)
-    expected = gather_in_numpy(model.cpu(), looks, order, reference)
+    expected = gather_in_numpy(model.cpu(), looks, order)
     assert set(expected) == {part.name for part in fields(MapBelief)}
     close = 2e-4 if dtype == torch.float32 else 1e-6
     for name, value in expected.items():
@@ -76,14 +77,14 @@ def test_belief_equals_a_reference_in_numpy(random_looks, toy_map, reference, or
         np.testing.assert_allclose(reference.array(tensor[0]), np.asarray(value), atol=close, rtol=close, err_msg=name)
 
 
-def test_classes_that_stand_for_several_count_several_times_for_background(random_looks, toy_map, reference):
+def test_classes_that_stand_for_several_count_several_times_for_background(random_looks, toy_map):
     looks, model, stands_for = random_looks(dtype=torch.float64), toy_map().double(), [1, 3, 9, 2]
     observer = LearnedMap(model)
     with torch.no_grad():
         look = observer.weigh(looks[:1], FIXATIONS[:1].double(), GRID)
         look = replace(look, stands_for=torch.tensor([stands_for]))
         belief = observer.update(observer.start(1, GRID, looks.scores), look)
-    expected = gather_in_numpy(model, looks, (0,), reference, stands_for)
+    expected = gather_in_numpy(model, looks, (0,), stands_for)
     np.testing.assert_allclose(reference.array(belief.probabilities[0]), expected["probabilities"], atol=1e-6)
 
 
