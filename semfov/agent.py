@@ -332,8 +332,8 @@ class ActivePerception(nn.Module):
                 the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
                 0.5 for a belief without thresholds.
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 2 in a photograph,
-                and all that there are passes for in a large picture. 0, and no fitted verification, make none.
+            closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 3 in a photograph,
+                all that there are passes for in a large picture, 2 for a fovea. 0, and no verification, make none.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
             bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
@@ -556,7 +556,7 @@ class ActivePerception(nn.Module):
             confirm: least probability for `found`, as for `search`; None takes that of the model.
             give_up: probability below which a look is not worth a frame; None takes that of the belief alone, as a
                 belief that fades can reach it, or with rate 0 that of `search`.
-            closer: largest number of closer looks, 0 to 100, in ln 2 / rate frames; None takes 2, and 100 for windows.
+            closer: largest number of closer looks, 0 to 100, in ln 2 / rate frames; None takes that of `search`.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.
 

@@ -159,7 +159,6 @@ KNOWN = {
     },
     "docs/decisions/closer_looks.md": {
         f"shows {PART} of the longer side": "code",
-        "there and at none of the places looked at before is 0.05": "in the file of the model",
         "photograph holds and 25 that": "tried on the fit set, without a command",
         "958 searches of 116 photographs": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",

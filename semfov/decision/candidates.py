@@ -43,8 +43,8 @@ class CandidatePlace(NamedTuple):
 class CandidatePlaces(ABC, Generic[LookType]):
     """Base of the places that seem to hold the target of one search, the most evident first, each listed once."""
 
-    by_best = False
-    """Whether the probability that the picture holds the target is that after the look at the best place."""
+    by_worth = False
+    """Whether all closer looks worth a pass are made, and the best place alone tells what the picture holds."""
 
     def __init__(self, forgetting: Forgetting | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting

@@ -38,7 +38,7 @@ class Verifier(Generic[LookType]):
     and 1, or more; after `MOST_CLOSER` closer looks, with one of at least `confirm`. Otherwise it goes on,
     until no look is worth a pass, or `most` closer looks were made. Then it has found the target at the best of the
     examined places, if that is probable enough. If not, the target is absent or the search undecided, by the
-    probability that the picture holds it (`verified`).
+    probability that the picture holds it (`verified`). In a photograph that one look shows no place ends it at once.
 
     The candidates are cells of a grid (`CandidateCells`) or boxes in a large picture
     (`semfov.zoom.closer.CandidateBoxes`). Closer looks may follow a look at once (`look_closely`), or take frames of
@@ -160,7 +160,7 @@ class Verifier(Generic[LookType]):
         """Probability that the picture holds the target: after the closer looks, or that without them."""
         without = self.places.presence
         recent = [each for each in self.verdicts if self._recent(each)]
-        if self.places.by_best:
+        if self.places.by_worth:
             recent = sorted(recent, key=self._chance)[-1:]
         return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
 
@@ -179,6 +179,8 @@ class Verifier(Generic[LookType]):
 
     def _verified(self, chances: Sequence[float], *, over: bool) -> int:
         """The outcome by the probabilities of some places (`verified`)."""
+        if self.places.by_worth and not over:
+            return 0
         outcome = verified(chances, self.presence, self.thresholds.confirm, over=over or self._made >= MOST_CLOSER)
         return outcome if over or OUTCOMES[outcome] == "found" else 0
 

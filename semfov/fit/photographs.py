@@ -27,10 +27,11 @@ from semfov.fit.windows_settings import FitZoomConfig
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.window_looking import right_boxes
-from semfov.zoom.closer import PhotographPlaces, WindowLook, candidates, look_closely
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance, Glances, LiveGlances, overview
+from semfov.zoom.glances import Glance, Glances, overview
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge_with_facts
 from semfov.zoom.photograph import PhotographEvidence
@@ -47,9 +48,10 @@ _AREA = 0.2
 
 
 class _WholeSearch(TargetSearch[WindowLook]):
-    """A search of a photograph after the look at the whole; objects `(M, 4)`, closer looks by their box."""
+    """A search of a photograph after the look at the whole; objects `(M, 4)`."""
 
     after = (1,)
+    most = MOST_IN_PHOTOGRAPH
 
     def __init__(
         self,
@@ -65,7 +67,6 @@ class _WholeSearch(TargetSearch[WindowLook]):
         places = partial(PhotographPlaces, target, glances.lattice)
         super().__init__(number, target, places, self._look_closely, present=len(objects) > 0, spare=spare)
         self.glances, self.whole, self.objects, self.model = glances, whole, objects, model
-        self.closely: dict[tuple[float, ...], Detections] = {}
 
     def __len__(self) -> int:
         return 1
@@ -81,11 +82,8 @@ class _WholeSearch(TargetSearch[WindowLook]):
         return WindowLook(candidates(self.whole), number, float(presence), self.best, 0.0)
 
     def _look_closely(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`, once."""
-        key = tuple(box.tolist())
-        if key not in self.closely:
-            self.closely[key] = candidates(look_closely(self.glances, box))
-        return self.closely[key]
+        """Look closely at a box `(4,)`."""
+        return candidates(look_closely(self.glances, box))
 
     def right(self, box: Tensor) -> bool:
         """Whether the centre of a box `(4,)` lies in an annotated box of the class."""
@@ -116,7 +114,7 @@ def fit_photographs(
     facts, right = [], []
     for number, index in enumerate(track(single[: config.photographs], "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
-        glances = LiveGlances(eye, eye.open(pictures[index].image))
+        glances = StoredGlances(eye, pictures, index, None)
         with torch.inference_mode():
             looks = glances.see([overview(glances.lattice), *usual_slices(glances.lattice)])
         usual = choose_classes(pictures, index, annotation, 2, _AREA, config.seed)

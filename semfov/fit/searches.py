@@ -15,7 +15,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
-from semfov.decision import OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
+from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
 from semfov.decision.candidates import LookAt, LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
@@ -37,6 +37,7 @@ class TargetSearch(ABC, Generic[LookType]):
     """
 
     after: ClassVar[tuple[int, ...]]
+    most: ClassVar[int] = MOST_CLOSER
 
     def __init__(
         self,

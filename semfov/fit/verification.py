@@ -192,7 +192,7 @@ def verify(
     for search in searches:
         model = folds[search.picture % len(folds)]
         places, count, ends = search.candidates(), 0, list[int]()
-        verifier = Verifier(model, places, search.close_up, limits)
+        verifier = Verifier(model, places, search.close_up, limits, search.most)
         for index in range(len(search)):
             count += 1
             room = search.passes - count
@@ -207,7 +207,7 @@ def verify(
             present=search.present,
             spare=search.spare,
             places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
-            ends=tuple(ends),
+            ends=() if places.by_worth else tuple(ends),
             presence=verifier.decision(over=True).probability,
             looks=count,
             unverified=unverified(search, thresholds),

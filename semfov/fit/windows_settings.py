@@ -86,7 +86,7 @@ class FitZoomConfig(FitConfig):
     lost: Share = 0.02
     place: Share = 0.2
     photographs: Whole = 320
-    worth: Share = 0.05
+    worth: Share = 0.2
     evidence: Path | None = None
     refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800

@@ -24,6 +24,9 @@ _CONTEXT = 3.0
 PART, _AROUND = 0.6, 2.0
 """Least side of that window in a photograph, in longer sides of the photograph, and of the box."""
 
+MOST_IN_PHOTOGRAPH = 3
+"""Default for the largest number of closer looks in a photograph: more would go to the objects of a crowd."""
+
 _WHOLE = 0.9
 """Share of a photograph from which on a window shows no more than the look at the whole."""
 
@@ -194,7 +197,7 @@ class PhotographPlaces(CandidateBoxes):
     """
 
     least = 0.002
-    by_best = True
+    by_worth = True
 
     def __init__(self, target: int, lattice: Lattice, forgetting: Forgetting | None = None) -> None:
         super().__init__(target, 0.0, forgetting)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import MOST_CLOSER, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, WindowLook, candidates
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook, candidates
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
@@ -154,7 +154,7 @@ class WindowDecisions:
         at = evidence.thresholds if photograph is None else photograph.verification.thresholds
         model = evidence.verification if photograph is None else photograph.verification
         self.thresholds = (at or _DEFAULTS).changed(give_up=give_up)
-        usual = CLOSER if photograph is None else MOST_CLOSER
+        usual = CLOSER if photograph is None else MOST_IN_PHOTOGRAPH
         most = usual if self._most is None else self._most
         if most and model is not None and model.thresholds is not None:
             worth = self.thresholds.give_up
