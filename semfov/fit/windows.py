@@ -67,7 +67,7 @@ _VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms",
 """Settings that the verification depends on."""
 
 _COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
-"""Settings that the certainty depends on."""
+"""Settings that the certainty and the spread depend on."""
 
 _SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
@@ -255,7 +255,9 @@ class MosaicFit:
     def spread(self, model: GlimpseEvidence) -> list[str]:
         """Fit the spread of expected numbers alone."""
         prepare_worker()
-        return spread_again(model, self._explored()[0], passes=self.config.passes)
+        lines = spread_again(model, self._explored()[0], passes=self.config.passes)
+        self._told(model, "spread", _COUNTING)
+        return lines
 
     def _explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
         """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""

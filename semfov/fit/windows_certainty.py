@@ -37,7 +37,7 @@ _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 _SPREADS = tuple(0.05 * n for n in range(41))
 _CHECKED = (8, 24)
 """Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""
-_COVERED = 0.9
+_COVERED = 0.8
 """Share of the pictures in which the annotated number should be within two errors of the expected one."""
 
 
@@ -58,6 +58,11 @@ class _Exploration(NamedTuple):
     def looks(self) -> int:
         """Number of looks."""
         return len(self.promised)
+
+    @property
+    def shows(self) -> bool:
+        """Whether all looks show at least half of the annotated objects: elsewhere most are too small for any look."""
+        return 2 * int((self.objects[self.looks][1] > 0).sum()) >= self.held
 
     def sums(self, certainty: Certainty, number: int) -> tuple[float, float]:
         """The sums of the probabilities of the objects after the first look, and after a number of them."""
@@ -210,7 +215,7 @@ def _left_out(explored: Mapping[str, Sequence[_Exploration]], passes: int) -> di
             claims = [
                 (*claim, each.held)
                 for each in some
-                if each.target is not None
+                if each.target is not None and each.shows
                 for claim in [each.number(certainty, min(after, each.looks))]
                 if claim is not None
             ]
@@ -220,7 +225,7 @@ def _left_out(explored: Mapping[str, Sequence[_Exploration]], passes: int) -> di
 
 
 def _fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> float:
-    """The least spread with which the annotated numbers are covered, in the mean over kinds of pictures and looks."""
+    """The least spread that covers enough of the pictures, in the mean over their kinds and numbers of looks."""
     for spread in _SPREADS:
         if sum(each.covered(spread) for each in numbers.values()) >= _COVERED * len(numbers):
             return spread
@@ -258,8 +263,8 @@ def _spread(model: GlimpseEvidence, explored: Mapping[str, Sequence[_Exploration
     ]
     return [
         f"Spread of the expected number of objects of the most frequent class of a picture: "
-        f"{model.certainty.spread:.2f}. Pictures in which the annotated number is within two errors, each kind with a "
-        "certainty that was fitted on the others:",
+        f"{model.certainty.spread:.2f}. Pictures, of those in which the looks show at least half of these objects, in "
+        "which the annotated number is within two errors, each kind with a certainty that was fitted on the others:",
         "",
         *table(rows),
         "",
