@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.calibration.sums import AddedSums
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from eval.decide.run import detected_on_landing, landing
@@ -23,7 +24,6 @@ from semfov.episode import Step, Stopwatch, rollout
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Task
-from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.presets import label
@@ -86,7 +86,7 @@ class BeliefCalibrationRun(ComparedLooking):
 
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, and how calibration is measured."""
-        return {**super().depends_on(), "belief calibration": [COUNTS, BANDS, BinarySums.EDGES.tolist()]}
+        return {**super().depends_on(), "belief calibration": [COUNTS, BANDS, AddedSums.EDGES.tolist()]}
 
     @property
     def guide(self) -> str:
@@ -139,7 +139,7 @@ def _judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
     group = band.masked_fill(step.visited[0], 0)
     probability = belief.probability(target)[0]
     return {
-        name: BinarySums.of(probability[group == number], goal[group == number]).record()
+        name: AddedSums.of(probability[group == number], goal[group == number]).record()
         for number, name in enumerate(CELL_GROUPS)
         if (group == number).any()
     }

@@ -12,17 +12,17 @@ from torch import Tensor
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, MAP, BeliefCalibrationRun
 from eval.calibration.cell_figure import plot_cell_reliability
+from eval.calibration.sums import AddedSums
 from eval.comparison.records import gather
 from eval.comparison.summary import MANIFEST, manifest, sensing, write_texts
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
 from semfov.errors import DataError
 from semfov.io.tables import csv_text
-from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
 
-_Sums = dict[tuple[str, int, str], BinarySums]
+_Sums = dict[tuple[str, int, str], AddedSums]
 """Sums over predictions by belief, number of looks, and group of cells."""
 
 _HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
@@ -48,19 +48,19 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
 
 def _add_up(records: Iterable[ResultRecord]) -> _Sums:
     """Add up the sums of all searches."""
-    sums: _Sums = defaultdict(BinarySums.nothing)
+    sums: _Sums = defaultdict(AddedSums.nothing)
     for record in records:
         for belief, measures in record["beliefs"].items():
             for looks, groups in measures["looks"].items():
                 for group, values in groups.items():
-                    sums[belief, int(looks), group] += BinarySums.from_record(values)
+                    sums[belief, int(looks), group] += AddedSums.from_record(values)
     return dict(sums)
 
 
-def _pooled(sums: _Sums, belief: str, looks: int) -> BinarySums:
+def _pooled(sums: _Sums, belief: str, looks: int) -> AddedSums:
     """Sums over all cells, whatever their group."""
     return sum(
-        (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), BinarySums.nothing()
+        (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), AddedSums.nothing()
     )
 
 
@@ -86,7 +86,7 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCa
             "classes are present, so its probabilities are expected to be too low."
         )
     every = _pooled(sums, beliefs[0], last)
-    alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
+    alone = AddedSums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
     return "\n".join(
         [
             f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} of them for a class that "
@@ -115,7 +115,7 @@ def _judged_after(sums: _Sums) -> list[int]:
     return sorted({looks for _, looks, _ in sums})
 
 
-def _measures_row(sums: BinarySums) -> list[str]:
+def _measures_row(sums: AddedSums) -> list[str]:
     """The measures as cells of a table row."""
     return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
 
@@ -141,15 +141,15 @@ def _beliefs_csv(sums: _Sums) -> str:
 
 
 def _beliefs_json(sums: _Sums) -> str:
-    """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
+    """All sums as JSON; the sums of several runs may be added up (`AddedSums.from_record`)."""
     entries = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
         for belief, looks, group, each in _sums_by_name(sums)
     ]
-    return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
+    return json.dumps({"edges": AddedSums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
 
 
-def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, AddedSums]]:
     """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
         yield belief, looks, "all", _pooled(sums, belief, looks)

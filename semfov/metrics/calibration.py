@@ -1,8 +1,7 @@
 """How well predicted probabilities agree with outcomes: scoring rules and calibration errors."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -118,7 +117,7 @@ _RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class BinarySums:
-    r"""Sums over binary predictions, from which their measures follow; the sums of parts of the data add up.
+    r"""Sums over binary predictions, from which their measures follow.
 
     For probabilities :math:`p_i` and outcomes :math:`y_i \in \{0, 1\}` the mean negative log likelihood and the mean
     Brier score (Brier, 1950; here of one of the two classes, from 0 to 1) are
@@ -150,33 +149,14 @@ class BinarySums:
         square = (p - came.double()).square()
         return cls(reliability(p, came, cls.EDGES), float(cost.sum()), float(square.sum()))
 
-    @classmethod
-    def nothing(cls) -> Self:
-        """The sums over no predictions, to which others are added."""
-        return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
-
-    def __add__(self, other: Self) -> Self:
-        """Sums over the predictions of both."""
-        return type(self)(self.bins + other.bins, self.surprisal + other.surprisal, self.square + other.square)
-
     @property
     def count(self) -> int:
         """Number of predictions."""
         return int(self.bins[0].sum())
 
     @property
-    def probability(self) -> float:
-        """Mean predicted probability; this and all other means are NaN where there are no predictions."""
-        return self._mean(float(self.bins[1].sum()))
-
-    @property
-    def rate(self) -> float:
-        """Fraction of the predictions that came true."""
-        return self._mean(float(self.bins[2].sum()))
-
-    @property
     def nll(self) -> float:
-        """Mean negative log likelihood, in nats."""
+        """Mean negative log likelihood, in nats; this and all other means are NaN where there are no predictions."""
         return self._mean(self.surprisal)
 
     @property
@@ -193,17 +173,3 @@ class BinarySums:
 
     def _mean(self, total: float) -> float:
         return total / self.count if self.count else float("nan")
-
-    def record(self) -> dict[str, Any]:
-        """The sums as JSON values, without empty bins; `from_record` reads them."""
-        filled = self.bins[0].nonzero()[:, 0].tolist()
-        bins = {str(number): self.bins[:, number].tolist() for number in filled}
-        return {"bins": bins, "surprisal": self.surprisal, "square": self.square}
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Read the sums from JSON values."""
-        sums = cls.nothing()
-        for number, column in record["bins"].items():
-            sums.bins[:, int(number)] = torch.tensor(column, dtype=torch.float64)
-        return cls(sums.bins, record["surprisal"], record["square"])

@@ -81,7 +81,9 @@ class Reliability(Metric):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.add_state("bins", default=BinarySums.nothing().bins, dist_reduce_fx="sum")
+        self.add_state(
+            "bins", default=torch.zeros(3, len(BinarySums.EDGES) + 1, dtype=torch.float64), dist_reduce_fx="sum"
+        )
         self.add_state("sums", default=torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, probability: Tensor, outcome: Tensor) -> None:

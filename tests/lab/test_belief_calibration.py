@@ -8,13 +8,13 @@ import torch
 
 from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrationRun
 from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
+from eval.calibration.sums import AddedSums
 from eval.search.run import SearchConfig
 from semfov import FovealObservationModel, InputError, MapEvidence, TargetEvidence, rollout
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.episode import StoredLooks
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.metrics.calibration import BinarySums
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
@@ -110,7 +110,7 @@ def test_sums_match_beliefs_updated_step_by_step(run):
                     assert set(got) == {name for name, cells in groups.items() if cells}
                     for group, cells in groups.items():
                         if cells:
-                            sums = BinarySums.from_record(got[group])
+                            sums = AddedSums.from_record(got[group])
                             assert sums.count == len(cells)
                             assert sums.nll * len(cells) == pytest.approx(
                                 sum(-math.log(q if y else 1 - q) for q, y in cells), rel=1e-4
@@ -154,7 +154,7 @@ def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_pat
 
 def cells(*pairs):
     """A record of cells, given as pairs of a probability and whether the cell holds the target."""
-    return BinarySums.of(torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs])).record()
+    return AddedSums.of(torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs])).record()
 
 
 def test_searches_add_up_by_belief_looks_and_group():

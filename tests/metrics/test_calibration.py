@@ -9,9 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eval.calibration.sums import AddedSums
 from eval.chance import errors_by_chance
 from semfov.errors import InputError
-from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
+from semfov.metrics.calibration import calibration, calibration_error, reliability
 
 
 def ece_by_loop(confidence, correct, bins):
@@ -46,7 +47,7 @@ def test_sums_equal_loops(dtype, device):
     generator = np.random.default_rng(0)
     p = generator.beta(0.2, 2, 3000).astype(np.float32)
     y = generator.random(3000) < p**1.3
-    sums = BinarySums.of(torch.tensor(p, dtype=dtype, device=device), torch.tensor(y, device=device))
+    sums = AddedSums.of(torch.tensor(p, dtype=dtype, device=device), torch.tensor(y, device=device))
     q = p.astype(np.float64)
     nll = [-math.log(max(b if so else 1 - b, np.finfo(np.float32).tiny)) for b, so in zip(q, y, strict=True)]
     assert sums.count == 3000
@@ -64,7 +65,7 @@ def test_sums_equal_loops(dtype, device):
 
 
 def test_the_edges_include_those_of_fifteen_equal_bins():
-    edges = BinarySums.EDGES.tolist()
+    edges = AddedSums.EDGES.tolist()
     assert edges == sorted(edges)
     assert edges[6:] == [b / 15 for b in range(1, 15)]
     assert max(edges[:6]) < 1 / 15
@@ -75,7 +76,7 @@ predictions = st.lists(st.tuples(st.floats(0, 1, width=32), st.booleans()), max_
 
 def sums_of(pairs):
     p, y = torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs], dtype=torch.bool)
-    return BinarySums.of(p, y)
+    return AddedSums.of(p, y)
 
 
 def assert_equal_sums(a, b):
@@ -89,27 +90,27 @@ def test_sums_of_parts_add_up(a, b, c):
     whole = sums_of(a + b + c)
     assert_equal_sums((sums_of(a) + sums_of(b)) + sums_of(c), whole)
     assert_equal_sums(sums_of(c) + (sums_of(b) + sums_of(a)), whole)
-    assert_equal_sums(whole + BinarySums.nothing(), whole)
+    assert_equal_sums(whole + AddedSums.nothing(), whole)
 
 
 @given(predictions)
 def test_sums_are_exact_after_json(pairs):
     sums = sums_of(pairs)
-    back = BinarySums.from_record(json.loads(json.dumps(sums.record())))
+    back = AddedSums.from_record(json.loads(json.dumps(sums.record())))
     assert torch.equal(back.bins, sums.bins)
     assert (back.surprisal, back.square) == (sums.surprisal, sums.square)
 
 
 def test_sums_of_few_and_of_certain_but_wrong_predictions():
-    nothing = BinarySums.nothing()
+    nothing = AddedSums.nothing()
     assert nothing.count == 0
     for name in ("nll", "brier", "ece", "probability", "rate"):
         assert math.isnan(getattr(nothing, name))
-    sums = BinarySums.of(torch.tensor([1.0, 0.0]), torch.tensor([False, True]))
+    sums = AddedSums.of(torch.tensor([1.0, 0.0]), torch.tensor([False, True]))
     assert math.isfinite(sums.nll)
     assert (sums.brier, sums.ece) == (1, 1)
     with pytest.raises(InputError, match="outcome"):
-        BinarySums.of(torch.rand(3), torch.ones(2).bool())
+        AddedSums.of(torch.rand(3), torch.ones(2).bool())
 
 
 def test_settings_at_their_limits():
