@@ -6,7 +6,6 @@ import torch
 
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
-from semfov.runs.candidates import Candidate
 from semfov.runs.search_protocol import Trial, looks_of, run_episodes
 from semfov.strategy import Strategy
 
@@ -30,11 +29,11 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     detections = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
     todo = [episode(n) for n in range(episodes)]
     noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
-    candidate = Candidate(Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive()))
+    strategy = Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive())
 
     def run(count: int, batch: int) -> object:
         looks = looks_of(todo[:count], detections, grid)
-        return run_episodes(todo[:count], candidate, looks, noise[:count], shifts=SHIFTS, batch=batch)
+        return run_episodes(todo[:count], strategy, looks, noise[:count], shifts=SHIFTS, batch=batch)
 
     return detections, run
 

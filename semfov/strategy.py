@@ -3,12 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
+from semfov.belief.grid import Grid
 from semfov.belief.observers import AnyOf, Observer
 from semfov.belief.observers.any_of import TargetLike
 from semfov.data.classes import class_index
 from semfov.errors import check
+from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.policies import NonPredictive, Policy, Random
 
 
@@ -33,6 +35,10 @@ class Strategy(nn.Module):
             check(isinstance(part, kind), argument, f"an instance of a subclass of {kind.__name__}", got)
         self.observer = observer
         self.policy = policy
+
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
+        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        return self.policy(target, grid)
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
         """Prepare the search for a target."""

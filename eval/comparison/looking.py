@@ -5,14 +5,35 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from eval.comparison.saliency import SaliencyStore, saliency_table
+from semfov.belief.grid import Grid
 from semfov.errors import lookup
-from semfov.runs.candidates import Candidate
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
+from semfov.gaze.policies import SaliencyMaximum
 from semfov.runs.config import RunConfig, SaliencyModel
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import store_folder
+from semfov.strategy import Strategy
+
+
+class Candidate(Strategy):
+    """A policy under comparison, in one scene; saliency `(X·Y, X·Y)` from every cell, or `(1, X·Y)` from anywhere."""
+
+    def __init__(self, strategy: Strategy, saliency: Tensor | None = None, weight: float = 1.0) -> None:
+        super().__init__(strategy.observer, strategy.policy)
+        self.strategy, self.saliency, self.weight = strategy, saliency, weight
+
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
+        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        if self.saliency is None:
+            return super().acquisition(target, grid, cell)
+        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
+        if isinstance(self.policy, SaliencyMaximum):
+            return Static(salient)
+        return SaliencyPrior(self.policy(target, grid), salient, weight=self.weight)
 
 
 class ComparedLooking(PolicyLooking):

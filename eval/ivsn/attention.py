@@ -1,18 +1,18 @@
 """IVSN over foveal looks: attention to what resembles the target, and the search that follows it."""
 
-from dataclasses import dataclass
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from eval.comparison.looking import Candidate
 from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import acuity
 from semfov.gaze.policies import Means, Policy, required_target
-from semfov.runs.candidates import Candidate
+from semfov.strategy import Strategy
 
 
 class TemplateAttention(AcquisitionFunction):
@@ -88,12 +88,12 @@ class TemplateSearch(Policy):
         raise InputError("policy 'ivsn': expected the attention of a scene, which `python -m eval.ivsn` computes")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Attending(Candidate):
     """IVSN in one scene, with the attention `(X·Y, K, X·Y)` of `TemplateAttention`."""
 
-    attention: Tensor
-    fovea: float
+    def __init__(self, strategy: Strategy, attention: Tensor, fovea: float) -> None:
+        super().__init__(strategy)
+        self.attention, self.fovea = attention, fovea
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The attention to the target, accumulated over the fixated cells."""

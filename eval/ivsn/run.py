@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.comparison.looking import Candidate
 from eval.ivsn.attention import Attending, TemplateSearch
 from eval.ivsn.templates import ClassTemplates, at_points
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import check
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import one_thread
 

@@ -36,7 +36,6 @@ from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
@@ -357,9 +356,7 @@ def _search_curves(
         noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
         for name, way in ways.items():
             with torch.inference_mode():
-                outcomes = run_episodes(
-                    episodes, Candidate(way), looks, noise, shifts=protocol.shifts, batch=protocol.batch
-                )
+                outcomes = run_episodes(episodes, way, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
             shifts = np.array([found_at for _, found_at in outcomes])
             curves[name].append(cumulative_performance(shifts, protocol.shifts))
     return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}

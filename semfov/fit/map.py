@@ -30,7 +30,6 @@ from semfov.gaze.policies import Closer, Random
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of, success_rate
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
@@ -321,7 +320,7 @@ def _explore_curves(
             with torch.inference_mode():
                 progress = run_explorations(
                     episodes,
-                    Candidate(way),
+                    way,
                     looks,
                     answers,
                     noise,

@@ -10,9 +10,9 @@ from semfov.data.scene import Scenes
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.exploration import count_right
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
+from semfov.strategy import Strategy
 
 
 class Exploration(NamedTuple):
@@ -42,7 +42,7 @@ def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: Pr
 
 def run_explorations(
     episodes: Sequence[Exploration],
-    candidate: Candidate,
+    strategy: Strategy,
     looks: StoredLooks,
     answers: Tensor,
     noise: Tensor,
@@ -61,8 +61,8 @@ def run_explorations(
         visits, counts = [], []
         for step in rollout(
             looks,
-            candidate.observer,
-            lambda _, cell: candidate.acquisition(None, looks.grid, cell),
+            strategy.observer,
+            lambda _, cell: strategy.acquisition(None, looks.grid, cell),
             start,
             choice,
             most=shifts + 1,

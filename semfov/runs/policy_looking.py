@@ -1,21 +1,27 @@
-"""Looks at scenes from every cell of a grid, and policies that choose among the cells."""
+"""Looks at scenes from every cell of a grid, and policies that choose among the cells, made from their settings."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from semfov.belief.observers import Observer
-from semfov.errors import check
-from semfov.gaze.policies import POLICIES, Task
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
+from semfov.errors import InputError, check
+from semfov.eye import Eye
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
 from semfov.io.code import class_digest
-from semfov.runs.candidates import belief_settings, load_models, make_strategy
-from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.looking import Looking
-from semfov.runs.presets import label, resolve
+from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
 from semfov.runs.scene_run import digest_of
+from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
+
+_T = TypeVar("_T")
 
 
 class PolicyLooking(Looking):
@@ -30,14 +36,14 @@ class PolicyLooking(Looking):
             check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
         super().__init__(config)
-        self.models = load_models(config, self.task, self.eye)
+        self.models = _load_models(config, self.task, self.eye)
         components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
         self.strategies: dict[str, Strategy] = {}
         observers: dict[PolicyConfig, Observer] = {}
         for name, policy in self.policies.items():
-            made = make_strategy(policy, self.task, config.belief, components, self.models, fovea)
+            made = _make_strategy(policy, self.task, config.belief, components, self.models, fovea)
             # Policies with the same belief share an observer, which then weighs each look only once.
-            observer = observers.setdefault(belief_settings(policy, self.task), made.observer)
+            observer = observers.setdefault(_belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
 
     @cached_property
@@ -63,3 +69,86 @@ class PolicyLooking(Looking):
     def stored(self, index: int) -> bytes | None:
         """Nothing: the records are all that a comparison needs."""
         return None
+
+
+class _Models(NamedTuple):
+    """Fitted models that the policies of a run need; None for a model that no policy needs."""
+
+    observation: FovealObservationModel | None = None
+    evidence: TargetEvidence | None = None
+    map: MapEvidence | None = None
+
+
+def _load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
+    """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
+    check(len(config.policies) > 0, "policies", "at least one policy", "none")
+    policies = [resolve(choice, task) for choice in config.policies]
+    belief = config.belief
+    return _Models(
+        make_observation(belief.model, eye) if _needs_observation(policies, belief) else None,
+        make_learned(TargetEvidence, belief.target_model, eye)
+        if any(_by_evidence(policy, task) for policy in policies)
+        else None,
+        make_learned(MapEvidence, belief.map_model, eye)
+        if any(policy.scores == "learned" and not _by_evidence(policy, task) for policy in policies)
+        else None,
+    )
+
+
+def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
+    """Whether a policy uses the learned target evidence."""
+    return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
+
+
+def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
+    """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
+    if _by_evidence(policy, task):
+        return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
+    return replace(policy, policy=Random.name, saliency=None, samples=None)
+
+
+def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
+    """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
+    return any(
+        policy.scores == "calibrated"
+        or _of(policy.misses, belief.misses)
+        or (policy.policy in POLICIES and POLICIES[policy.policy].needs_model)
+        for policy in policies
+    )
+
+
+def _make_strategy(
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: _Models, fovea: float
+) -> Strategy:
+    """Build the observer and the policy that settings describe."""
+    if policy.policy == TARGET_EVIDENCE:
+        return Strategy(Target(_required(models.evidence, "policy", "learned target evidence")), NonPredictive())
+    calibrated = policy.scores == "calibrated"
+    means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
+    chosen = named_policy(policy.policy, task, means)
+    if _by_evidence(policy, task):
+        return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
+    if policy.scores == "learned":
+        return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
+    misses = _of(policy.misses, belief.misses)
+    observer = Semantic(
+        components,
+        _required(models.observation, "scores", "an observation model") if calibrated else None,
+        prior=belief.prior,
+        fusion=belief.fusion,
+        footprint=_of(policy.footprint, belief.footprint),
+        tempering=_of(policy.tempering, belief.tempering),
+        memory=_of(policy.memory, belief.memory),
+        misses=_required(models.observation, "misses", "an observation model") if misses else None,
+    )
+    return Strategy(observer, chosen)
+
+
+def _of(own: _T | None, common: _T) -> _T:
+    return common if own is None else own
+
+
+def _required(model: _T | None, argument: str, expected: str) -> _T:
+    if model is None:
+        raise InputError(f"{argument}: expected {expected}, got none")
+    return model

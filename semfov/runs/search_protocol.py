@@ -13,7 +13,6 @@ from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
@@ -149,7 +148,7 @@ def looks_of(episodes: Sequence[Trial], detections: Detections, grid: Grid) -> S
 
 def run_episodes(
     episodes: Sequence[Trial],
-    candidate: Candidate,
+    strategy: Strategy,
     looks: StoredLooks,
     noise: Tensor,
     *,
@@ -163,12 +162,12 @@ def run_episodes(
     outcomes: list[EpisodeOutcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
-        outcomes += _run_batch(episodes[part], candidate, looks.of(part), noise[part], shifts)
+        outcomes += _run_batch(episodes[part], strategy, looks.of(part), noise[part], shifts)
     return outcomes
 
 
 def _run_batch(
-    episodes: Sequence[Trial], candidate: Candidate, looks: StoredLooks, noise: Tensor, shifts: int
+    episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, shifts: int
 ) -> list[EpisodeOutcome]:
     grid = looks.grid
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
@@ -183,13 +182,13 @@ def _run_batch(
     seeking = (found_at < 0).nonzero()[:, 0]
 
     def acquisition(order: Tensor, cell: Tensor) -> AcquisitionFunction:
-        return candidate.acquisition(cues[seeking[order]], grid, cell)
+        return strategy.acquisition(cues[seeking[order]], grid, cell)
 
     def lands(step: Step) -> Tensor:
         return goals[seeking[step.episodes], step.next_cell]
 
-    if candidate.strategy.policy.by_belief:
-        observer, source = candidate.observer, looks.of(seeking)
+    if strategy.policy.by_belief:
+        observer, source = strategy.observer, looks.of(seeking)
     else:
         # No look changes what the policy does, and most of the time would go into the belief.
         observer, source = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)

@@ -7,8 +7,8 @@ from semfov import Detections, DirichletBelief, FovealObservationModel, Grid, In
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.gaze.acquisition import CloserLook, ExpectedAccuracy, ExpectedGain
 from semfov.gaze.policies import Closer, Gain, Random, SaliencyMaximum
-from semfov.runs.candidates import _Models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.policy_looking import _make_strategy, _Models
 from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
 from tests.small import values_of
@@ -135,7 +135,7 @@ def test_settings_of_another_belief_are_refused(policy, setting):
 
 def test_strategies_of_learned_maps(model):
     def strategy(name, **models):
-        return make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, _Models(**models), 0.15)
+        return _make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, _Models(**models), 0.15)
 
     for name, kind in zip(LEARNED, (Random, Closer, Gain, SaliencyMaximum, SaliencyMaximum), strict=True):
         made = strategy(name, map=model)

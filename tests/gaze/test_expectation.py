@@ -11,8 +11,8 @@ from scipy.stats import beta as beta_distribution
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition, dirichlet, fusion, policies
 from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
 from semfov.gaze.policies import POLICIES, Means, named_policy
-from semfov.runs.candidates import _Models, make_strategy
 from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.policy_looking import _make_strategy, _Models
 from semfov.runs.presets import label, resolve
 from tests.small import draw as rand
 
@@ -171,7 +171,7 @@ def test_policies_take_the_expectation_by_their_settings():
     assert label(settings, "exploration") == "kl-calibrated, samples 8"
     for scores in ("raw", "calibrated"):
         chosen = replace(settings, scores=scores)
-        strategy = make_strategy(chosen, "exploration", BeliefConfig(), 4, _Models(model), 0.1)
+        strategy = _make_strategy(chosen, "exploration", BeliefConfig(), 4, _Models(model), 0.1)
         expected = sampled_likelihoods(model, 8, calibrated=scores == "calibrated")
         assert torch.equal(strategy.policy.likelihoods, expected)
     with pytest.raises(InputError, match="samples: expected null, except for predictive; got 8 for 'neighbourhood'"):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from eval.comparison.looking import Candidate
 from semfov import Detections, FovealObservationModel, Grid, policies
 from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.exploration import answers_of
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise, run_explorations
 from semfov.strategy import Strategy

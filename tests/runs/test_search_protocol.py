@@ -11,7 +11,6 @@ from semfov import Detections, Grid, fusion, policies
 from semfov.belief.observers import SemanticLook
 from semfov.data import Annotation
 from semfov.metrics.search import cumulative_performance
-from semfov.runs.candidates import Candidate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.search_protocol import episodes_of, looks_of, run_episodes, tie_noise
 from semfov.strategy import Strategy
@@ -62,7 +61,7 @@ NOTHING = Detections.empty(25, 3)
 def run(scenes, look, policy, protocol, batch=1024, index=0):
     episodes = episodes_of(scenes, index, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
-    candidate = Candidate(Strategy(FixedLook(look), policy))
+    candidate = Strategy(FixedLook(look), policy)
     outcomes = run_episodes(
         episodes, candidate, looks_of(episodes, NOTHING, GRID), noise, shifts=protocol.shifts, batch=batch
     )
@@ -121,7 +120,7 @@ class Unread(FixedLook):
 def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look):
     protocol = ProtocolConfig(starts=4, shifts=9)
     episodes, noise, expected = run(scenes, look, policies.Random(), protocol)
-    looks, candidate = looks_of(episodes, NOTHING, GRID), Candidate(Strategy(Unread(look), policies.Random()))
+    looks, candidate = looks_of(episodes, NOTHING, GRID), Strategy(Unread(look), policies.Random())
     assert run_episodes(episodes, candidate, looks, noise, shifts=9, batch=8) == expected
     for episode, random, outcome in zip(episodes, noise, expected, strict=True):
         cells = [episode.start]
@@ -129,7 +128,7 @@ def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look
             random[len(cells) - 1][cells] = -1
             cells.append(int(random[len(cells) - 1].argmax()))
         assert outcome[0] == cells
-    seeing = Candidate(Strategy(Unread(look), policies.NonPredictive()))
+    seeing = Strategy(Unread(look), policies.NonPredictive())
     with pytest.raises(AssertionError, match="updated"):
         run_episodes(episodes, seeing, looks, noise, shifts=9, batch=8)
 
@@ -188,7 +187,7 @@ def test_a_search_ends_when_no_cell_is_left(scenes, look):
     episodes = episodes_of(scenes, 0, 5, 5, protocol)[:1]
     hidden = [episodes[0]._replace(goal=())]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
-    candidate = Candidate(Strategy(FixedLook(look), policies.Random()))
+    candidate = Strategy(FixedLook(look), policies.Random())
     cells, found_at = run_episodes(hidden, candidate, looks_of(hidden, NOTHING, GRID), noise, shifts=40, batch=8)[0]
     assert found_at == -1
     assert sorted(cells) == list(range(25))

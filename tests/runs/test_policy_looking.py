@@ -6,14 +6,21 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from eval.comparison.looking import Candidate
 from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence, observers, policies
 from semfov.belief import MapEvidence
 from semfov.gaze.acquisition import ExpectedAccuracy, PredictedTargetPosterior, SaliencyPrior, Static, TargetPosterior
-from semfov.runs import candidates
-from semfov.runs.candidates import Candidate, _Models, _needs_observation, belief_settings, load_models, make_strategy
+from semfov.runs import policy_looking
 from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.policy_looking import (
+    _belief_settings,
+    _load_models,
+    _make_strategy,
+    _Models,
+    _needs_observation,
+)
 from semfov.runs.presets import _valid_policies, presets, resolve
 from semfov.strategy import Strategy
 
@@ -28,7 +35,7 @@ def model():
 
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
     """The strategy of a policy for two classes, made with the given models."""
-    return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, _Models(**models), fovea)
+    return _make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, _Models(**models), fovea)
 
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
@@ -37,11 +44,11 @@ def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, m
     seen = {}
     for name in presets(task):
         plain = resolve(name, task)
-        own = candidates._by_evidence(plain, task) or plain.scores == "learned"
+        own = policy_looking._by_evidence(plain, task) or plain.scores == "learned"
         for policy in (plain,) if own else (plain, replace(plain, tempering=0.5), replace(plain, misses=True)):
             observer = strategy(policy, task, **models).observer
             look = type(observer), repr(observer), [id(part) for part in observer.children()]
-            assert seen.setdefault(belief_settings(policy, task), look) == look
+            assert seen.setdefault(_belief_settings(policy, task), look) == look
     assert 3 < len(seen) < 3 * len(presets(task))
 
 
@@ -89,25 +96,25 @@ def loaded(monkeypatch):
         loaded.append((kind, name))
         return kind
 
-    monkeypatch.setattr(candidates, "make_observation", lambda name, eye: make("observation", name))
-    monkeypatch.setattr(candidates, "make_learned", lambda kind, name, eye: make(kind, name))
+    monkeypatch.setattr(policy_looking, "make_observation", lambda name, eye: make("observation", name))
+    monkeypatch.setattr(policy_looking, "make_learned", lambda kind, name, eye: make(kind, name))
     return loaded
 
 
 def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     eye = SimpleNamespace()
-    assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == _Models()
-    assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == _Models()
+    assert _load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == _Models()
+    assert _load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == _Models()
     assert loaded == []
     learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
-    assert load_models(learned, "exploration", eye) == _Models(map=MapEvidence)
+    assert _load_models(learned, "exploration", eye) == _Models(map=MapEvidence)
     assert loaded == [(MapEvidence, "everything")]
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2")
     every = SearchConfig(
         policies=("random", guided, "predictive-raw"), belief=BeliefConfig(model="mine", target_model="sought")
     )
-    models = load_models(every, "search", eye)
+    models = _load_models(every, "search", eye)
     assert models == _Models("observation", TargetEvidence)
     assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
 
@@ -125,7 +132,7 @@ def test_presets_need_their_observation_model_and_runs_a_policy(model):
                 strategy(preset, task, **others)
     for config in [SearchConfig, ExploreConfig]:
         with pytest.raises(InputError, match="policies: expected at least one"):
-            load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
+            _load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
 
 
 def test_strategies_follow_their_settings(model):
