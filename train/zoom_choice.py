@@ -5,7 +5,6 @@ from itertools import chain, islice
 
 import torch
 
-from eval.zoom.slices import look_for_slice
 from semfov.data.scene import Annotation
 from semfov.fit.windows import MosaicFit
 from semfov.runs.progress import track
@@ -13,6 +12,7 @@ from semfov.runs.window_looking import found_in
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, around
+from train.zoom_slices import look_for_slice
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
 _PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)

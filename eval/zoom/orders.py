@@ -10,7 +10,24 @@ from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
-from semfov.zoom.slices import raw
+from semfov.zoom.slices import raw, slices
+
+
+def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
+    r"""Square slices whose number and side follow from the size of the picture, as in ASAHI.
+
+    A picture whose longer side exceeds :math:`512 (4 - 3 l) + 1` pixels is covered by 4 × 3 slices with an overlap l,
+    another one by 3 × 2; n × m slices need the side
+
+    .. math:: p = \max\left(\frac{W}{n - (n - 1) l}, \frac{H}{m - (m - 1) l}\right) + 1
+
+    Zhang, H. et al. (2023), Adaptive slicing-aided hyper inference for small object detection in high-resolution remote
+    sensing images, Remote Sensing 15(5):1249.
+    """
+    many = max(lattice.size) > 512 * (4 - 3 * overlap) + 1
+    counts = (4, 3) if many else (3, 2)
+    side = int(max(length / (n - (n - 1) * overlap) for length, n in zip(lattice.size, counts, strict=True))) + 1
+    return slices(lattice, side, side - int(side * overlap))
 
 
 def in_order(windows: Sequence[Window]) -> Order:

@@ -16,8 +16,7 @@ from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
 from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
-from eval.zoom.orders import in_order, oracle, quad_tree, shuffled, sparse
-from eval.zoom.slices import adaptive_slices, look_for_slice
+from eval.zoom.orders import adaptive_slices, in_order, oracle, quad_tree, shuffled, sparse
 from semfov.agents.windows import WindowEpisode
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
@@ -44,6 +43,7 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.slices import ranked, slices, usual_slices
+from train.zoom_slices import look_for_slice
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
 

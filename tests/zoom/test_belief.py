@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from eval.zoom.slices import odds_of
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief, _WindowSums
@@ -14,6 +13,7 @@ from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
 from tests.zoom import plain
+from train.zoom_slices import odds_of
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval.zoom.slices import adaptive_slices
+from eval.zoom.orders import adaptive_slices
 from semfov import InputError, WindowEye, ZoomAgent
 from semfov.agents.episode import EpisodeLimits
 from semfov.zoom.glances import LiveGlances
