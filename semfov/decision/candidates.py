@@ -46,27 +46,21 @@ class CandidatePlaces(ABC, Generic[LookType]):
     by_worth = False
     """Whether all closer looks worth a pass are made, and the best place alone tells what the picture holds."""
 
+    detections: Detections
+    """Detections of the last look, a batch of one."""
+
+    target: int
+    """Class that closer looks are made for, 1..K; in a search for several classes the most probable one."""
+
+    presence: float
+    """Probability that the picture holds the target, after the last look."""
+
     def __init__(self, forgetting: Forgetting | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
 
     @abstractmethod
     def see(self, look: LookType) -> None:
         """Take in a look of the search."""
-
-    @property
-    @abstractmethod
-    def detections(self) -> Detections:
-        """Detections of the last look, a batch of one."""
-
-    @property
-    @abstractmethod
-    def target(self) -> int:
-        """Class that closer looks are made for, 1..K."""
-
-    @property
-    @abstractmethod
-    def presence(self) -> float:
-        """Probability that the picture holds the target, after the last look."""
 
     @property
     @abstractmethod
@@ -148,23 +142,10 @@ class CandidateCells(CandidatePlaces[Step]):
 
     def see(self, look: Step) -> None:
         """Take in a step of the search."""
-        self._step = look
+        self._step, self.detections = look, look.detections
+        self.target = class_meant(look.belief, self._target)
+        self.presence = float(look.belief.presence(self._target))
         self._looks.append(_Seen(self._frame, look.detections, self.grid))
-
-    @property
-    def detections(self) -> Detections:
-        """Detections of the last look."""
-        return self._looks[-1].detections
-
-    @property
-    def target(self) -> int:
-        """Class that closer looks are made for; in a search for several classes the most probable one."""
-        return class_meant(self._step.belief, self._target)
-
-    @property
-    def presence(self) -> float:
-        """Probability that the image holds the target."""
-        return float(self._step.belief.presence(self._target))
 
     @property
     def left(self) -> float:

@@ -99,7 +99,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
-        self._target, self.likely = target, likely
+        self.target, self.likely = target, likely
         self._detections: list[_Dated] = []
         self._examined: list[tuple[float, Tensor]] = []  # with their frames
         self._frame, self._number = 0.0, 0
@@ -109,25 +109,11 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
     def see(self, look: WindowLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._look, self._number = look, look.number
-        scores = look.detections.scores[0, :, self._target]
+        self.detections, self.presence = look.detections, look.presence
+        scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
             self._detections.append(_Dated(self._frame, look.detections.boxes[0][of_target], scores[of_target]))
-
-    @property
-    def detections(self) -> Detections:
-        """Detections of the last look."""
-        return self._look.detections
-
-    @property
-    def target(self) -> int:
-        """Class that is searched for."""
-        return self._target
-
-    @property
-    def presence(self) -> float:
-        """Probability that the picture holds the target, from all looks but the closer ones."""
-        return self._look.presence
 
     @property
     def left(self) -> float:
@@ -156,7 +142,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look, which is the last look of the path."""
-        return CloseUp(None, self._target, None, box, place, presence, number=self._number - 1)
+        return CloseUp(None, self.target, None, box, place, presence, number=self._number - 1)
 
     def wait(self, frames: float = 1) -> None:
         """Let frames pass: forget boxes of which less than half the evidence is left."""
@@ -182,7 +168,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def _chance(self, score: float) -> float:
         """Probability that the target is where the highest score is this one."""
-        picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
+        picture, place, top = torch.tensor([self.presence, score, self._look.best]).logit(_SMALLEST)
         return float((picture + place - top).sigmoid())
 
 
