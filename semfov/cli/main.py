@@ -165,11 +165,16 @@ def _option_names(name: str) -> list[str]:
 
 def _of_others(own: str, rest: Sequence[str]) -> str | None:
     """What to say about an option that other subcommands or other programs have; None if there is none."""
-    if own not in (*_LOOKING, "gaze"):
-        return None
     names = {each: set(_option_names(each)) for each in (*_LOOKING, own)}
+    first, singular = _SUBCOMMANDS[own][0], _SUBCOMMANDS[own][0].removesuffix("s")
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
+        whole = (own, option) == ("fit", "detector")  # its parts are options, detector.name and others
+        asked = {option, option.removesuffix("s"), *OTHER_WORDS.get(option, ())}
+        if whole or (option and option not in names[own] and asked & {first, singular}):
+            return f"unknown option --{option}; the {singular} has no option before it: semfov {own} {singular.upper()}"
+        if own not in (*_LOOKING, "gaze"):
+            continue
         meant = next((each for each in OTHER_WORDS.get(option, ()) if each in names[own]), None)
         if meant is not None and option not in names[own]:
             return f"unknown option --{option.replace('_', '-')}; did you mean --{meant.replace('_', '-')}?"

@@ -56,7 +56,7 @@ class PictureSource(NamedTuple):
 
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
-    sources: list[PictureSource] = []
+    sources: dict[str, PictureSource] = {}
     pictures, shown = options.pictures, shown_by(options)
     # A file may have brackets in its name, as copies do: photo[1].jpg.
     patterns = (name if set(name) & set("*?[") and not os.path.lexists(name) else None for name in pictures)
@@ -74,5 +74,7 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
         check(not video, "picture", "photographs; `semfov live` takes videos", name)
         for each in picture_files(path, recursive=options.recursive):
             place = each.relative_to(path) if path.is_dir() else Path(each.name)
-            sources.append(PictureSource(printable(str(each)), each, place=place, shown=shown))
-    return sources
+            source = PictureSource(printable(str(each)), each, place=place, shown=shown)
+            # A picture that is named twice, such as by its name and by its folder, is looked at once.
+            sources.setdefault(os.path.abspath(each), source)
+    return [*sources.values()]

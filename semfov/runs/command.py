@@ -232,9 +232,12 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
         if not word.startswith("--") or option not in option_names:
             usual.append(word)
             continue
-        if any(each.partition("=")[0] == option for each in usual):
-            raise InputError(f"{option[2:]}: expected once, got it again; several values are given as a,b")
         hint, has_value = hints.get(option[2:]), bool(equals)
+        if any(each.partition("=")[0] == option for each in usual):
+            several = "; several values are given as a,b" if hint is str or _is_list(hint) else ""
+            raise InputError(f"{option[2:]}: expected once, got it again{several}")
+        if hint is Path and (value if has_value else rest[0] if rest else "none") == "":
+            raise InputError(f"{option[2:]}: expected the name of a file or folder, got an empty one")
         if hint is bool and not has_value:
             value = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
             has_value = True

@@ -218,6 +218,8 @@ def test_a_name_with_brackets_is_that_of_its_file(tmp_path):
     for name, expected in (("a[1].png", ["a[1].png"]), ("a[0-9].png", ["a1.png"]), ("a*.png", ["a1.png", "a[1].png"])):
         found = picture_sources(FindOptions(pictures=(str(tmp_path / name),)))
         assert [source.file.name for source in found] == expected
+    again = (str(tmp_path / "a[1].png"), str(tmp_path), f"{tmp_path}/./a1.png")
+    assert [source.file.name for source in picture_sources(FindOptions(pictures=again))] == ["a[1].png", "a1.png"]
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import threading
 
@@ -119,7 +120,7 @@ def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_p
     assert crop.shape[-1] == pytest.approx(width, abs=2)
     middle = crop[:, crop.shape[1] // 2, crop.shape[2] // 2]
     torch.testing.assert_close(middle, torch.tensor([230.0, 20.0, 20.0]) / 255, rtol=0, atol=0.1)
-    again = [flight / "low" / "b.png", flight / "low" / "b.png"]
+    again = [flight / "low" / "b.png", shutil.copy(flight / "low" / "b.png", tmp_path / "b.png")]
     with pytest.raises(InputError, match=r"labels: expected pictures of different names .* got b"):
         semfov.run(again, "red", agent=agent, labels=tmp_path / "labels")
 

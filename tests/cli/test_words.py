@@ -28,6 +28,8 @@ REFUSED = {
     "explore FOLDER": "and --recursive also searches the folders in it, got none",
     "search nosuch.jpg cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "search zebr nosuch.jpg": "picture: expected a file or folder (a class is given by --target zebr), got zebr",
+    "find . --out=": "out: expected the name of a file or folder, got an empty one",
+    "find . --passes 1 --passes 2": "passes: expected once, got it again\n",
     "find nosuch --target cup": "picture: expected a file or folder (a class is given by --target nosuch)",
     "find --classes cup": "classes: expected none for yolov3-tiny, which has its own; --target names",
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
@@ -59,6 +61,10 @@ REFUSED = {
 }
 
 WRONG_USE = {
+    "app --detector yolov3-tiny": "the detector has no option before it: semfov app DETECTOR",
+    "fit --detector mine.onnx": "the model has no option before it: semfov fit MODEL",
+    "find --picture a.jpg": "unknown option --picture; the picture has no option before it: semfov find PICTURE",
+    "search --image a.jpg --target cup": "the picture has no option before it: semfov search PICTURE",
     "find . --imgsz 640": "unknown option --imgsz; --help-all lists all options",
     "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
     "--target cup": "expected a command before --target: search, find",
