@@ -78,6 +78,7 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any], EzPickle):
             DataError: no scene has anything to look for.
         """
         super().reset(seed=seed)
+        check_dictionary(options)
         self.gazes.begin(_ROW, [self.gazes.choose(self.np_random, options or {})])
         self._over = False
         return self._observed()
@@ -326,8 +327,15 @@ def scenery_or_open(
     """Take the scenery that is given, or open one; raises an error if both a scenery and options are given."""
     expected = f"no options of `{open_it.__name__}` beside it"
     check(scenery is None or not options, "scenery", expected, ", ".join(options))
+    made = scenery is None or hasattr(scenery, "classes")
+    check(made, "scenery", f"what `{open_it.__name__}` makes", f"a {type(scenery).__name__}")
     check_options(options, signature(open_it).parameters.keys() - {"task"}, f"`{open_it.__name__}`")
     return open_it(*task, **options) if scenery is None else scenery
+
+
+def check_dictionary(options: object) -> None:
+    """Raise `InputError` for options of a reset that have no names."""
+    check(options is None or isinstance(options, dict), "options", "a dictionary", f"a {type(options).__name__}")
 
 
 def _first(arrays: Arrays) -> Arrays:

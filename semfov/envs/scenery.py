@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.belief.grid import check_cells
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
@@ -267,6 +268,9 @@ def open_scenery(
     arguments = {**locals()}
     check(task in ("search", "exploration"), "task", "'search' or 'exploration'", repr(task))
     check_whole(mosaics, "mosaics", 0, 1_000_000)
+    kind = scenes is None or isinstance(scenes, str | Path) or hasattr(scenes, "__len__")
+    check(kind, "scenes", "a folder or `Scenes` (count= says how many)", scenes)
+    check_cells(grid)
     if config is None:
         folder = Path(scenes) if isinstance(scenes, str | Path) else None
         notes = None if annotations is None else Path(annotations)

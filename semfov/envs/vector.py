@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.envs.cells import GAZES
-from semfov.envs.environment import PRICES, scenery_or_open
+from semfov.envs.environment import PRICES, check_dictionary, scenery_or_open
 from semfov.envs.gazes import Arrays
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
@@ -70,7 +70,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         known, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
         mode = AutoresetMode(lookup(str(name), known, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self.num_envs, self.task = num_envs, task
+        self.num_envs, self.task = num_envs, lookup(task, GAZES, "task")
         self.scenery = scenery_or_open(scenery, open_scenery, options, task)
         # A copy is a new environment of the same settings and scenes, which begins with a reset.
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
@@ -120,12 +120,14 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
             for row, one in enumerate(seeds):
                 if one is not None:
                     self._randoms[row] = seeding.np_random(one)[0]
+        check_dictionary(options)
         remaining = dict(options or {})
         mask = remaining.pop("reset_mask", None)
         if mask is not None:
             flags = np.asarray(mask)
-            fits = flags.shape == (self.num_envs,) and flags.dtype == np.bool_
-            check(fits, "reset_mask", f"{self.num_envs} booleans, one for each environment", repr(mask))
+            fits = flags.shape == (self.num_envs,) and flags.dtype == np.bool_ and flags.any()
+            expected = f"{self.num_envs} booleans, one for each environment, at least one of them true"
+            check(bool(fits), "reset_mask", expected, repr(mask))
         rows = self._rows if mask is None else torch.from_numpy(np.flatnonzero(mask))
         episodes = remaining.pop("episodes", None)
         if episodes is None:

@@ -330,3 +330,21 @@ def test_without_gymnasium_the_error_has_the_install_command(fresh):
         "try:\n    import semfov.envs\nexcept DataError as error:\n    print(error)"
     )
     assert 'pip install "semfov[envs]"' in fresh(code)
+
+
+def test_arguments_of_other_kinds_are_refused_by_name(sceneries, world):
+    vector = GazeVectorEnv("search", 2, together=False, scenery=sceneries["search"])
+    vector.reset(seed=0)
+    for call, said in (
+        (lambda: open_scenery("search", 3), "scenes: expected a folder or `Scenes`"),
+        (lambda: open_scenery("search", **{**world, "grid": 10}), r"grid: expected \(columns, rows\), got 10"),
+        (lambda: GazeSearch(scenery="photographs"), "scenery: expected what `open_scenery` makes, got a str"),
+        (lambda: GazeVectorEnv("find", 2), "unknown task 'find'; .*search"),
+        (lambda: GazeSearch(sceneries["search"]).reset(options=[1]), "options: expected a dictionary, got a list"),
+        (
+            lambda: vector.reset(options={"reset_mask": [False, False]}),
+            "reset_mask: expected 2 booleans, .* one of them",
+        ),
+    ):
+        with pytest.raises(InputError, match=f"^{said}"):
+            call()
