@@ -141,14 +141,21 @@ def _fill(result: Tensor, plane: Tensor, lines: Lines) -> None:
         return
     _, edge, span = lines.ends.shape
     torch.bmm(lines.ends, _both_ends(plane, span), out=_both_ends(result, edge))
-    inner = result[lines.rows : lines.rows + lines.middle.shape[:2].numel()].unflatten(0, (len(lines.middle), -1))
-    torch.bmm(lines.middle, _windows(plane, lines), out=inner)
+    tiles, tile, window = lines.middle.shape
+    inputs = _parts(plane, lines.start, lines.shift, (tiles, window))
+    torch.bmm(lines.middle, inputs, out=_parts(result, lines.rows, tile, (tiles, tile)))
 
 
 def _both_ends(plane: Tensor, rows: int) -> Tensor:
     """The first and the last rows of a plane, `(2, rows, w)`, which may overlap."""
-    (height, width), (step, along) = plane.shape, plane.stride()
-    return plane.as_strided((2, rows, width), ((height - rows) * step, step, along), plane.storage_offset())
+    return _parts(plane, 0, plane.shape[0] - rows, (2, rows))
+
+
+def _parts(plane: Tensor, first: int, apart: int, shape: tuple[int, int]) -> Tensor:
+    """Parts `(n, rows, w)` of a plane that begin at rows `apart`, from a first one; they may overlap."""
+    step, along = plane.stride()
+    begin = plane.storage_offset() + first * step
+    return plane.as_strided((*shape, plane.shape[1]), (apart * step, step, along), begin)
 
 
 def _windows(image: Tensor, lines: Lines) -> Tensor:
