@@ -3,7 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 GRADIO := build/gradio
-INSTALL := install --quiet --require-hashes --requirement
+# Of files that name all packages; bytecode is written when a module is first imported.
+INSTALL := install --quiet --no-compile --no-deps --require-hashes --requirement
 LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes --no-annotate \
 	--custom-compile-command "make constraints"
 # The tests of a file stay together: what they share is made once.
@@ -35,9 +36,12 @@ help:
 
 setup: $(STAMP)
 
+# Two processes unpack the packages: torch and its libraries are as large as all others together.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip $(INSTALL) constraints.txt
+	awk '/^[a-z]/ {print >("$(VENV)/" (part = /^(torch|triton|nvidia|cuda)/ ? "torch" : "others") ".txt")} \
+		/^ / {print >("$(VENV)/" part ".txt")}' constraints.txt
+	$(BIN)/python -m pip $(INSTALL) $(VENV)/torch.txt & $(BIN)/python -m pip $(INSTALL) $(VENV)/others.txt && wait $$!
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
