@@ -67,12 +67,9 @@ def test_no_private_names_of_other_packages_are_used():
     assert {name: parts for name, parts in found.items() if parts} == {}
 
 
-def test_files_of_the_library_have_at_most_600_lines():
+def test_files_of_the_library_are_short_and_have_names_of_their_own():
     lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in LIBRARY}
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
-
-
-def test_no_file_has_a_catch_all_name():
     assert not {file.name for file in SOURCES} & {"utils.py", "helpers.py", "misc.py", "common.py"}
 
 

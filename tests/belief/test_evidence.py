@@ -60,15 +60,12 @@ def test_blur_matches_scipy(columns, sigma, device):
         np.testing.assert_allclose(blurred.reshape(table.shape), filtered, atol=1e-12)
 
 
-def test_nearness_falls_with_distance(dtype):
+def test_nearness_and_logarithms_of_odds_follow_their_formulas(dtype):
     distance = torch.tensor([0.0, 1 / 6, 1 / 3, 1.25, math.inf], dtype=dtype)
     got = nearness(distance)
     assert got.dtype == dtype
     assert got.tolist() == pytest.approx([math.exp(-6 * d) for d in distance.tolist()], rel=1e-6)
     assert got[-1] == 0
-
-
-def test_logarithms_of_odds_are_finite():
     odds = torch.tensor([0.0, 1e-12, 1e-3, 0.5, 1.0, 80.0], dtype=torch.float64)
     expected = [math.log(value + 1e-3) / 2 + 1 for value in odds.tolist()]
     assert logarithm(odds).tolist() == pytest.approx(expected)

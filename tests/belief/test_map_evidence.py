@@ -150,23 +150,20 @@ def remaining_fields(said):
     return said.score, said.looks, said.visited, said.target
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("look_width", 0), ("readout_width", 0), ("components", 2), ("components", 10_001), ("components", 3.0)],
-)
-def test_invalid_sizes_are_refused(name, value):
-    with pytest.raises(InputError, match=f"{name}: expected a whole number"):
-        MapEvidence(**{name: value})
-
-
-@pytest.mark.parametrize(
-    ("settings", "widths", "components"),
-    [
+def test_sizes_have_defaults_and_limits():
+    for name, value in [
+        ("look_width", 0),
+        ("readout_width", 0),
+        ("components", 2),
+        ("components", 10_001),
+        ("components", 3.0),
+    ]:
+        with pytest.raises(InputError, match=f"{name}: expected a whole number"):
+            MapEvidence(**{name: value})
+    for settings, widths, components in [
         ({}, (48, 24), 81),
         ({"look_width": 1, "readout_width": 1, "components": 3}, (1, 1), 3),
         ({"look_width": 1, "readout_width": 1, "components": 10_000}, (1, 1), 10_000),
-    ],
-)
-def test_default_sizes_and_sizes_at_their_limits(settings, widths, components):
-    model = MapEvidence(**settings)
-    assert (model.widths, len(model.prior)) == (widths, components)
+    ]:
+        model = MapEvidence(**settings)
+        assert (model.widths, len(model.prior)) == (widths, components)

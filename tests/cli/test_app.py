@@ -49,13 +49,10 @@ def test_looks_at_cells_beside_a_gpu_are_those_on_the_cpu(agent):
     torch.testing.assert_close(there.record.presence, here.record.presence, rtol=1e-3, atol=1e-4)
 
 
-def test_without_gradio_it_is_said_how_to_install_it(monkeypatch, capsys):
+def test_what_cannot_be_served_is_told_before_anything_is_loaded(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert main(["app"]) == 1
     assert capsys.readouterr().err == 'error: app: expected Gradio for the page; pip install "semfov[app]"\n'
-
-
-def test_an_address_that_cannot_be_served_is_told_before_anything_is_loaded(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", ModuleType("gradio"))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -109,15 +109,12 @@ def test_what_is_no_file_of_annotations_is_refused(tmp_path, make_coco):
         read_annotations(make_coco(data=[]))
 
 
-def test_long_values_are_shortened_in_the_message(make_coco, coco_dict):
+def test_long_and_deeply_nested_values_are_refused_in_a_short_message(make_coco, coco_dict, tmp_path):
     data = coco_dict(BOXES)
     data["images"][0]["width"] = "x" * 10_000
     with pytest.raises(DataError) as caught:
         read_annotations(make_coco(data=data))
     assert len(str(caught.value)) < 300
-
-
-def test_deeply_nested_values_are_refused(make_coco, coco_dict, tmp_path):
     data = coco_dict(BOXES)
     data["images"][0]["width"] = "HERE"
     text = json.dumps(data).replace('"HERE"', "[" * 900 + "]" * 900)

@@ -17,16 +17,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_pictures_are_sorted_by_name_and_have_no_objects(folder):
-    pictures = Pictures(folder, ["b.png", "a.png", "b.png"], ("person", "cup"))
-    assert pictures.ids == ["a.png", "b.png"]
-    assert [pictures[index].image.shape for index in range(2)] == [(3, 6, 9), (3, 6, 8)]
-    assert pictures[0].image[0].eq(1).all()
-    assert pictures.annotation(0).size == (9, 6)
-    assert torch.equal(pictures.annotation(0).boxes, torch.zeros(0, 4))
-    assert pictures.targets(0) == []
-
-
 def test_digests_depend_on_the_content_of_the_files(folder):
     pictures = Pictures(folder, ["a.png", "b.png"], ("person",))
     assert pictures.digest(0) == hashlib.sha256((folder / "a.png").read_bytes()).hexdigest()
@@ -36,7 +26,14 @@ def test_digests_depend_on_the_content_of_the_files(folder):
     assert pictures.fingerprint != before
 
 
-@pytest.mark.parametrize("name", ["missing.png", "../a.png"])
-def test_missing_files_and_files_outside_the_folder_are_refused(folder, name):
-    with pytest.raises(DataError, match=r"missing\.png|leads out"):
-        Pictures(folder, ["a.png", name], ("person",))
+def test_pictures_are_sorted_by_name_and_lie_in_the_folder(folder):
+    pictures = Pictures(folder, ["b.png", "a.png", "b.png"], ("person", "cup"))
+    assert pictures.ids == ["a.png", "b.png"]
+    assert [pictures[index].image.shape for index in range(2)] == [(3, 6, 9), (3, 6, 8)]
+    assert pictures[0].image[0].eq(1).all()
+    assert pictures.annotation(0).size == (9, 6)
+    assert torch.equal(pictures.annotation(0).boxes, torch.zeros(0, 4))
+    assert pictures.targets(0) == []
+    for name in ["missing.png", "../a.png"]:
+        with pytest.raises(DataError, match=r"missing\.png|leads out"):
+            Pictures(folder, ["a.png", name], ("person",))

@@ -38,14 +38,11 @@ def test_boxes_of_a_closer_look_are_in_pixels_of_the_image(image, box):
     torch.testing.assert_close(seen.boxes[0, 0], torch.tensor([130.0, 90, 150, 110]), atol=1.0, rtol=0)
 
 
-def test_a_closer_look_shows_more_than_the_whole_image(image):
+def test_a_closer_look_shows_more_than_the_whole_image_to_one_box_of_one_image(image):
     eye = Eye(Foveation(200.0), Fine(), reference=160.0)
     whole = eye.detector(image[None])
     close = eye.close_up(image[None], whole.boxes[0, 0])
     assert (int(whole.labels[0, 0]), int(close.labels[0, 0])) == (2, 1)
-
-
-def test_a_closer_look_needs_one_image_and_one_box(image):
     eye = Eye(Foveation(200.0), Square(), reference=160.0)
     with pytest.raises(InputError, match="image: expected a tensor of shape"):
         eye.close_up(image, torch.zeros(4))

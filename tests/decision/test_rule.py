@@ -284,21 +284,15 @@ def test_search_gives_up_and_describes_the_outcome(image, presence, outcome, wor
     assert scanpath.describe() == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
 
 
-def test_search_without_shifts_left_is_undecided(image):
+def test_searches_decide_when_no_shifts_or_no_cells_are_left(image):
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=4)
     assert scanpath.shifts == 4
     assert scanpath.decision == Decision("undecided", pytest.approx(0.1))
     assert scanpath.describe() == "“red” undecided after 4 gaze shifts (probability 0.10)"
-
-
-def test_search_without_cells_left_decides_absent(image):
-    """After every cell was visited, no cell is left to look at."""
+    # After every cell was visited, no cell is left to look at.
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=40)
     assert sorted(scanpath.cells.tolist()) == list(range(12))
     assert scanpath.decision.outcome == "absent"
-
-
-def test_search_decides_after_its_last_shift(image):
     script = [(cells(c5=0.4), 0.3), (cells(c5=0.9), 0.9)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0, shifts=1)
     assert scanpath.decision.outcome == "found"

@@ -117,15 +117,12 @@ def test_without_a_confirmed_place_the_presence_decides(presence, outcome):
     assert decision.probability == pytest.approx(judge.looks[0].presence)
 
 
-def test_a_search_that_gives_up_examines_what_is_probable_enough_even_if_not_fixated():
+def test_what_is_probable_enough_is_examined_even_if_not_fixated():
     judge, closer = verifier({9: 0.95}, thresholds=Thresholds(0.7, 0.5, 0.3))
     last = step(0, {9: 0.4, 3: 0.2}, [0], 0.6, look(9, 3))
     assert int(judge(last)) == 1
     assert closer.cells == [9]
     assert judge.conclude().cell == 9
-
-
-def test_places_less_probable_than_the_threshold_are_not_examined():
     judge, closer = verifier({9: 0.95}, thresholds=Thresholds(0.7, 0.5, 0.41))
     last = step(0, {9: 0.4}, [9], 0.6, look(9))
     assert int(judge(last)) > 1

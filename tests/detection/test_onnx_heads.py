@@ -77,7 +77,7 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     assert found.objectness is None
 
 
-def test_decoders_are_differentiable():
+def test_decoders_are_differentiable_and_compile():
     def numbers(found):
         return tuple(x for x in (found.boxes, found.classes, found.objectness, found.background) if x is not None)
 
@@ -90,9 +90,6 @@ def test_decoders_are_differentiable():
     assert check(lambda x, y: numbers(heads.decode_rtdetr(x, y, (16, 8))), (raw, boxes))
     distances = noise(1, 5, 12).requires_grad_()
     assert check(lambda x, y: numbers(heads._decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
-
-
-def test_decoder_compiles():
     raw = noise(1, 84, 8)
     compiled = torch.compile(heads._decode_yolox, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(raw, (64, 64)).boxes, heads._decode_yolox(raw, (64, 64)).boxes)

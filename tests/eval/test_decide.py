@@ -175,7 +175,7 @@ def test_table_matches_hand_calculations():
     assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 
 
-def test_the_table_counts_closer_looks():
+def test_the_table_counts_closer_looks_and_shows_nothing_as_a_dash():
     agent = [
         record("target-evidence", present, "found", 0.9, 4, right_place=present, closer=2 - present)
         for present in (1, 0)
@@ -183,8 +183,5 @@ def test_the_table_counts_closer_looks():
     alone = [{**each, "policy": "target-evidence, no closer looks", "looks": 2, "closer": 0} for each in agent]
     text = decision_summary([*agent, *alone], "sensed")
     assert "Closer looks count as looks; target-evidence makes 1.50 of them in a search." in text
-
-
-def test_shares_and_means_of_nothing_are_shown_as_a_dash():
     assert (share(1, 8), share(0, 3), share(0, 0)) == ("12.5", "0.0", "-")
     assert (mean_or_dash([1, 2]), mean_or_dash([0.125], 2), mean_or_dash([])) == ("1.5", "0.12", "-")

@@ -96,7 +96,7 @@ def test_the_policies_of_each_run_have_different_labels(runs):
         assert len(set(labels)) == len(labels) > 0
 
 
-def test_studies_use_the_fit_set_and_results_use_the_listed_photographs(tmp_path):
+def test_studies_use_the_fit_set_and_results_the_listed_photographs_up_to_a_limit(tmp_path):
     config = ResultsConfig(root=tmp_path / "val", annotations=tmp_path / "v.json", fit_root=tmp_path / "fit")
     for name, run in experiments(config).items():
         study = " " in name
@@ -104,9 +104,6 @@ def test_studies_use_the_fit_set_and_results_use_the_listed_photographs(tmp_path
         assert run.data.ids == (None if study else config.ids)
     ids = (ROOT / config.ids).read_text().split()
     assert len(set(ids)) == len(ids) == 300
-
-
-def test_a_trial_limits_every_experiment_on_the_listed_photographs(tmp_path):
     config = ResultsConfig(root=tmp_path / "val", annotations=tmp_path / "v.json")
     limits = {run.data.limit for run in experiments(replace(config, limit=7)).values()}
     assert limits == {7}
@@ -347,16 +344,13 @@ def test_every_threshold_has_a_model_of_its_own_and_the_same_sensor(runs):
         assert list(runs).index(f"looks-threshold-{name}") < list(runs).index(f"search-threshold-0.02-{name}")
 
 
-def test_verdicts_name_the_thresholds_at_which_they_hold(at_thresholds):
+def test_differences_and_verdicts_name_their_thresholds(at_thresholds, tmp_path):
     rows = [cells_of(row) for row in _page_table("verdicts", at_thresholds).make(at_thresholds)]
     assert rows[0] == ["the paper finds", "in the paper", "counted", "YOLOX-nano", "YOLOv3-tiny"]
     assert rows[2][1:4] == ["+11.2 / +10.4 / +5.8", "one target", "holds at 0.02; reversed at 0.1, 0.25, 0.5"]
     told = {cell for row in rows[2:] for cell in row[3:]}
     words = [row[0] for row in map(cells_of, _page_table("verdicts-words", at_thresholds).make(at_thresholds)[2:])]
     assert words == [word for word in VERDICTS if any(f"{word} at" in cell for cell in told)]
-
-
-def test_differences_are_shown_at_every_threshold(at_thresholds, tmp_path):
     rows = [cells_of(row) for row in _page_table("thresholds", at_thresholds).make(at_thresholds)]
     assert rows[0] == ["detector", "difference", "shifts", "0.02", "0.1", "0.25", "0.5"]
     assert rows[2][:5] == ["YOLOX-nano", CONTRASTS[0].text, "5", "+100.0 ± 0.0", "-100.0 ± 0.0"]

@@ -143,12 +143,9 @@ def test_a_belief_without_a_batch_gives_the_values_of_its_episode(name):
     torch.testing.assert_close(function(beliefs()[1], visits()[1]), function(beliefs(), visits())[1])
 
 
-@pytest.mark.parametrize("target", [-1, 4])
-def test_a_target_out_of_range_is_refused(target):
-    with pytest.raises(InputError, match="target"):
-        acquisition.TargetPosterior(target)(beliefs(), visits())
-
-
-def test_a_neighbourhood_of_zero_width_is_refused():
+def test_targets_and_widths_out_of_range_are_refused():
+    for target in [-1, 4]:
+        with pytest.raises(InputError, match="target"):
+            acquisition.TargetPosterior(target)(beliefs(), visits())
     with pytest.raises(InputError, match=r"^sigma:"):
         acquisition.NeighbourhoodPosterior(3, model(), GRID, sigma=0.0)

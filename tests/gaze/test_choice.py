@@ -81,11 +81,6 @@ def test_softmax_draws_in_proportion_to_exponentials(inverse_temperature, dtype,
     assert bool(((counts - count * share).abs() <= 5 * (count * share * (1 - share)).sqrt()).all())
 
 
-def test_a_negative_inverse_temperature_is_refused():
-    with pytest.raises(InputError, match="inverse_temperature"):
-        Softmax(lambda *_: torch.zeros(1, 9), -1.0)
-
-
 @given(st.integers(1, 9), st.integers(0, 10_000))
 def test_selection_equals_a_loop(cells, seed):
     generator = torch.Generator().manual_seed(seed)
@@ -99,13 +94,10 @@ def test_selection_equals_a_loop(cells, seed):
         assert got == (max(tied, key=lambda c: float(noise[row, c])) if free else -1)
 
 
-def test_rounding_does_not_break_ties():
+def test_ties_are_not_broken_by_rounding_negative_values_or_infinities():
     values = torch.tensor([[0.3, 0.1 + 0.2, 0.30000003]])
     noise = torch.tensor([[0.9, 0.2, 0.5]])
     assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [0]
-
-
-def test_selection_with_negative_values_and_infinities():
     values = torch.tensor([[-3.0, -2.0, -float("inf")]])
     noise = torch.tensor([[0.9, 0.2, 0.95]])
     assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [1]
@@ -116,13 +108,6 @@ def test_selection_compiles_to_one_graph():
     visited = torch.rand(4, 9) < 0.5
     compiled = torch.compile(select_fixation, fullgraph=True, backend="eager")
     assert torch.equal(compiled(values, visited, noise), select_fixation(values, visited, noise))
-
-
-def test_selection_refuses_nan_and_other_shapes():
-    with pytest.raises(InputError, match="NaN"):
-        select_fixation(torch.tensor([[float("nan")]]), torch.tensor([[False]]), torch.rand(1, 1))
-    with pytest.raises(InputError, match="visited"):
-        select_fixation(torch.zeros(1, 3), torch.zeros(1, 2, dtype=torch.bool), torch.rand(1, 3))
 
 
 CELLS, GRID = 12, Grid(4, 3, (64, 48))
@@ -175,7 +160,13 @@ def test_soft_fixations_at_low_temperature_are_cell_centres(visited):
     torch.testing.assert_close(soft, centres[cell])
 
 
-def test_soft_fixations_refuse_wrong_arguments():
+def test_wrong_arguments_of_choices_are_refused():
+    with pytest.raises(InputError, match="inverse_temperature"):
+        Softmax(lambda *_: torch.zeros(1, 9), -1.0)
+    with pytest.raises(InputError, match="NaN"):
+        select_fixation(torch.tensor([[float("nan")]]), torch.tensor([[False]]), torch.rand(1, 1))
+    with pytest.raises(InputError, match="visited"):
+        select_fixation(torch.zeros(1, 3), torch.zeros(1, 2, dtype=torch.bool), torch.rand(1, 3))
     zeros = torch.zeros(1, 3)
     with pytest.raises(InputError, match="temperature"):
         soft_fixation(zeros, zeros > 0, torch.zeros(3, 2), zeros, temperature=0.0)

@@ -82,14 +82,6 @@ def test_a_model_without_miss_rates_is_refused(name, task):
         named_policy(name, task, means)(1 if task == "search" else None, GRID)
 
 
-@pytest.mark.parametrize(
-    ("name", "task", "meant"), [("two-peak", "exploration", "two-peaks"), ("predicitve", "search", "predictive")]
-)
-def test_a_similar_name_is_suggested(name, task, meant):
-    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-        named_policy(name, task)
-
-
 def test_every_policy_class_is_public():
     for name in OWN:
         kind = POLICIES[name]
@@ -152,7 +144,10 @@ def test_the_error_for_a_missing_target_names_the_policy(name, means):
         named_policy(name, "search", means)(None, GRID)
 
 
-def test_a_policy_for_another_task_is_refused(means):
+def test_other_names_and_tasks_are_refused_with_a_suggestion(means):
+    for name, task, meant in [("two-peak", "exploration", "two-peaks"), ("predicitve", "search", "predictive")]:
+        with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+            named_policy(name, task)
     with pytest.raises(InputError, match="search policy 'kl'"):
         named_policy("kl", "search", means)
     with pytest.raises(InputError, match="exploration policy 'predictive'"):

@@ -23,7 +23,7 @@ def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, sp
     assert time == pytest.approx(found, rel=0.01)
 
 
-def test_a_shift_takes_as_long_as_the_longest_of_simultaneous_movements():
+def test_durations_of_movements_follow_the_main_sequence_and_settling():
     speeds = Speeds()
     eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
     none = torch.tensor(0.0)
@@ -31,9 +31,6 @@ def test_a_shift_takes_as_long_as_the_longest_of_simultaneous_movements():
     assert float(speeds.duration(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
     assert float(speeds.duration(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
     assert float(speeds.duration(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
-
-
-def test_durations_of_movements_follow_the_main_sequence_and_settling():
     # 21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time.
     found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
     torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))

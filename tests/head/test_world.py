@@ -37,12 +37,6 @@ def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
         assert seen[latitude.abs() < 60].all()
 
 
-def test_cells_contain_their_centres(world):
-    assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
-    torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
-    assert float(world.area.mean()) == pytest.approx(1)
-
-
 def test_boxes_are_converted_to_places_and_back(world):
     boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
     pose = world.poses(60.0)[1][1]
@@ -57,7 +51,16 @@ def test_boxes_are_converted_to_places_and_back(world):
     torch.testing.assert_close(corners, boxes, atol=5e-2, rtol=0)
 
 
-def test_a_view_of_a_panorama_is_perspective():
+def test_cells_contain_their_centres_and_panoramas_are_twice_as_wide_as_high(world):
+    assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
+    torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
+    assert float(world.area.mean()) == pytest.approx(1)
+    with pytest.warns(UserWarning, match="twice as wide as high, got 64 × 48 px"):
+        Panorama(torch.rand(3, 48, 64), (32, 24))
+    Panorama(torch.rand(3, 48, 98), (32, 24))
+
+
+def test_views_are_perspectives_of_panoramas_and_glimpses_of_flat_scenes():
     torch.manual_seed(0)
     image = torch.rand(3, 90, 180)
     pose = torch.tensor([33.0, 20.0, 60.0])
@@ -65,16 +68,7 @@ def test_a_view_of_a_panorama_is_perspective():
     world = Panorama(image, (32, 24))
     torch.testing.assert_close(world.view(pose)[0], expected.clamp(0, 1))
     torch.testing.assert_close(world.look_at((33.0, 20.0), 60.0), expected.clamp(0, 1))
-
-
-def test_a_photograph_given_as_a_panorama_brings_a_warning():
-    with pytest.warns(UserWarning, match="twice as wide as high, got 64 × 48 px"):
-        Panorama(torch.rand(3, 48, 64), (32, 24))
-    Panorama(torch.rand(3, 48, 98), (32, 24))
-
-
-def test_a_view_of_a_flat_scene_is_a_glimpse():
-    """Without the border pixels, where a glimpse also uses pixels from outside the window."""
+    # Without the border pixels, where a glimpse also uses pixels from outside the window.
     torch.manual_seed(0)
     image = torch.rand(3, 120, 160).mul(255).round() / 255
     view = Flat(image, (32, 24), degree=5).look_at((-4.0, 2.0), 16.0)  # 20 px to the left, 10 px up

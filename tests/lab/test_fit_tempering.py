@@ -44,15 +44,12 @@ def test_hit_rate_equals_a_loop_over_looks(tempering):
     assert 0 < rate < 1
 
 
-def test_there_is_no_hit_rate_when_every_fixation_is_on_the_target():
+def test_the_report_has_a_row_for_every_exponent_and_no_rate_without_targets():
     grid, seen = Grid(4, 3, (96, 96)), looks(2)
     goal = torch.ones(1, 12, dtype=torch.bool)
     fixations = torch.tensor([[10.0, 10.0], [80.0, 80.0]])
     assert hit_rate(Semantic(5), seen, fixations, grid, torch.tensor([1]), goal) is None
-
-
-def test_the_report_has_a_row_for_every_exponent_and_names_the_best():
-    """The best one is that of the photographs to choose by."""
+    # The best one is that of the photographs to choose by.
     report = _tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
     assert "choose by: 0.25." in report
     rows = cells_of(report)[2:]

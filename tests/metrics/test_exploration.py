@@ -8,6 +8,22 @@ from semfov.data import Annotation
 from semfov.metrics.exploration import answers_of, count_right, success_rate
 
 
+def test_a_cell_is_right_if_an_object_of_its_single_most_probable_class_overlaps_it():
+    # Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too.
+    answers = torch.tensor([[False, True, False]] * 4)
+    beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
+    assert count_right(beta, answers).tolist() == [1]
+    # Without the background column, classes slightly less probable than background are right, too.
+    assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
+    answers = torch.tensor([[False, True], [False, True], [True, True]])
+    beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
+    assert count_right(beta, answers).tolist() == [2]
+
+
+def test_success_rate_by_hand():
+    np.testing.assert_allclose(success_rate([0, 1, 3], 4), [0, 0.25, 0.75])
+
+
 def test_answers_are_the_classes_of_overlapping_objects():
     annotation = Annotation(
         torch.tensor([[1.0, 1, 19, 19], [15, 5, 45, 15], [62, 42, 78, 58]]),
@@ -18,29 +34,7 @@ def test_answers_are_the_classes_of_overlapping_objects():
     answers = answers_of(annotation, Grid(4, 3, (80, 60)), 4)
     found = {cell: set(row.nonzero()[:, 0].tolist()) for cell, row in enumerate(answers) if row.any()}
     assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
-
-
-def test_a_cell_is_right_if_an_object_of_its_most_probable_class_overlaps_it():
-    """Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too."""
-    answers = torch.tensor([[False, True, False]] * 4)
-    beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
-    assert count_right(beta, answers).tolist() == [1]
-    # Without the background column, classes slightly less probable than background are right, too.
-    assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
-
-
-def test_a_cell_with_tied_classes_is_not_right():
-    answers = torch.tensor([[False, True], [False, True], [True, True]])
-    beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
-    assert count_right(beta, answers).tolist() == [2]
-
-
-def test_success_rate_by_hand():
-    np.testing.assert_allclose(success_rate([0, 1, 3], 4), [0, 0.25, 0.75])
-
-
-def test_answers_have_a_column_for_every_class_of_the_model():
-    """Also if the picture shows none of the last classes."""
+    # Also if the picture shows none of the last classes.
     annotation = Annotation(
         torch.tensor([[1.0, 1, 5, 5]]), torch.tensor([1]), torch.zeros(1, dtype=torch.bool), (20, 10)
     )

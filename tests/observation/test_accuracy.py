@@ -66,13 +66,10 @@ def assert_close_to_exact(found: torch.Tensor, exact: list[mpmath.mpf], size: li
         assert abs(value - wanted) <= 1e-14 * max(abs(largest), 1), (value, float(wanted), float(largest))
 
 
-def test_log_normaliser_is_accurate_for_tiny_and_huge_parameters():
+def test_log_density_is_accurate_for_tiny_and_huge_parameters():
     table = [[mp.mpf(a) for a in row] for row in rows().tolist()]
     size = [mp.fsum(abs(mp.loggamma(a)) for a in row) + abs(mp.loggamma(mp.fsum(row))) for row in table]
     assert_close_to_exact(dirichlet.log_normaliser(rows()), [exact_normaliser(row) for row in table], size)
-
-
-def test_log_density_is_accurate_for_tiny_and_huge_parameters():
     alpha = rows()
     log_scores = torch.tensor([-1e-9, -300.0, -21.0], dtype=torch.float64).expand_as(alpha)
     exact, size = [], []

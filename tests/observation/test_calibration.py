@@ -85,7 +85,7 @@ def test_training_with_one_level_equals_logistic_regression_with_scipy():
     np.testing.assert_allclose(model.alpha[:, 0].detach(), alpha, rtol=2e-3)
 
 
-def test_training_is_deterministic():
+def test_training_is_deterministic_also_under_no_grad():
     data = detections(800, 4, torch.float32)
     start = FovealObservationModel.identity(CLASSES, EDGES)
     torch.manual_seed(1)
@@ -94,9 +94,6 @@ def test_training_is_deterministic():
     second = fit_discriminative(start, *data)
     for name, tensor in first.state_dict().items():
         assert torch.equal(tensor, second.state_dict()[name])
-
-
-def test_training_works_under_no_grad():
     with torch.no_grad():
         model = fit_discriminative(FovealObservationModel.identity(CLASSES, EDGES), *detections(300, 7, torch.float32))
     assert model.metadata["method"] == "discriminative"

@@ -165,16 +165,13 @@ def test_cells_with_few_samples_follow_their_class():
     torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
 
 
-def test_a_fit_without_data_gives_the_uniform_density():
+def test_fits_without_data_or_of_identical_samples_are_finite():
     model = FovealObservationModel.identity(CLASSES, EDGES)
     with pytest.warns(UserWarning, match="level 0 has no inner neighbour"):
         model.fit(DirichletStatistics((4, 3), 4), prior=True, expected="empirical")
     torch.testing.assert_close(model.alpha, torch.ones(4, 3, 4))
     torch.testing.assert_close(model.expected_scores(), torch.full((4, 3, 4), 0.25))
     torch.testing.assert_close(model.log_prior.exp(), torch.full((4, 3), 0.25))
-
-
-def test_identical_samples_and_zeros_give_finite_parameters():
     statistics = DirichletStatistics((4, 3), 4)
     rows = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).repeat(500, 1)
     statistics.update(rows, (torch.ones(500).long(), torch.zeros(500).long()))

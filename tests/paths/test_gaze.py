@@ -34,7 +34,7 @@ def gaze():
     return GazePrediction(model, terms, (104, 78), (rand(3, 78, 104) * 255).byte(), "folder/poster.png")
 
 
-def test_the_density_sums_to_one_and_follows_the_terms(gaze):
+def test_the_density_sums_to_one_and_has_its_terms_as_parts(gaze):
     assert gaze.density.shape == (78, 104)
     assert float(gaze.density.sum()) == pytest.approx(1, abs=1e-5)
     assert float(gaze.cells.sum()) == pytest.approx(1, abs=1e-5)
@@ -42,9 +42,6 @@ def test_the_density_sums_to_one_and_follows_the_terms(gaze):
     torch.testing.assert_close(gaze.cells, total.flatten().softmax(0).view(39, 52))
     p = gaze.cells.double()
     assert gaze.entropy == pytest.approx(float(-(p * p.log2()).sum()), abs=1e-4)
-
-
-def test_parts_are_divergences_from_the_density_without_a_term(gaze):
     p = gaze.cells.double()
     for name, rest in (("map", "centre bias"), ("centre bias", "map")):
         q = gaze.terms[rest][0].double().flatten().softmax(0).view(39, 52)

@@ -91,7 +91,7 @@ def test_the_page_contains_fixations_detections_and_pictures(page, scanpath, ima
     assert len(data["pictures"]) == 2  # the three views are equal
 
 
-def test_points_of_curves_follow_the_numbers(hostile):
+def test_curves_have_their_points_and_a_legend(hostile):
     text = curves_html({"flat": np.full(3, 0.5), hostile: np.array([0, 0.5, 1.0])}, {"flat": np.full(3, 0.1)}, hostile)
     assert hostile not in text
     lines = re.findall(r'<polyline [^>]*points="([^"]+ [^"]+ [^"]+)"', text)
@@ -100,9 +100,6 @@ def test_points_of_curves_follow_the_numbers(hostile):
     assert rising[1] == flat[1]
     assert rising[0][1] - rising[1][1] == pytest.approx(rising[1][1] - rising[2][1], abs=0.2)
     assert text.count("<polygon") == 1
-
-
-def test_the_legend_of_many_curves_lists_only_some_of_them(hostile):
     curves = {"random": np.zeros(3)} | {f"policy {number}": np.full(3, number / 40) for number in range(30)}
     text = curves_html(curves, {}, hostile)
     entries = re.findall(r"</svg> ([^<]+)</li>", text)

@@ -80,14 +80,6 @@ class Waiting(Executor):
         self.kept = []
 
 
-def test_any_executor_gives_what_one_process_gives():
-    expected = {-n: n for n in range(50)}
-    assert results(operator.neg, [-n for n in range(50)], 1) == expected
-    with ThreadPoolExecutor(4) as pool:
-        assert results(operator.neg, [-n for n in range(50)], pool) == expected
-        assert pool.submit(int).result() == 0, "an executor that was given stays open"
-
-
 def test_threads_of_a_worker_take_turns():
     busy = []
 
@@ -101,7 +93,12 @@ def test_threads_of_a_worker_take_turns():
         assert results(work, range(20), pool) == {n: n for n in range(20)}
 
 
-def test_an_executor_is_given_a_limited_number_of_tasks_at_once():
+def test_any_executor_gives_what_one_process_gives():
+    expected = {-n: n for n in range(50)}
+    assert results(operator.neg, [-n for n in range(50)], 1) == expected
+    with ThreadPoolExecutor(4) as pool:
+        assert results(operator.neg, [-n for n in range(50)], pool) == expected
+        assert pool.submit(int).result() == 0, "an executor that was given stays open"
     pool = Waiting()
     assert results(operator.neg, range(1000), pool) == {n: -n for n in range(1000)}
     assert pool.most == workers._OUTSTANDING

@@ -162,12 +162,9 @@ def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
     assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
 
 
-def test_kl_divergence_is_measured_from_the_prior_of_the_run(model):
+def test_policies_use_the_prior_and_the_fovea_of_the_run(model):
     explorer = strategy("kl-raw", "exploration", BeliefConfig(prior=0.25), observation=model)
     assert explorer.policy(None, GRID).prior == explorer.observer.prior == 0.25
-
-
-def test_closer_look_uses_the_fovea_of_the_run():
     assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
 
 

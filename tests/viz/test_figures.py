@@ -49,7 +49,7 @@ def test_plot_shows_curves_and_error_bands():
     assert len(axes.collections) == 1
 
 
-def test_the_legend_of_many_curves_names_the_highest_ones_and_random_gaze():
+def test_the_legend_names_all_of_few_curves_and_the_highest_of_many():
     curves = {"random": np.zeros(21)} | {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
     (axes,) = draw(plot_success_rate(curves, title="exploration")).axes
     named = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -58,14 +58,11 @@ def test_the_legend_of_many_curves_names_the_highest_ones_and_random_gaze():
     assert len(axes.lines) == 17
     assert len({shown[name] for name in named}) == len(named)
     assert [entry.get_color() for entry in axes.get_legend().legend_handles] == [shown[name][0] for name in named]
-
-
-@pytest.mark.parametrize("count", [1, 7])
-def test_few_curves_are_all_named(count):
-    curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(count)}
-    (axes,) = draw(plot_success_rate(curves)).axes
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(curves)
-    assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == count
+    for count in [1, 7]:
+        curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(count)}
+        (axes,) = draw(plot_success_rate(curves)).axes
+        assert [text.get_text() for text in axes.get_legend().get_texts()] == list(curves)
+        assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == count
 
 
 def test_scanpath_shows_numbered_fixations(scanpath, image):
@@ -194,7 +191,7 @@ def test_bars_are_as_high_as_the_posterior(scanpath):
         assert axes.get_zlim()[1] >= float(belief.max())
 
 
-def test_strip_shows_views_with_their_detections(scanpath, image):
+def test_strip_shows_views_of_any_size_with_their_detections(scanpath, image):
     views = [image * share for share in (0.2, 0.5, 0.8)]
     figure = draw(plot_foveated_strip(scanpath, views, most=2))
     assert [axes.get_title() for axes in figure.axes] == ["fixation 0", "fixation 2"]
@@ -203,9 +200,6 @@ def test_strip_shows_views_with_their_detections(scanpath, image):
         assert {text.get_text() for text in axes.texts} == {"cat 0.80", "cup 0.60"}
         colours = {patch.get_edgecolor() for patch in axes.patches}
         assert len(colours) == 2  # the target's and another
-
-
-def test_views_may_be_smaller_than_the_photograph(scanpath, image):
     figure = draw(plot_foveated_strip(scanpath, [image[:, ::2, ::2]] * 3))
     assert tuple(figure.axes[0].images[0].get_extent()) == (0, 80, 60, 0)
 

@@ -63,13 +63,6 @@ def test_boxes_at_the_border_of_the_picture_do_not_count_as_cut(detector):
     assert not bool(eye.glance(eye.open(image), torch.tensor([[63.5, 63.5, 1.0]])).cut.any())
 
 
-def test_the_canvas_is_filled_beyond_the_picture(detector, picture):
-    eye = WindowEye(detector)
-    canvas, frames = eye.glimpse(eye.open(picture), torch.tensor([[0.0, 0.0, 1.0]]))
-    assert frames[0, :4].tolist() == [0, 0, 64, 64]
-    assert float(canvas[0, :, :60, :60].abs().max()) == 0
-
-
 @pytest.mark.parametrize("fill", [0.0, 114 / 255, 0.5, 0.3])
 def test_the_detector_gets_the_glimpse(detector, fill):
     """A padding that is no byte is kept, too."""
@@ -90,7 +83,11 @@ def test_the_detector_gets_the_glimpse(detector, fill):
     assert float(canvases[2][0, 0, 0, 0]) == pytest.approx(fill, abs=1e-7)
 
 
-def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
+def test_windows_beside_the_picture_are_filled_and_show_its_nearest_pixel(detector, picture):
+    eye = WindowEye(detector)
+    canvas, frames = eye.glimpse(eye.open(picture), torch.tensor([[0.0, 0.0, 1.0]]))
+    assert frames[0, :4].tolist() == [0, 0, 64, 64]
+    assert float(canvas[0, :, :60, :60].abs().max()) == 0
     image = torch.rand(3, 60, 90, generator=torch.Generator().manual_seed(0))
     eye = WindowEye(detector)
     canvas, frames = eye.glimpse(eye.open(image), torch.tensor([[500.0, 400.0, 1.0], [-500.0, -400.0, 1.0]]))

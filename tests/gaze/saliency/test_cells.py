@@ -23,14 +23,6 @@ def test_mean_and_max_equal_a_brute_force(height: int, width: int, columns: int,
         np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
 
 
-def test_cells_are_those_of_the_grid() -> None:
-    saliency = torch.zeros(1, 47, 61)
-    saliency[0, 33, 50] = 1.0
-    expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
-    for reduction in ("mean", "max"):
-        assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
-
-
 def test_the_most_salient_unvisited_cell_holds_the_most_salient_pixel_left() -> None:
     """Luzio, Bernardino and Moreno (2024, section IV-B): after each fixation the pixels of its cell are nullified."""
     saliency = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 0.1
@@ -67,6 +59,11 @@ def test_bad_input(shape: tuple[int, ...], columns: int, rows: int, reduction: s
         cell_saliency(torch.zeros(shape), columns, rows, reduction)
 
 
-def test_integer_maps_are_refused() -> None:
+def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():
+    saliency = torch.zeros(1, 47, 61)
+    saliency[0, 33, 50] = 1.0
+    expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
+    for reduction in ("mean", "max"):
+        assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
     with pytest.raises(InputError, match="saliency"):
         cell_saliency(torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)

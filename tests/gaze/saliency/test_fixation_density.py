@@ -99,15 +99,12 @@ def test_without_map_and_biases_the_centre_bias_is_left(model, maps):
         model(maps, (39, 52), without=["centre"])
 
 
-def test_terms_add_up(model, maps):
+def test_terms_add_up_and_a_new_model_has_no_oculomotor_biases(model, maps):
     path = 40 * rand(2, 3, 2).double()
     terms = model.terms(maps, (39, 52), path)
     assert list(terms) == ["map", "centre bias", "oculomotor biases"]
     total = torch.stack([*terms.values()]).sum(0)
     torch.testing.assert_close(model(maps, (39, 52), path), total.flatten(1).log_softmax(1).view_as(total))
-
-
-def test_a_new_model_has_no_oculomotor_biases(maps):
     model = FixationDensity({"fine": 3, "coarse": 5}).double()
     path = 40 * rand(2, 3, 2).double()
     torch.testing.assert_close(model(maps, (39, 52), path), model(maps, (39, 52)))

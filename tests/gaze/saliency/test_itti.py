@@ -119,12 +119,9 @@ def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     assert 172 <= column < 204
 
 
-def test_gradients_without_normalising() -> None:
+def test_gradients_without_normalising_and_of_a_uniform_image():
     image = torch.rand(1, 3, 20, 26, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(IttiKoch(normalise=False), image, fast_mode=True)
-
-
-def test_gradients_of_a_uniform_image_are_finite() -> None:
     image = torch.full((1, 3, 40, 40), 0.5, requires_grad=True)
     itti_koch_saliency(image).sum().backward()
     assert image.grad is not None

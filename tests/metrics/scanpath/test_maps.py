@@ -65,15 +65,6 @@ def test_log_likelihood_of_a_gaussian_matches_its_entropy():
     assert bits == pytest.approx(2 * np.log2(side) - entropy, abs=0.03)
 
 
-def test_a_uniform_map_is_at_chance():
-    flat = np.ones(SHAPE)
-    x, y = [3, 4], [5, 6]
-    assert nss(flat, x, y).tolist() == [0, 0]
-    assert nss(flat / flat.size, x, y).tolist() == [0, 0]
-    assert auc(flat, x, y).tolist() == [0.5, 0.5]
-    np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
-
-
 def test_batches_of_tensors_equal_single_maps():
     maps = torch.rand(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x, y = torch.zeros(2, 3, 4), torch.ones(2, 3, 4)
@@ -109,7 +100,13 @@ def test_densities_have_a_floor_and_double_precision():
     np.testing.assert_array_equal(density, log_density(maps.double(), floor=0.2))
 
 
-def test_a_uniform_map_does_not_affect_other_maps_of_its_batch():
+def test_a_uniform_map_is_at_chance_and_does_not_affect_other_maps():
+    flat = np.ones(SHAPE)
+    x, y = [3, 4], [5, 6]
+    assert nss(flat, x, y).tolist() == [0, 0]
+    assert nss(flat / flat.size, x, y).tolist() == [0, 0]
+    assert auc(flat, x, y).tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
     maps = np.stack([np.ones(SHAPE), np.random.default_rng(5).uniform(0, 1, SHAPE)])
     got = nss(maps, [[3], [4]], [[5], [6]])
     assert got[0, 0] == 0
@@ -126,47 +123,12 @@ def test_metrics_are_computed_in_double_precision():
     )
 
 
-@pytest.mark.parametrize(
-    ("call", "argument"),
-    [
-        (lambda: nss(np.ones(SHAPE), [17], [0]), "x, y"),
-        (lambda: nss(np.ones(SHAPE), [-0.6], [0]), "x, y"),
-        (lambda: nss(np.ones((2, *SHAPE)), [1], [0]), "x, y"),
-        (lambda: log_density(np.zeros(SHAPE)), "maps"),
-        (lambda: log_density(-np.ones(SHAPE)), "maps"),
-        (lambda: auc_judd(np.ones((1, 1)), [0], [0]), "saliency"),
-        (lambda: nss(np.ones(5), [1], [0]), "maps"),
-        (lambda: nss(np.ones((0, 5)), [], []), "maps"),
-        (lambda: nss(np.ones(SHAPE), [1, 2], [0]), "x, y"),
-        (lambda: nss(np.ones(SHAPE), [0], [11.5]), "x, y"),
-        (lambda: nss(np.ones(SHAPE), [16.5], [0]), "x, y"),
-        (lambda: auc_judd(np.ones((2, *SHAPE)), [[1], [1]], [[1], [1]]), "saliency"),
-        (lambda: auc_judd(np.ones(SHAPE), [], []), "saliency"),
-        (lambda: auc_shuffled(np.ones(SHAPE), [], [], [1], [1]), "x, other_x"),
-        (lambda: auc_shuffled(np.ones(SHAPE), [1], [1], [], []), "x, other_x"),
-    ],
-)
-def test_invalid_shapes_and_points_are_refused_by_name(call, argument):
-    with pytest.raises(InputError, match=rf"^{argument}:"):
-        call()
-
-
 def test_one_fixation_and_one_other_pixel_are_enough():
     assert auc_judd([[0.0, 1.0]], [1], [0]) == 1
     # The only threshold passes both pixels: the curve is a straight line from corner to corner.
     assert auc_judd([[1.0, 0.0]], [1], [0]) == 0.5
     assert auc_shuffled([[0.0, 1.0]], [1], [0], [0], [0]) == 1
     assert auc_shuffled([[0.0, 1.0]], [0], [0], [1], [0]) == 0
-
-
-def test_correlation_equals_numpy():
-    rng = np.random.default_rng(3)
-    first, second = rng.random((2, 4, *SHAPE))
-    expected = [np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(first, second, strict=True)]
-    np.testing.assert_allclose(correlation(first, second), expected)
-    assert correlation(np.ones(SHAPE), first[0]) == 0
-    with pytest.raises(InputError, match="maps"):
-        correlation(first, second[:, :-1])
 
 
 def test_kl_divergence_equals_scipy():
@@ -182,7 +144,14 @@ def test_kl_divergence_equals_scipy():
         kullback_leibler(-first, second)
 
 
-def test_similarity_is_one_minus_the_total_variation():
+def test_correlation_and_similarity_equal_their_formulas():
+    rng = np.random.default_rng(3)
+    first, second = rng.random((2, 4, *SHAPE))
+    expected = [np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in zip(first, second, strict=True)]
+    np.testing.assert_allclose(correlation(first, second), expected)
+    assert correlation(np.ones(SHAPE), first[0]) == 0
+    with pytest.raises(InputError, match="maps"):
+        correlation(first, second[:, :-1])
     first, second = np.random.default_rng(5).random((2, *SHAPE))
     distance = np.abs(first / first.sum() - second / second.sum()).sum() / 2
     assert similarity(first, second) == pytest.approx(1 - distance)
@@ -202,9 +171,27 @@ NAN = float("nan")
 MAP = [[0.1, 0.2], [0.3, 0.4]]
 
 
-@pytest.mark.parametrize(
-    ("call", "named"),
-    [
+def test_what_is_no_map_or_point_is_refused_by_name():
+    for call, argument in [
+        (lambda: nss(np.ones(SHAPE), [17], [0]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [-0.6], [0]), "x, y"),
+        (lambda: nss(np.ones((2, *SHAPE)), [1], [0]), "x, y"),
+        (lambda: log_density(np.zeros(SHAPE)), "maps"),
+        (lambda: log_density(-np.ones(SHAPE)), "maps"),
+        (lambda: auc_judd(np.ones((1, 1)), [0], [0]), "saliency"),
+        (lambda: nss(np.ones(5), [1], [0]), "maps"),
+        (lambda: nss(np.ones((0, 5)), [], []), "maps"),
+        (lambda: nss(np.ones(SHAPE), [1, 2], [0]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [0], [11.5]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [16.5], [0]), "x, y"),
+        (lambda: auc_judd(np.ones((2, *SHAPE)), [[1], [1]], [[1], [1]]), "saliency"),
+        (lambda: auc_judd(np.ones(SHAPE), [], []), "saliency"),
+        (lambda: auc_shuffled(np.ones(SHAPE), [], [], [1], [1]), "x, other_x"),
+        (lambda: auc_shuffled(np.ones(SHAPE), [1], [1], [], []), "x, other_x"),
+    ]:
+        with pytest.raises(InputError, match=rf"^{argument}:"):
+            call()
+    for call, named in [
         (lambda: auc([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN in 1 of 4 pixels"),
         (lambda: nss([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
         (lambda: auc_judd([[0.1, NAN], [0.3, 0.4]], [1], [1]), "maps: expected numbers, got NaN"),
@@ -219,11 +206,9 @@ MAP = [[0.1, 0.2], [0.3, 0.4]]
             lambda: information_gain(log_density(np.ones((4, 4))), log_density(np.ones((40, 40))), [1], [1]),
             r"baseline: expected densities over \(4, 4\) pixels, as `density`, got \(40, 40\)",
         ),
-    ],
-)  # fmt: skip
-def test_figures_are_not_made_better_by_what_is_no_map(call, named):
-    with pytest.raises(InputError, match=named):
-        call()
+    ]:
+        with pytest.raises(InputError, match=named):
+            call()
 
 
 def test_maps_of_any_type_have_the_same_figures():

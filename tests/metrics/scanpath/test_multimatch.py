@@ -41,11 +41,8 @@ def test_a_scanpath_matches_itself_and_its_reverse_has_the_opposite_direction():
     assert math.isnan(back.duration)
 
 
-def test_fewer_than_three_fixations_have_no_similarity():
+def test_invalid_and_short_scanpaths_are_refused_by_name():
     assert all(map(math.isnan, multimatch([[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], (10, 10))))
-
-
-def test_invalid_arguments_are_refused_by_name():
     with pytest.raises(InputError, match=r"^ours:"):
         multimatch([0, 1, 2], [[0, 0]] * 3, (10, 10))
     with pytest.raises(InputError, match=r"^theirs:"):

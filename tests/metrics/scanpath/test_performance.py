@@ -39,32 +39,6 @@ def test_area_equals_the_trapezoid_rule_of_scipy(curve):
     assert performance_area(curve) == pytest.approx(trapezoid(curve, dx=1 / (len(curve) - 1)))
 
 
-def test_a_straight_scanpath_has_ratio_one_and_a_detour_less():
-    box = (90, -10, 110, 10)
-    assert scanpath_ratio([[0, 0], [50, 0], [100, 0]], box) == pytest.approx(1)
-    assert scanpath_ratio([[0, 0], [0, 100], [100, 100], [100, 0]], box) == pytest.approx(1 / 3)
-    # Fixations after the target do not count; stopping short of its centre does not raise the ratio above 1.
-    assert scanpath_ratio([[0, 0], [92, 0], [500, 500]], box) == 1
-    assert np.isnan(scanpath_ratio([[100, 0], [0, 0]], box))
-    assert np.isnan(scanpath_ratio([[0, 0], [1, 1]], box))
-
-
-@pytest.mark.parametrize(
-    ("call", "argument"),
-    [
-        (lambda: mean_performance([1], ["a", "b"], 3), "groups"),
-        (lambda: mean_performance([], [], 3), "groups"),
-        (lambda: performance_area([0.5]), "curve"),
-        (lambda: probability_mismatch([0.5], [0.5, 0.6]), "reference"),
-        (lambda: found_at([1, 2], (0, 0, 1, 1)), "points"),
-        (lambda: found_at(np.zeros((0, 2)), (0, 0, 1, 1)), "points"),
-    ],
-)
-def test_invalid_arguments_are_refused_by_name(call, argument):
-    with pytest.raises(InputError, match=f"^{argument}:"):
-        call()
-
-
 def test_the_four_edges_of_a_box_are_on_the_target():
     for kind in [np.array, torch.tensor]:
         path = kind([[0.0, 0.0], [10.0, 20.0], [15.0, 25.0]])
@@ -78,8 +52,15 @@ def test_the_four_edges_of_a_box_are_on_the_target():
         assert found_at([point], box) == -1
 
 
-def test_the_scanpath_ratio_starts_at_the_first_fixation():
-    """From (10, 20) via (10, 50) to (50, 50): 30 and 40 along two sides of a triangle whose third side is 50."""
+def test_scanpath_ratios_by_hand():
+    box = (90, -10, 110, 10)
+    assert scanpath_ratio([[0, 0], [50, 0], [100, 0]], box) == pytest.approx(1)
+    assert scanpath_ratio([[0, 0], [0, 100], [100, 100], [100, 0]], box) == pytest.approx(1 / 3)
+    # Fixations after the target do not count; stopping short of its centre does not raise the ratio above 1.
+    assert scanpath_ratio([[0, 0], [92, 0], [500, 500]], box) == 1
+    assert np.isnan(scanpath_ratio([[100, 0], [0, 0]], box))
+    assert np.isnan(scanpath_ratio([[0, 0], [1, 1]], box))
+    # From (10, 20) via (10, 50) to (50, 50): 30 and 40 along two sides of a triangle whose third side is 50.
     assert scanpath_ratio([[10, 20], [10, 50], [50, 50]], (45, 45, 55, 55)) == pytest.approx(50 / 70)
 
 
@@ -104,16 +85,23 @@ def test_areas_by_hand():
     assert tfp_auc([6, 7], ["cup", "fork"]) == 0.5
 
 
-@pytest.mark.parametrize(
-    ("call", "named"),
-    [
+def test_invalid_arguments_are_refused_by_name():
+    for call, argument in [
+        (lambda: mean_performance([1], ["a", "b"], 3), "groups"),
+        (lambda: mean_performance([], [], 3), "groups"),
+        (lambda: performance_area([0.5]), "curve"),
+        (lambda: probability_mismatch([0.5], [0.5, 0.6]), "reference"),
+        (lambda: found_at([1, 2], (0, 0, 1, 1)), "points"),
+        (lambda: found_at(np.zeros((0, 2)), (0, 0, 1, 1)), "points"),
+    ]:
+        with pytest.raises(InputError, match=f"^{argument}:"):
+            call()
+    for call, named in [
         (lambda: found_at([[5, 5]], [8, 4, 4, 8]), "box: expected x1 <= x2 and y1 <= y2"),
         (lambda: found_at([[5, 5]], [4, 4, 8]), r"box: expected \(x1, y1, x2, y2\), got shape \(3,\)"),
         (lambda: found_at([[5, 5]], [4, 4, float("nan"), 8]), "box: expected x1 <= x2 and y1 <= y2"),
         (lambda: found_at([[float("nan"), 5]], [4, 4, 8, 8]), "points: expected finite numbers"),
         (lambda: scanpath_ratio([[0, 0], [5, 5]], [8, 8, 4, 4]), "box: expected x1 <= x2 and y1 <= y2"),
-    ],
-)
-def test_boxes_are_corners_in_order(call, named):
-    with pytest.raises(InputError, match=named):
-        call()
+    ]:
+        with pytest.raises(InputError, match=named):
+            call()

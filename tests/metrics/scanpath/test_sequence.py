@@ -43,26 +43,6 @@ def test_the_edit_distance_is_the_levenshtein_distance(a, b):
     assert edit_distance(a, b) == levenshtein(a, b)
 
 
-def test_clusters_separate_distant_fixations():
-    generator = np.random.default_rng(0)
-    places = np.array([[100.0, 100.0], [400.0, 100.0], [250.0, 400.0]])
-    truth = np.repeat([0, 1, 2], 20)
-    points = places[truth] + generator.normal(0, 10, (60, 2))
-    labels = cluster_labels(points, points, bandwidth=60)
-    assert len(set(labels.tolist())) == 3
-    assert all(len(set(labels[truth == place].tolist())) == 1 for place in range(3))
-    assert len(set(cluster_labels(points, points, bandwidth=1000).tolist())) == 1
-
-
-def test_consecutive_fixations_closer_than_half_a_window_are_merged():
-    path = [[0.0, 0.0], [4.0, 4.0], [5.0, 5.0], [50.0, 50.0]]
-    # (0, 0) and (4, 4) merge into (2, 2); the next fixation is 3 away and merges, too.
-    np.testing.assert_allclose(merge_close(path, (10, 10)), [[3.5, 3.5], [50, 50]])
-    np.testing.assert_allclose(merge_close(path, (1, 1)), path)
-    # Both differences have to be small.
-    np.testing.assert_allclose(merge_close([[0.0, 0.0], [1.0, 30.0]], (10, 10)), [[0, 0], [1, 30]])
-
-
 def test_cell_labels_match_the_grid():
     from semfov.belief.grid import Grid
 
@@ -73,7 +53,13 @@ def test_cell_labels_match_the_grid():
     assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
 
 
-def test_merging_restarts_after_a_large_step_and_includes_the_last_fixation():
+def test_consecutive_fixations_closer_than_half_a_window_are_merged():
+    path = [[0.0, 0.0], [4.0, 4.0], [5.0, 5.0], [50.0, 50.0]]
+    # (0, 0) and (4, 4) merge into (2, 2); the next fixation is 3 away and merges, too.
+    np.testing.assert_allclose(merge_close(path, (10, 10)), [[3.5, 3.5], [50, 50]])
+    np.testing.assert_allclose(merge_close(path, (1, 1)), path)
+    # Both differences have to be small.
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [1.0, 30.0]], (10, 10)), [[0, 0], [1, 30]])
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [50, 50], [52, 50]], (10, 10)), [[0, 0], [51, 50]])
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [2, 0]], (10, 10)), [[1, 0]])
     # Half a window apart is not closer than half a window.
@@ -98,7 +84,15 @@ def test_labels_in_an_array_equal_labels_in_a_list():
     assert edit_distance([3, -1], np.array([3, -1])) == 0
 
 
-def test_clusters_match_scikit_learn_with_bin_seeding():
+def test_clusters_are_those_of_scikit_learn():
+    generator = np.random.default_rng(0)
+    places = np.array([[100.0, 100.0], [400.0, 100.0], [250.0, 400.0]])
+    truth = np.repeat([0, 1, 2], 20)
+    points = places[truth] + generator.normal(0, 10, (60, 2))
+    labels = cluster_labels(points, points, bandwidth=60)
+    assert len(set(labels.tolist())) == 3
+    assert all(len(set(labels[truth == place].tolist())) == 1 for place in range(3))
+    assert len(set(cluster_labels(points, points, bandwidth=1000).tolist())) == 1
     points = np.random.default_rng(0).uniform(0, 500, (40, 2))
     expected = MeanShift(bandwidth=90, bin_seeding=True).fit(points).predict(points)
     assert cluster_labels(points, points, bandwidth=90).tolist() == expected.tolist()
