@@ -25,7 +25,7 @@ from semfov.errors import InputError
 from semfov.paths.conversion import Conversion
 from semfov.paths.endings import FIXATIONS, Ending
 from semfov.paths.files import Format
-from semfov.paths.look import LookView, RecordedLook, read_region, whole_pixels
+from semfov.paths.look import LookView, RecordedLook, look_columns, read_region, whole_pixels
 from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
 
 if TYPE_CHECKING:
@@ -422,24 +422,7 @@ class Record(Conversion):
         """
         closer = {number_of(look): look.place for look in self.closer_looks}
         brought = Counter(self.objects.passes.tolist())
-        rows = []
-        for look in self:
-            count = int(look.detections.count.sum())
-            rows.append(
-                {
-                    "look": look.number,
-                    **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
-                    "detections": count,
-                    "seen": self.classes[int(look.detections.labels.flatten()[0])] if count else None,
-                    "score": float(look.detections.confidence.flatten()[0]) if count else None,
-                    "seconds": look.seconds,
-                    "value": look.value,
-                    "closer": closer.get(look.number),
-                    "brought": brought[look.number],
-                    **look.more,
-                }
-            )
-        return rows
+        return [look_columns(look, self.classes, closer.get(look.number), brought[look.number]) for look in self]
 
     def to_dict(self) -> dict[str, Any]:
         """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values.
