@@ -94,7 +94,8 @@ def tiff_tags(draw: Draw, folder: Path) -> Case:
     # Of other types Pillow reads grey whose values are those of 16 bits, or floats up to 1.
     unread = white is None and kind not in _WITHOUT_WHITE
     # Nobody turns those that Pillow does not read.
-    refused = far or (orientation != 1 and (bands is not None or (big and order == ">")))
+    unnamed = count == 3 and photometric == "minisblack"
+    refused = far or (orientation != 1 and (bands is not None or unnamed or (big and order == ">")))
     return Case(_quiet(read), check, may=refused or unread, must=refused)
 
 

@@ -26,7 +26,7 @@ from semfov.io.files import check_regular
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
 _JPEG = 7
-_COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _METADATA, _NODATA = 259, 262, 274, 42112, 42113  # tags
+_COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES, _METADATA, _NODATA = 259, 262, 274, 277, 42112, 42113  # tags
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 _ALWAYS = (1, 8, 32946)  # compressions whose decoders are always there
 _PLANES = 2  # planar configuration of channels that are stored one after the other
@@ -214,5 +214,9 @@ def is_converted(path: str | PathLike[str]) -> bool:
                     first: Any = file.pages[0]
                     tags = {tag.code: tag.value for tag in first.tags.values()}
     kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
+    turned, bands = tags.get(_ORIENTATION, 1), tags.get(_SAMPLES, 1)
+    if turned != 1 and kind <= 1 and bands > 2:  # Pillow reads none of them, or the first as grey
+        expected = "orientation 1 of bands without colours"
+        raise DataError(f"image {Path(path)}: expected {expected}, got {turned} of {bands} bands; turn it upright")
     unusual = kind > _PALETTE and (kind, packed) != (_YCBCR, _JPEG)
-    return bool(unusual or tags.get(_ORIENTATION, 1) != 1)
+    return bool(unusual or turned != 1)

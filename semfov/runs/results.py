@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ _TOGETHER = 1.0
 _WAIT = 60.0
 """Seconds for which another process may write."""
 
+_DAMAGED = (sqlite3.DatabaseError, UnicodeDecodeError)
+"""Errors of a file that is no database, or whose names of columns are none."""
+
 
 class SceneResults:
     """Outcomes of finished scenes, one row each, in a SQLite database; `flush` writes the last ones.
@@ -47,21 +51,21 @@ class SceneResults:
 
     def __len__(self) -> int:
         """Number of rows."""
-        with suppress(sqlite3.DatabaseError), self._opened() as database:
+        with suppress(*_DAMAGED), self._opened() as database:
             return 0 if database is None else int(database.execute("SELECT COUNT(*) FROM scenes").fetchone()[0])
         return 0
 
     def finished(self, scenes: int) -> set[int]:
         """Numbers of the finished scenes, whose outcomes are verified but not made."""
         numbers: set[int] = set()
-        with suppress(sqlite3.DatabaseError), self._opened() as database:
+        with suppress(*_DAMAGED), self._opened() as database:
             rows = () if database is None else database.execute("SELECT * FROM scenes")
             numbers.update(row[0] for row in rows if row[0] < scenes and self._whole(*row))
         return numbers
 
     def items(self, scenes: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """The numbers and outcomes of finished scenes in their order, one at a time."""
-        with suppress(sqlite3.DatabaseError), self._opened() as database:
+        with suppress(*_DAMAGED), self._opened() as database:
             query = "SELECT * FROM scenes WHERE number < ? ORDER BY number"
             for row in () if database is None else database.execute(query, (scenes,)):
                 result = self._read(*row)
@@ -94,7 +98,7 @@ class SceneResults:
             self._write()
         except (sqlite3.OperationalError, OSError) as error:
             raise DataError(f"cannot write {self.path}: {error}") from None
-        except sqlite3.DatabaseError:
+        except _DAMAGED:
             self.path.unlink()  # it is no database, or damaged: its scenes are run again
             self._write()
         self._waiting.clear()
@@ -116,6 +120,8 @@ class SceneResults:
             return
         # Not read-only: what a process that was killed has half written must be undone first.
         with closing(sqlite3.connect(self.path, timeout=_WAIT)) as database:
+            # A damaged text is read with other letters, and is not that of its sum.
+            database.text_factory = partial(str, encoding="utf-8", errors="replace")
             yield database
 
     def _whole(self, index: int, sha256: str, seconds: str, records: str) -> bool:

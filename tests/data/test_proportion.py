@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from semfov import DataError, as_image, read_image
+from semfov.agents.picture import open_picture
 from semfov.data.large import open_large, picture_size
 from semfov.data.raster import RasterPicture
 from tests.data.test_large import pixels
@@ -225,3 +226,14 @@ def test_the_alpha_of_16_bits_is_no_value_of_the_picture(tmp_path):
     with pytest.warns(UserWarning, match=r"values from \d+ to 10[12]\d of 16 bits"):
         open_large(tmp_path / "a.tif")
     assert whole(open_large(tmp_path / "a.tif", white="auto")).max() == 255
+
+
+@pytest.mark.parametrize("planes", ["separate", "contig"])
+def test_bands_without_colours_that_are_turned_are_refused(tmp_path, planes):
+    """Pillow would read the first of them as grey, or none; the bands of an upright one are red, green and blue."""
+    bands = np.moveaxis(pixels(6, 8), -1, 0) if planes == "separate" else pixels(6, 8)
+    given = {"photometric": "minisblack", "planarconfig": planes, "extratags": [(274, "H", 1, 3, True)]}
+    tifffile.imwrite(tmp_path / "a.tif", bands, **given)
+    for read in (open_large, lambda path: open_picture(path).image(torch.zeros(1))):
+        with pytest.raises(DataError, match="expected orientation 1 of bands without colours, got 3 of 3 bands"):
+            read(tmp_path / "a.tif")

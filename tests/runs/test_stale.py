@@ -208,3 +208,12 @@ def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
     key = SearchRun(config).key
     monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
     assert SearchRun(config).key != key
+
+
+def test_a_database_whose_columns_have_damaged_names_counts_as_missing(tmp_path):
+    results = SceneResults(tmp_path, "1-2", lambda index: "a")
+    results.save(0, [{"policy": "random"}], {"look": 0.5})
+    results.flush()
+    results.path.write_bytes(results.path.read_bytes().replace(b"records", b"rec\xd1rds"))
+    assert outcomes(results, 0) is None
+    assert results.finished(1) == set()
