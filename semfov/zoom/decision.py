@@ -91,15 +91,13 @@ class SearchFacts:
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
         closest, named = max(look.closest for look in looks), max(look.named for look in looks)
         hints = features(torch.tensor([best, second, closest, looks[0].score, named, ahead], dtype=torch.float32))
-        left = [math.log(self._left() + 1e-3) / 4, self.belief.left_share]
+        last = self.belief.lattice.levels - 1
+        # Number of looks of the last level that are expected to show the target. Windows start at every cell: this is
+        # the mean over all ways to lay them side by side.
+        showing = float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
+        left = [math.log(showing + 1e-3) / 4, self.belief.left_share]
         counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
         return torch.cat([hints, torch.tensor([*left, *counts])])
-
-    def _left(self) -> float:
-        """Number of looks of the last level, side by side over the picture, that are expected to show the target."""
-        last = self.belief.lattice.levels - 1
-        # Windows start at every cell: this is the mean over all ways to lay them side by side.
-        return float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:

@@ -94,25 +94,18 @@ def _promote(maps: Tensor) -> Tensor:
     Shapes: maps `(..., h, w)`.
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
-    peaks = _local_maxima(maps) & (maps > _PEAK)
-    count = peaks.sum((-2, -1), keepdim=True)
-    # The largest maximum is exactly 1, and is always among the peaks.
-    others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
-    return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
-
-
-def _local_maxima(maps: Tensor) -> Tensor:
-    """Local maxima: pixels above their earlier neighbours and no less than their later ones, in row-major order.
-
-    Shapes: maps `(..., h, w)`.
-    """
+    # Peaks are above their earlier neighbours and no less than their later ones, in row-major order.
     height, width = maps.shape[-2:]
     padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
     left, right = padded[..., :width], padded[..., 2:]
     rows = torch.maximum(torch.maximum(left, right), padded[..., 1:-1])
     earlier = torch.maximum(rows[..., :height, :], left[..., 1:-1, :])
     later = torch.maximum(rows[..., 2:, :], right[..., 1:-1, :])
-    return (maps > earlier) & (maps >= later)
+    peaks = (maps > earlier) & (maps >= later) & (maps > _PEAK)
+    count = peaks.sum((-2, -1), keepdim=True)
+    # The largest maximum is exactly 1, and is always among the peaks.
+    others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
+    return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
 
 
 def _conspicuity(image: Tensor) -> Tensor:
