@@ -7,11 +7,13 @@ import io
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from functools import lru_cache
-from pathlib import Path, PurePath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import torch
+
 from semfov.data.classes import canonical_name
-from semfov.data.coco import read_annotations
+from semfov.data.coco import read_annotations, warn_of_form
 from semfov.errors import DataError, check
 
 
@@ -23,14 +25,18 @@ class Truth:
         self.coco, self.digest = read_annotations(path)
         self._images: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for image in self.coco.imgs.values():
-            self._images[PurePath(image["file_name"]).name].append(image)
+            self._images[_parts(image["file_name"])[-1]].append(image)
+        entries = self.coco.dataset["annotations"]
+        sizes = [[self.coco.imgs[each["image_id"]][side] for side in ("width", "height")] * 2 for each in entries]
+        boxes, limits = torch.tensor([each["bbox"] for each in entries]), torch.tensor(sizes)
+        warn_of_form(boxes.view(-1, 4).double(), limits.view(-1, 4).double(), path)
 
     def image_id(self, name: str, size: tuple[int, int] | None = None) -> int | str:
         """The id of a picture of `(width, height)`; of several of one name that whose folders agree best."""
-        parts = PurePath(name).parts
+        parts = _parts(name)
 
         def agreement(image: dict[str, Any]) -> int:
-            own = PurePath(image["file_name"]).parts
+            own = _parts(image["file_name"])
             pairs = zip(reversed(own), reversed(parts), strict=False)
             return next((count for count, (one, other) in enumerate(pairs) if one != other), min(len(own), len(parts)))
 
@@ -70,6 +76,11 @@ class Truth:
             judge.accumulate()
             judge.summarize()
         return float(judge.stats[0]), float(judge.stats[1])
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """The parts of a path, of Windows or not."""
+    return PurePosixPath(name.replace("\\", "/")).parts or (name,)
 
 
 def read_truth(path: Path) -> Truth:

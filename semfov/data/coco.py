@@ -357,8 +357,7 @@ class _Packed:
 
         corner, extent = bboxes.reshape(-1, 4).split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)
-        if seems := _other_form(bboxes.reshape(-1, 4), limits):
-            warnings.warn(f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}", stacklevel=4)
+        warn_of_form(bboxes.reshape(-1, 4), limits, path, stacklevel=5)
         cut = edges.clamp(min=0).minimum(limits)
         boxes = cut.float()
         solid = (boxes[:, 2:] > boxes[:, :2]).all(-1)
@@ -386,6 +385,13 @@ class _Packed:
         own = slice(self._ends[row - 1] if row else 0, self._ends[row])
         boxes, labels, crowd = self._boxes[own], self._labels[own], self._crowd[own]
         return Annotation(boxes.clone(), labels.clone(), crowd.clone(), self.sizes[row])
+
+
+def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, stacklevel: int = 3) -> None:
+    """Warn of boxes `(N, 4)` in pictures of sizes `(N, 4)` that look like no [x, y, width, height] in pixels."""
+    if seems := _other_form(boxes, limits):
+        said = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}"
+        warnings.warn(said, stacklevel=stacklevel)
 
 
 def _other_form(boxes: torch.Tensor, limits: torch.Tensor) -> str | None:

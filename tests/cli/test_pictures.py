@@ -184,12 +184,22 @@ def test_results_have_the_ids_of_annotations_and_are_judged_by_pycocotools(run, 
 
 
 def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth):
-    truth = make_truth("a/x.jpg", "b/x.jpg", "y.jpg")
+    truth = make_truth("a/x.jpg", "b\\x.jpg", "y.jpg")
     assert truth.image_id("/photos/b/x.jpg") == 2
     assert truth.image_id("../elsewhere/y.jpg") == 3
     for name in ("c/x.jpg", "x.jpg", "z.jpg"):
         with pytest.raises(DataError, match="expected one image with the file_name of"):
             truth.image_id(name)
+
+
+def test_boxes_of_annotations_that_look_like_fractions_are_told(make_truth, tmp_path):
+    make_truth("x.jpg")
+    path = tmp_path / "truth.json"
+    data = json.loads(path.read_text())
+    data["annotations"] = [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [0.1, 0.1, 0.3, 0.4]}]
+    path.write_text(json.dumps(data))
+    with pytest.warns(UserWarning, match=r"truth\.json: bbox is .* these look like fractions of the picture"):
+        Truth(path)
 
 
 def test_annotations_judge_nothing_where_no_picture_was_looked_at(run, make_truth, tmp_path):
