@@ -182,7 +182,7 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
     many = len(rows) >= _MANY and bool((spread > size / 4).all())
 
     def mostly(odd: Tensor) -> bool:
-        return float(odd.any(-1).double().mean()) > _MOST_MISPLACED
+        return float(odd.any(-1).double().mean()) >= _MOST_MISPLACED
 
     places = middle.median(0).values.round().long().tolist()
     forms = {

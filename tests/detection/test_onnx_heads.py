@@ -227,3 +227,8 @@ def test_corners_that_were_read_as_centres_and_sizes_are_told():
     rows = torch.cat([low, low + size, noise(1, 84, 3).sigmoid()], -1)
     assert heads.misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
     assert "corners" in heads.misplaced(heads.decode_yolov8(rows.mT).boxes, (64, 64))
+
+
+def test_few_boxes_as_centres_and_sizes_are_told():
+    assert "comes first" in heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
+    assert heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
