@@ -68,8 +68,10 @@ def data(folder):
 
 
 def arguments(folder, *more):
-    paths = ["--out", str(folder / "models"), "--cache", str(folder / "cache")]
-    return ["fit", str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
+    """Of an option that is given again, the last value: the command takes it once."""
+    given = [*data(folder), "--out", str(folder / "models"), "--cache", str(folder / "cache"), *more]
+    latest = dict(zip(given[::2], given[1::2], strict=True))
+    return ["fit", str(folder / "colours.onnx"), *SMALL, *(word for option in latest.items() for word in option)]
 
 
 @pytest.mark.slow

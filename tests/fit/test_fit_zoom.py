@@ -62,6 +62,10 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     assert changed
     assert all(name.startswith("survey.") for name in changed)
     assert other.metadata["survey"]["seed"] == config.seed
+    fit_zoom(replace(config, evidence=path, refit=("spread",), out=tmp_path / "spread"))
+    other = GlimpseEvidence.from_pretrained(tmp_path / "spread" / "bright.safetensors")
+    assert replace(other.certainty, spread=model.certainty.spread) == model.certainty
+    assert all(torch.equal(before[name], tensor) for name, tensor in other.state_dict().items())
     # A fit with the same seed gives the same model.
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
