@@ -58,6 +58,18 @@ def kaplan(beta: Any, likelihood: Any) -> Any:
     return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
 
 
+def once(words: Sequence[str]) -> list[str]:
+    """The words of a command, in which each option keeps the last of its values: a command takes an option once."""
+    kept: dict[str, list[str]] = {"": []}
+    for word in words:
+        if word.startswith("--"):
+            kept.pop(word, None)
+            kept[word] = []
+        else:
+            kept[next(reversed(kept))].append(word)
+    return [word for option, values in kept.items() for word in (option, *values) if word]
+
+
 def cells_of(text: str) -> list[list[str]]:
     """The cells of all rows of the tables in a text of Markdown, with their heads and rules."""
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]

@@ -3,9 +3,7 @@
 import re
 import sys
 from collections import Counter
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import cv2
 import numpy as np
@@ -75,20 +73,11 @@ def test_a_playlist_is_no_video(video, tmp_path, suffix):
         open_stream(path)
 
 
-def test_streams_are_opened_by_their_address(video):
-    class Quiet(SimpleHTTPRequestHandler):
-        def __init__(self, *rest):
-            super().__init__(*rest, directory=video.parent)
-
-        def log_message(self, *rest):
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        stream = open_stream(f"http://admin:secret@127.0.0.1:{server.server_port}/video.avi?key=secret")
-        assert stream.name == f"http://127.0.0.1:{server.server_port}/video.avi"
-        assert len(list(stream.frames)) == 8
-        server.shutdown()
+def test_streams_are_opened_by_their_address(video, serve):
+    place = serve(video.parent).removeprefix("http://")
+    stream = open_stream(f"http://admin:secret@{place}/video.avi?key=secret")
+    assert stream.name == f"http://{place}/video.avi"
+    assert len(list(stream.frames)) == 8
 
 
 def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():

@@ -1,12 +1,9 @@
 """Named weights: the cache, sources that are tried in order, and the sources themselves on this machine."""
 
-import functools
 import hashlib
-import http.server
 import io
 import sys
 import tarfile
-import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -169,33 +166,14 @@ def test_a_missing_pip_is_named_in_the_error(package, tmp_path, monkeypatch):
         package.fetch(tmp_path / "out")
 
 
-@pytest.fixture
-def address(tmp_path):
-    """A web server on this machine that serves one file."""
-    folder = tmp_path / "served"
-    folder.mkdir()
-    (folder / "x.weights").write_bytes(CONTENT)
-
-    class Silent(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    handler = functools.partial(Silent, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
-
-
-def test_a_file_is_downloaded_from_its_address(address, tmp_path, monkeypatch):
+def test_a_file_is_downloaded_from_its_address(serve, tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    (tmp_path / "x.weights").write_bytes(CONTENT)
+    address = serve(tmp_path)
     _Address(f"{address}/x.weights").fetch(tmp_path / "out")
     assert Path(tmp_path / "out").read_bytes() == CONTENT
     with pytest.raises(DataError, match=r"missing.weights: cannot be downloaded \(HTTPError\)"):
         _Address(f"{address}/missing.weights").fetch(tmp_path / "out")
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
         _Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")
 

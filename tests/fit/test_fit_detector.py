@@ -42,6 +42,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
+from tests.small import once
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +69,8 @@ def data(folder):
 
 
 def arguments(folder, *more):
-    """Of an option that is given again, the last value: the command takes it once."""
-    given = [*data(folder), "--out", str(folder / "models"), "--cache", str(folder / "cache"), *more]
-    latest = dict(zip(given[::2], given[1::2], strict=True))
-    return ["fit", str(folder / "colours.onnx"), *SMALL, *(word for option in latest.items() for word in option)]
+    paths = ["--out", str(folder / "models"), "--cache", str(folder / "cache")]
+    return once(["fit", str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more])
 
 
 @pytest.mark.slow

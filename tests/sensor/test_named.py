@@ -17,7 +17,7 @@ from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
 from semfov.sensor.named import SensorName
 from tests.colours import write_home
-from tests.small import run_settings
+from tests.small import once, run_settings
 from train.fit_fom import main as fit_fom
 
 
@@ -100,10 +100,10 @@ def test_a_registered_sensor_without_a_fovea_runs_in_a_study(home, tmp_path, mon
 
 def given(home, out, *more):
     photographs = home / "photographs"
-    return [
+    return once([
         "--data.root", str(photographs), "--data.annotations", str(photographs / "instances.json"),
         "--sensor.name", "log-polar", "--out", str(home / out), "--cache", str(home / "cache"), "--workers", "1", *more,
-    ]  # fmt: skip
+    ])  # fmt: skip
 
 
 def searching(home, out, policies, *more):

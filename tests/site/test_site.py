@@ -4,11 +4,8 @@ import json
 import os
 import re
 import shutil
-import threading
 import zlib
-from functools import partial
 from html.parser import HTMLParser
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -130,25 +127,6 @@ def test_tutorials_have_pictures_with_content_and_alt_text(site, can_run, source
 
 
 @pytest.fixture
-def address(site):
-    """Address of the site on a local server, which its search needs."""
-    handler = partial(Quiet, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    """A request handler that prints no log."""
-
-    def log_message(self, *_):
-        pass
-
-
-@pytest.fixture
 def opened():
     """A page of a browser, and the list of addresses that it requests."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
@@ -189,7 +167,8 @@ ANSWERS = """() => {
 }"""
 
 
-def test_the_search_works_and_requests_nothing_from_elsewhere(address, opened):
+def test_the_search_works_and_requests_nothing_from_elsewhere(site, serve, opened):
+    address = serve(site)
     page, asked = opened
     page.goto(f"{address}/index.html")
     box = page.locator("input[placeholder]:visible").first

@@ -77,9 +77,7 @@ def test_blur_in_tiles_compiles_and_vectorises() -> None:
 
 
 @pytest.mark.parametrize(("size", "length"), [((200, 170), (90, 61)), ((190, 40), (63, 41)), ((300, 200), (450, 199))])
-def test_resizing_to_other_sizes_equals_opencv(
-    size: tuple[int, int], length: tuple[int, int], dtype: torch.dtype
-) -> None:
+def test_resizing_to_other_sizes_equals_opencv(size, length, dtype):
     image = torch.rand(size, dtype=dtype)
     expected = cv2.resize(image.double().numpy(), length[::-1], interpolation=cv2.INTER_CUBIC)
     # The weights in OpenCV are in single precision.
@@ -89,9 +87,7 @@ def test_resizing_to_other_sizes_equals_opencv(
 @pytest.mark.parametrize(
     ("size", "factors"), [((60, 90), (2, 4)), ((30, 21), (16, 8)), ((100, 61), (3, 7)), ((80, 170), (3, 1))]
 )
-def test_enlargement_in_tiles_equals_opencv(
-    size: tuple[int, int], factors: tuple[int, int], dtype: torch.dtype
-) -> None:
+def test_enlargement_in_tiles_equals_opencv(size, factors, dtype):
     image = torch.rand(size, dtype=dtype)
     height, width = size[0] * factors[0], size[1] * factors[1]
     expected = cv2.resize(image.double().numpy(), (width, height), interpolation=cv2.INTER_CUBIC)

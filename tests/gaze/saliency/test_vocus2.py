@@ -64,9 +64,7 @@ def opencv_vocus2(
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
 @pytest.mark.parametrize(("centre", "surround", "scales"), [(2.0, 6.0, 1), (3.0, 13.0, 2), (2.0, 6.0, 3)])
-def test_saliency_equals_the_steps_in_opencv(
-    photograph: np.ndarray, fusion: str, centre: float, surround: float, scales: int, dtype: torch.dtype
-) -> None:
+def test_saliency_equals_the_steps_in_opencv(photograph, fusion, centre, surround, scales, dtype):
     image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
     saliency = VOCUS2(centre, surround, scales=scales, fusion=fusion)(image)
     assert saliency.dtype == dtype
@@ -84,9 +82,7 @@ def test_saliency_in_lab_equals_that_of_lab_channels_by_scikit_image(photograph:
 
 @pytest.mark.parametrize("color_space", ["opponent", "lab"])
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (7, 5), (33, 200)])
-def test_any_size_and_uniform_images(
-    size: tuple[int, int], color_space: str, dtype: torch.dtype, device: torch.device
-) -> None:
+def test_any_size_and_uniform_images(size, color_space, dtype, device):
     image = torch.rand(1, 3, *size, dtype=dtype, device=device)
     saliency = vocus2_saliency(image, color_space=color_space)
     assert saliency.shape == (1, *size)

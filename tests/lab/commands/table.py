@@ -20,6 +20,7 @@ from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye
 from semfov.zoom import GlimpseEvidence
 from tests.colours import CLASSES, write_network, write_photographs
+from tests.small import once
 
 NETWORK = ("--detector.name", "HERE/colours.onnx")
 PHOTOGRAPHS = ("--data.root", "HERE/photographs", "--data.annotations", "HERE/photographs/instances.json",
@@ -84,7 +85,7 @@ def small_run(name: str, folder: Path, *more: str) -> Path:
     """Run the small run of a command in a folder, with more settings; returns the folder of its outcomes."""
     write_material(folder)
     module, *job = name.split()
-    words = [*job, *(word.replace("HERE", str(folder)) for word in (*COMMANDS[name].settings, *more))]
+    words = once([*job, *(word.replace("HERE", str(folder)) for word in (*COMMANDS[name].settings, *more))])
     paths = ["--out", str(folder / "out"), "--cache", str(folder / "cache"), "--workers", "1"]
     assert importlib.import_module(module).main([*words, *paths]) == 0
     return folder / "out"

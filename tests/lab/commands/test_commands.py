@@ -14,6 +14,8 @@ import torch
 import yaml
 from safetensors import safe_open
 
+from tests.small import once
+
 from .table import COMMANDS, MODEL, RUN, write_material
 
 ROOT = Path(__file__).parents[3]
@@ -23,7 +25,7 @@ def words(name, folder, *more, workers=1):
     """Words of a small run that writes to `out` and `cache` in a folder."""
     command, (_, *job) = COMMANDS[name], name.split()
     paths = ["--out", str(folder / "out"), "--cache", str(folder / "cache")]
-    return [*job, *more, *paths, *(["--workers", str(workers)] if command.workers else [])]
+    return once([*job, *more, *paths, *(["--workers", str(workers)] if command.workers else [])])
 
 
 def run(name, *arguments):
