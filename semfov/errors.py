@@ -274,7 +274,21 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
 
 
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither."""
+    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither.
+
+    Args:
+        function: the method.
+
+    Returns:
+        The method, which checks its arguments first.
+
+    Raises:
+        InputError: by the method: an argument is unknown, missing or one too many.
+
+    >>> checked_keywords(lambda self, picture: picture)(None, pictur="a.jpg")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    semfov.errors.InputError: ...
+    """
     form = signature(function)
     _, *known = form.parameters
     words = [each.name if each.default is each.empty else f"{each.name}=" for each in form.parameters.values()][1:]

@@ -21,6 +21,7 @@ from semfov.cli.main import main as semfov_command
 from semfov.detection.weights import fetch
 from tests.colours import SMALL, write_network, write_photographs
 from tests.reader import fill
+from tests.small import once
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -151,14 +152,14 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
         write_photographs(folder / name).rename(folder / instances)
     fit, find, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
     tiny = [*SMALL, *["--data.limit", "6", "--holdout", "3", "--steps", "3", "--map_steps", "3", "--fixations", "2"]]
-    assert written_files(run([*fit, *tiny]))
+    assert written_files(run(once([*fit, *tiny])))
     assert "red" in run(find)
     assert "red" in run(search)
     task = (ROOT / "docs/tasks/own-detector.md").read_text(encoding="utf-8")
     assert all(line in task for line in OWN)
     (block,) = re.findall(r"```python\n(.*?)```", task, re.S)
     exec(compile(block, "own-detector.md", "exec"), {})
-    assert written_files(run([*study, "--data.min_instances", "0", "--data.limit", "1"]))
+    assert written_files(run(once([*study, "--data.min_instances", "0", "--data.limit", "1"])))
 
 
 @pytest.mark.weights
