@@ -14,7 +14,6 @@ pytestmark = [pytest.mark.weights, pytest.mark.slow, pytest.mark.lab]
 SEARCHES = [
     "recommended",
     "random",
-    "vocus2",
     PolicyConfig("non-predictive", "calibrated", tempering=0.25, memory="closest", footprint="soft", misses=True),
 ]
 EXPLORATIONS = ["recommended", "kl-calibrated"]
