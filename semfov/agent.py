@@ -216,7 +216,7 @@ class ActivePerception(nn.Module):
             raise AttributeError(f"an agent has search, find_all and explore, not {name!r}")
         return super().__getattr__(name)
 
-    def forward(self, *_: Any, **__: Any) -> NoReturn:
+    def __call__(self, *_: Any, **__: Any) -> NoReturn:
         raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
 
     def __repr__(self) -> str:
