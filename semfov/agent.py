@@ -73,6 +73,7 @@ class ActivePerception(nn.Module):
         agent.search(semfov.Panorama("street.jpg"), "bicycle").plot()
     """
 
+    @checked_keywords
     def __init__(
         self,
         eye: Eye,
@@ -87,8 +88,7 @@ class ActivePerception(nn.Module):
         self.eye = eye
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
-        self.verification = verification
-        self.windows = windows
+        self.verification, self.windows = verification, windows
         check_cells(grid)
         self.columns, self.rows = grid
         self._check_parts()

@@ -289,17 +289,17 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
     Traceback (most recent call last):
     semfov.errors.InputError: ...
     """
-    form = signature(function)
+    form, name = signature(function), function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
     _, *known = form.parameters
     words = [each.name if each.default is each.empty else f"{each.name}=" for each in form.parameters.values()][1:]
 
     @wraps(function)
     def call(*given: _Given.args, **options: _Given.kwargs) -> _Result:
-        check_options(options, known, function.__name__)
+        check_options(options, known, name)
         try:
             form.bind(*given, **options)
         except TypeError as error:
-            raise InputError(f"{function.__name__}: {error}; expected {', '.join(words)}") from None
+            raise InputError(f"{name}: {error}; expected {', '.join(words)}") from None
         return function(*given, **options)
 
     return call

@@ -312,6 +312,7 @@ def test_unknown_keywords_are_refused_with_the_near_ones(method, name, remedy, a
             "search: too many positional arguments; expected picture, target, ",
         ),
         (lambda agent: agent.search(PIXELS, "cup", target="cup"), "search: multiple values for argument 'target'"),
+        (lambda agent: type(agent)("yolox-nano"), "ActivePerception: missing a required argument: 'search'; "),
         (lambda agent: agent(PIXELS), "an agent is not called itself: it has search, find_all, explore"),
         (lambda agent: agent.track, "an agent has search, find_all and explore, not 'track'"),
         (lambda agent: agent.explore(PIXELS, shifts=1).boxes, "Scanpath has no attribute 'boxes'; use its objects"),
