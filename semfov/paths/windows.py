@@ -151,12 +151,12 @@ class ZoomPath(GazeRecord):
 
     @property
     def reacts(self) -> bool:
-        """Whether the detector reacts to what is there, so that a number of objects can be believed.
+        """Whether the detector reacts to one of the classes at least, so that a number of objects can be believed.
 
         It does where objects are listed of which five or more have a probability of one half, or where these make up
         three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
         """
-        return self._reacts_to(self._sought)
+        return any(self._reacts_to([label]) for label in self._sought or self.candidates.labels.unique().tolist())
 
     def to_dict(self) -> dict[str, Any]:
         """The outcome, the objects and the looks as JSON values, without numbers that are not claimed.
@@ -233,7 +233,7 @@ class ZoomPath(GazeRecord):
 
         Where fewer are expected than are counted, it is said how many of those counted are right. Without a class to
         search for there is no such number, since the small rests of all classes add up to many. Of one object it would
-        say no more. Where the detector hardly reacts to what is there (`reacts`), no number is given either.
+        say no more. No number is given of a class to which the detector hardly reacts (`reacts`).
 
         Returns:
             A phrase such as `41 × person from probability or score 0.5 (about 47 ± 5 that this detector can show)`, or
@@ -242,16 +242,20 @@ class ZoomPath(GazeRecord):
         text = super().objects_in_words()
         if self.unseen is None or not self._sought:
             return text
-        if not self.reacts:
-            return f"{text} (the detector hardly reacts, so no number is given)"
-        chances = self.objects.scores
-        if len(chances) == 1:
+        claimed = [label for label in self._sought if self._reacts_to([label])]
+        if not claimed:
+            why = "beside many faint candidates" if len(self.objects) else "the detector hardly reacts"
+            return f"{text} ({why}, so no number in all is given)"
+        if len(self.objects) == 1:
             return text
+        chances, numbers = self.objects.of(claimed).scores, self._numbers()
         (mean, variance), of = number_of(chances, (0.0, 0.0), self.spread), "of them right"
-        means, variances = zip(*self._numbers().values(), strict=True)
+        means, variances = zip(*(numbers[label] for label in claimed), strict=True)
         if round(sum(means)) >= len(chances):
             mean, variance, of = sum(means), sum(variances), "that this detector can show"
-        return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of})"
+        left = [self.classes[label] for label in self._sought if label not in claimed]
+        without = f", without {' and '.join(left)}" if left else ""
+        return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of}{without})"
 
     def _looks(self) -> Iterator[RecordedLook]:
         clock = self.seconds or (None,) * len(self.glances)

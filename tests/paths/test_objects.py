@@ -17,7 +17,7 @@ from semfov.zoom.glances import Glance, around, overview
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
-HARDLY = "the detector hardly reacts, so no number is given"
+HARDLY = "so no number in all is given"
 LEFT, RIGHT = [10.0, 10, 30, 30], [50.0, 40, 70, 55]
 
 
@@ -102,7 +102,11 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
             (0.0, 0.0),
             "3 × cup from probability or score 0.5 (about 3 ± 1 that this detector can show)",
         ),
-        ([0.9, *[0.3] * 9], (0.0, 0.0), f"1 × cup from probability or score 0.5 ({HARDLY})"),
+        (
+            [0.9, *[0.3] * 9],
+            (0.0, 0.0),
+            f"1 × cup from probability or score 0.5 (beside many faint candidates, {HARDLY})",
+        ),
         ([0.9, 0.1], (0.0, 0.0), "1 × cup from probability or score 0.5"),
         (
             [*[0.6] * 5, *[0.4] * 20],
@@ -114,7 +118,7 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
         (
             [0.2],
             (0.0, 0.0),
-            f"0 × cup from probability or score 0.5 ({HARDLY})",
+            f"0 × cup from probability or score 0.5 (the detector hardly reacts, {HARDLY})",
         ),
     ],
 )
@@ -142,6 +146,8 @@ def test_a_number_is_claimed_class_by_class():
     error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
     assert path.expected_error["cup"] == pytest.approx(error**0.5)
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
+    said = "2 × cup, 0 × cat from probability or score 0.5 (about 2 ± 1 that this detector can show, without cat)"
+    assert path.objects_in_words() == said
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])
     values = path.to_dict()
