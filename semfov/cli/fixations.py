@@ -12,7 +12,8 @@ import numpy as np
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
 from semfov.data.fixations.reading import PictureSizes, frame_of, json_reader
-from semfov.errors import DataError, SemfovError, check, printable
+from semfov.data.sources import PHOTOGRAPHS
+from semfov.errors import DataError, InputError, SemfovError, check, printable
 
 
 def check_fixations(options: CheckOptions) -> int:
@@ -20,14 +21,20 @@ def check_fixations(options: CheckOptions) -> int:
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
     given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
     given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
-    folder = Path(given.pop("picture")) if "picture" in given and Path(given["picture"]).is_dir() else None
-    sizes = None if folder is None else PictureSizes(folder)
+    place = None if options.picture is None else Path(options.picture)
+    folder = place is not None and place.is_dir()
+    if folder:
+        del given["picture"]
+    pictures = place is not None and (folder or (place.is_file() and place.suffix.lower() in PHOTOGRAPHS))
+    sizes = PictureSizes(place) if place is not None and pictures else None
     wrong = False
     for name in options.files:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of what the lines below say
                 records = _records(Path(name), given, sizes)
+            if sizes is not None and not folder:  # one picture is compared with what was looked at in it
+                records = [each for each in records if each.picture in sizes] or records
             lines = suspicions(records, sizes)
         except SemfovError as error:
             if len(options.files) == 1:
@@ -38,7 +45,9 @@ def check_fixations(options: CheckOptions) -> int:
         kind = json_reader(name)[0] if name.lower().endswith(".json") else None
         usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
         print(f"{printable(name)}: {_content(records, usual)}")
-        print(*(f"  suspicious: {line}" for line in lines), sep="\n") if lines else print("  nothing is suspicious")
+        compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
+        found = [f"  suspicious: {line}" for line in lines] or [f"  nothing is suspicious{compared}"]
+        print(*found, sep="\n")
         wrong = wrong or bool(lines)
     return 1 if wrong else 0
 
@@ -47,9 +56,18 @@ def _records(path: Path, given: Mapping[str, Any], sizes: PictureSizes | None) -
     """The records of a file; where it has no frames, they are the pictures."""
     try:
         return read_fixations(path, **given)
-    except DataError as error:
-        if sizes is None or "size" in given or "give size=" not in str(error):
+    except InputError as error:
+        if "picture" not in given or not str(error).startswith("picture: expected an option"):
             raise
+        # The file names its pictures.
+        check(sizes is not None, "picture", "a picture or folder that exists", given["picture"])
+        return _records(path, {name: value for name, value in given.items() if name != "picture"}, sizes)
+    except DataError as error:
+        # A frame of EyeLink is a screen.
+        if "size" in given or "give size=" not in str(error) or path.suffix.lower() == ".asc":
+            raise
+        if sizes is None:
+            raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
         return read_fixations(path, **given, size=sizes)
 
 

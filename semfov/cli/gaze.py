@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +118,16 @@ class _GazeJob:
         outcomes = [self.outcomes[number] for number in sorted(self.outcomes)]
         written = [Path(each["density"]) for each in outcomes if "density" in each]
         if self.table is not None and outcomes:
+            # As in the folder, or where two pictures would then have one name, as they were named.
+            names = [Path(source.name).name for source in self.sources]
+            count = Counter(name.lower() for name in names)
+            names = [
+                name if count[name.lower()] == 1 else source.name
+                for name, source in zip(names, self.sources, strict=True)
+            ]
             paths = [
-                Fixations(each["picture"], subject, np.array(points), tuple(each["size"]), np.array(durations))
-                for each in outcomes
+                Fixations(names[number], subject, np.array(points), tuple(each["size"]), np.array(durations))
+                for number, each in sorted(self.outcomes.items())
                 for subject, points, durations in each["viewers"]
             ]
             write_table(self.table, paths)
@@ -145,4 +153,4 @@ def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Ou
     )
     viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
     part = None if options.report is None else gaze_part(prediction, paths)
-    return {"text": text, "picture": prediction.name, "size": prediction.size, "viewers": viewers, "part": part}
+    return {"text": text, "size": prediction.size, "viewers": viewers, "part": part}

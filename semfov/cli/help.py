@@ -26,6 +26,7 @@ Commands:
   check       say what is suspicious in a file of fixations
   fit         fit all models to your own detector
   detectors   list detectors, or the classes of one
+  completion  let bash, zsh or fish complete commands and options
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
 `semfov completion bash >> ~/.bashrc` lets the shell complete commands and options (also zsh and fish).
@@ -123,7 +124,9 @@ usage: semfov check FILE [FILE ...] [options]
 
   FILE                 a table of fixations, as semfov, Tobii, Pupil Labs, PsychoPy, PyGaze, Gazepoint, pymovements or
                        EyeLink Data Viewer write it, an ASC file of EyeLink, or JSON of COCO-Search18 or OSIE
-  --size W,H           the frame, where the file has none; --picture NAME and --subject NAME likewise
+  --picture FOLDER     the pictures, or one picture (kitchen.jpg), whose sizes are compared with the frames, and are the
+                       frames where the file has none
+  --picture NAME       the picture's name, where the file has none; --subject NAME and --size W,H (the frame) likewise
   --quiet              errors alone
 
 It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. The exit code
@@ -173,7 +176,8 @@ usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] 
   --closer N           most closer looks in the time until half of the belief has faded (0: none)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
-  --out FILE           video to write, with gaze and belief, or windows and objects
+  --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects
+  --out FOLDER         likewise, as a video in this folder
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
 """,

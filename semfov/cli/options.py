@@ -191,7 +191,8 @@ class LiveOptions(AgentOptions):
         closer: largest number of closer looks in the time until half of the belief has faded (none: 2 for a fovea, as
             many as there are frames for windows); 0: none.
         white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
-        out: video to write, with gaze and belief, or windows and objects, drawn into each frame.
+        out: video to write, `.mp4` or `.avi`, or a folder for it, with gaze and belief, or windows and objects, drawn
+            into each frame.
     """
 
     source: str | None = None
@@ -272,8 +273,8 @@ class CheckOptions(Settings):
     Args:
         files: tables, ASC files of EyeLink, or JSON files of fixations.
         size: width and height of the frame, `1920,1080`, where the file has none.
-        picture: name of the picture, where the file has none; or the folder of the pictures that it names, whose sizes
-            are compared with the frames, and are the frames where the file has none.
+        picture: name of the picture, where the file has none; or a picture or folder of pictures that the file names,
+            whose sizes are compared with the frames, and are the frames where the file has none.
         subject: name of the person, where the file has none.
         quiet: print errors alone; the exit code tells whether anything is suspicious.
     """

@@ -71,7 +71,7 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
         warnings.warn(f"{source}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=2)
     if not files:
         where = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
-        expected = f"photographs ({', '.join(PHOTOGRAPHS)}) in {source}, {where}"
+        expected = f"photographs (.jpg, .png, .tif, …) in {source}, {where}"
         raise DataError(f"picture: expected {expected}, got none")
     return files
 

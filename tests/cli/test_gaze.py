@@ -73,6 +73,16 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
 
 
+def test_pictures_of_one_name_stay_apart_in_the_table(run, photos, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    Image.new("RGB", (50, 40)).save(other / "0.png")
+    table = tmp_path / "gaze.csv"
+    assert run(photos, other / "0.png", "--people", 2, "--out", table)[0] == 0
+    sizes = {each.picture: each.size for each in read_table(table)}
+    assert sizes == {str(photos / "0.png"): (120, 90), "1.png": (80, 100), str(other / "0.png"): (50, 40)}
+
+
 def test_a_command_that_is_stopped_has_written_the_pictures_so_far_and_continues(run, photos, tmp_path, monkeypatch):
     made, looked = GazePrediction.of, []
 

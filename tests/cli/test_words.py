@@ -117,9 +117,15 @@ def test_wrong_use_is_refused_in_one_line_with_exit_code_2(command, tmp_path, ca
 def test_alone_it_lists_its_commands(words, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
-    assert all(re.search(rf"^  {name} ", printed, re.M) for name in _SUBCOMMANDS)
+    assert all(re.search(rf"^  {name} ", printed, re.M) for name in (*_SUBCOMMANDS, "completion"))
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"semfov {semfov.__version__}\n"
+
+
+@pytest.mark.parametrize("name", ["gaze", "live", "search"])
+def test_help_tells_that_the_output_may_be_a_file_or_a_folder(name, capsys):
+    main([name, "--help"])
+    assert {"FILE", "FOLDER"} <= {*re.findall(r"^  --out (\w+)", capsys.readouterr().out, re.M)}
 
 
 @pytest.mark.parametrize("name", _SUBCOMMANDS)

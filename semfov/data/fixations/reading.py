@@ -93,7 +93,7 @@ def json_reader(path: str | PathLike[str]) -> tuple[str, Callable[..., list[Fixa
 
 
 class PictureSizes(Mapping[str, tuple[int, int]]):
-    """`(width, height)` of the pictures in a folder, by names as tables have them: with any path, and any ending."""
+    """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
 
     def __init__(self, folder: Path) -> None:
         self._files: dict[str, Path] = {}
@@ -104,8 +104,9 @@ class PictureSizes(Mapping[str, tuple[int, int]]):
 
     def __getitem__(self, name: str) -> tuple[int, int]:
         whole = name.lower().replace("\\", "/")
-        last = whole.rpartition("/")[2]
-        path = next((self._files[each] for each in (whole, last, Path(last).stem) if each in self._files), None)
+        parts = whole.split("/")
+        names = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
+        path = next((self._files[each] for each in names if each in self._files), None)
         if path is None:
             raise KeyError(name)
         if path not in self._sizes:

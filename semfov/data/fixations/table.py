@@ -15,6 +15,7 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.data.fixations.suspicions import warn_of_frames
+from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import check_regular, read_text, write_text
 
@@ -162,6 +163,9 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
         raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
     if not path.exists():
         raise DataError(f"{path}: no such file; check the path")
+    if path.suffix.lower() in (*PHOTOGRAPHS, *VIDEOS):
+        got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
+        raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
     check_regular(path)
     try:
         text = read_text(path)

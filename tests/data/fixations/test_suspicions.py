@@ -9,6 +9,7 @@ from PIL import Image
 
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
+from semfov.data.fixations.reading import PictureSizes
 from semfov.errors import DataError
 
 SIZE = (800, 600)
@@ -86,7 +87,7 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
     assert main(["check", str(tmp_path / "good.csv")]) == 0
     shown = capsys.readouterr().out
     assert "320 fixations, 40 scanpaths, 1 person, 40 pictures, frames of 800 × 600; they take" in shown
-    assert "nothing is suspicious" in shown
+    assert "nothing is suspicious; frames were not compared with pictures (--picture FOLDER)\n" in shown
     write_table(tmp_path / "bad.csv", KINDS["origin"][0])
     assert main(["check", str(tmp_path / "good.csv"), str(tmp_path / "bad.csv"), str(tmp_path / "none.csv")]) == 1
     shown = capsys.readouterr().out
@@ -95,7 +96,7 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
     (tmp_path / "neon.csv").write_text("fixation id,duration [ms],fixation x [px],fixation y [px]\n1,250,800,600\n")
     command = ["check", str(tmp_path / "neon.csv"), "--picture", "scene.mp4"]
     assert main(command) == 1
-    assert "give --size" in capsys.readouterr().err
+    assert "give --size, or give its pictures by --picture FOLDER" in capsys.readouterr().err
     assert main([*command, "--size", "1600,1200"]) == 0
     assert main([*command, "--size", "wide"]) == 1
     write_osie(tmp_path / "free.json", people(2))
@@ -125,6 +126,39 @@ def test_pictures_of_a_folder_are_compared_with_the_frames_by_their_names(tmp_pa
     table.write_text("picture,subject,x,y\nb,1,600,400\nc,1,390,590\n")
     assert main(command) == 0
     assert "frames of 400 × 600, 640 × 480" in capsys.readouterr().out
+
+
+def test_one_picture_is_compared_with_its_frame_and_one_that_is_not_there_is_refused(tmp_path, capsys):
+    (tmp_path / "none").mkdir()
+    for name, size in (("0.jpg", SIZE), ("1.jpg", (400, 600))):
+        Image.new("L", size).save(tmp_path / name)
+    write_table(tmp_path / "t.csv", people(2))
+
+    def told(place):
+        code = main(["check", str(tmp_path / "t.csv"), "--picture", str(tmp_path / place)])
+        return code, *capsys.readouterr()
+
+    code, out, err = told("0.jpg")
+    assert (code, err) == (0, "")
+    assert "1 picture, " in out
+    assert out.endswith("  nothing is suspicious\n")
+    assert "have other proportions than their frames, such as 1.jpg, 400 × 600 in 800 × 600" in told("1.jpg")[1]
+    code, _, err = told("nosuch")
+    assert code == 1
+    assert f"picture: expected a picture or folder that exists, got {tmp_path / 'nosuch'}\n" in err
+    assert "picture: expected photographs (.jpg, .png, .tif, …) in " in told("none")[2]
+    # Without a frame in an export that names no picture, it is the picture that is named.
+    (tmp_path / "t.csv").write_text("fixation id,duration [ms],fixation x [px],fixation y [px]\n1,250,300,500\n")
+    assert "1 picture, frames of 400 × 600" in told("1.jpg")[1]
+
+
+def test_pictures_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    for name, side in (("a/p.png", 8), ("b/p.png", 9)):
+        (tmp_path / name).parent.mkdir()
+        Image.new("L", (side, side)).save(tmp_path / name)
+    sizes = PictureSizes(tmp_path)
+    for before in ("", "x/", f"{tmp_path}/"):
+        assert [sizes[f"{before}{name}/p.png"] for name in "aB"] == [(8, 8), (9, 9)]
 
 
 def test_columns_of_an_export_are_taken_with_its_units(tmp_path):

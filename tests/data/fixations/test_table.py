@@ -209,6 +209,13 @@ def test_files_that_are_no_text_are_refused_with_their_reader(tmp_path, kind):
         read_fixations(tmp_path / f"a.{kind}")
 
 
+@pytest.mark.parametrize(("name", "kind"), [("kitchen.JPG", "picture"), ("scene.mp4", "video")])
+def test_pictures_and_videos_are_refused_as_such(tmp_path, name, kind):
+    (tmp_path / name).write_bytes(b"\xff\xd8")
+    with pytest.raises(DataError, match=rf"expected a table of fixations \(.*\), got a {kind}$"):
+        read_fixations(tmp_path / name)
+
+
 def test_tables_of_other_types_and_numbers_of_python_are_refused(tmp_path):
     for source in ({"picture": ["a.jpg"]}, [{"x": 1}]):
         with pytest.raises(InputError, match=r"source: expected a file, or a pandas.DataFrame .*, got a (dict|list)"):
