@@ -20,7 +20,6 @@ from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
-from semfov.data.fixations import Fixations
 from semfov.data.inputs import Color
 from semfov.data.tone import White
 from semfov.data.windowed import ChosenBands
@@ -37,6 +36,7 @@ from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, GazeRecord
+from semfov.paths.gaze import ScanpathLike
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
@@ -213,7 +213,7 @@ class ActivePerception(nn.Module):
     def __getattr__(self, name: str) -> Any:
         """The parts of the module; other libraries' words for what an agent does are refused with its own."""
         if name in ("detect", "find", "locate", "predict", "track"):
-            raise AttributeError(f"an agent has search, find_all and explore, not {name!r}")
+            raise AttributeError(f"an agent has search, find_all, explore, gaze and live, not {name!r}")
         return super().__getattr__(name)
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
@@ -501,7 +501,7 @@ class ActivePerception(nn.Module):
         picture: PictureLike,
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
-        seen: Fixations | None = None,
+        seen: ScanpathLike | None = None,
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
@@ -511,8 +511,8 @@ class ActivePerception(nn.Module):
         Args:
             picture: a photograph, as for `search`.
             model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
-            seen: fixations, a pass for each; the prediction then knows only what the agent's fovea has shown at them
-                (`semfov.saliency.features_so_far`). None for the sharp picture.
+            seen: fixations, a record, or points, a pass for each; the prediction then knows only what the agent's fovea
+                has shown at them (`semfov.saliency.features_so_far`). None for the sharp picture.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.

@@ -29,7 +29,9 @@ OTHER_WORDS: dict[str, tuple[str, ...]] = {
 
 RECORD_WORDS = {
     **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
-    **dict.fromkeys(("box", "confidence", "probability", "score"), "its decision, such as record.decision.box"),
+    "box": "record.decision.box, or its objects, record.objects.boxes",
+    **dict.fromkeys(("confidence", "probability", "score"), "record.decision.probability"),
+    **dict.fromkeys(("outcome", "result"), "record.decision.outcome"),
     **dict.fromkeys(("count", "counts", "number"), "len(record.objects), or record.expected with what was not seen"),
     **dict.fromkeys(("dataframe", "df", "to_dataframe", "to_df", "to_pandas"), "record.to_frame()"),
     **dict.fromkeys(("draw", "show", "visualize"), "record.plot()"),

@@ -434,7 +434,9 @@ def test_agents_and_streams_are_printed_in_one_line():
 def test_words_of_other_libraries_are_refused_with_those_of_an_agent():
     agent = one_agent(Coloured(("red", "wine glass")))
     for name in ("detect", "find", "predict"):
-        with pytest.raises(AttributeError, match=f"an agent has search, find_all and explore, not '{name}'"):
+        with pytest.raises(
+            AttributeError, match=f"an agent has search, find_all, explore, gaze and live, not '{name}'"
+        ):
             getattr(agent, name)
     with pytest.raises(AttributeError, match=r"has no attribute 'nothing'$"):
         _ = agent.nothing

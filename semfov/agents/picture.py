@@ -59,6 +59,8 @@ class OpenedPicture:
 
     def image(self, like: Tensor) -> Tensor:
         """The pixels for a fovea, `(1, 3, H, W)`."""
+        remedy = "a scene is looked at by search, find_all and explore"
+        check(not self.scene, "picture", "a flat picture for a fovea", f"a {type(self.source).__name__}; {remedy}")
         source, path = self.source, isinstance(self.source, str | PathLike)
         if isinstance(source, LargePicture) or (path and Path(cast(str, source)).suffix.lower() in BY_WINDOWS):
             width, height = self.large.size

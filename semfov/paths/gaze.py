@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, write_table
+from semfov.data.fixations.suspicions import check_viewed, warn_outside
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import FeatureMaps
@@ -26,6 +27,7 @@ from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
+from semfov.paths.base import GazeRecord
 from semfov.paths.stimulus import reduced_copy
 from semfov.words import GAZE_WORDS, missing
 
@@ -39,6 +41,9 @@ _REACH = 0.05
 _LONGEST = 100
 """Largest number of fixations of a drawn scanpath."""
 
+ScanpathLike = Fixations | GazeRecord | Tensor | np.ndarray | Sequence[Sequence[float]]
+"""Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
+
 
 @dataclass(frozen=True, repr=False, eq=False)
 class GazePrediction:
@@ -50,6 +55,7 @@ class GazePrediction:
         size: `(width, height)` of the picture in pixels.
         photograph: `(3, h, w)`, bytes, the reduced picture.
         source: file of the picture; None if it does not come from a file.
+        seen: number of fixations at which the fovea has seen the picture; None for the sharp picture.
 
     Example::
 
@@ -64,6 +70,7 @@ class GazePrediction:
     size: tuple[int, int]
     photograph: Tensor
     source: str | None = None
+    seen: int | None = None
 
     if not TYPE_CHECKING:  # to which any name would be one of a prediction
 
@@ -78,7 +85,7 @@ class GazePrediction:
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
         source: str | None = None,
-        seen: Fixations | None = None,
+        seen: ScanpathLike | None = None,
     ) -> Self:
         """Predict where people look in a picture, from one pass of a detector.
 
@@ -87,15 +94,15 @@ class GazePrediction:
             image: `(3, H, W)`, RGB in [0, 1].
             model: a model that was fitted to the detector, or its file or folder; None for the one that is shipped.
             source: file of the picture.
-            seen: fixations at which the eye has looked, in any size of the picture; the prediction then knows only what
-                the fovea has shown. None for the sharp picture.
+            seen: fixations at which the eye has looked, or a record, in any size of the picture, or points in its
+                pixels; the prediction then knows only what the fovea has shown. None for the sharp picture.
 
         Returns:
             The prediction.
 
         Raises:
             InputError: no model is shipped for the detector, or the given one was fitted to another detector; or the
-                frame of `seen` has other proportions, or the sensor of the eye bends the picture.
+                fixations of `seen` are not those of one viewer of this picture, or the sensor of the eye bends it.
             DataError: the file of the model is missing or damaged.
         """
         detector = looking.detector if isinstance(looking, Eye) else looking
@@ -113,14 +120,15 @@ class GazePrediction:
                 _, maps = detector.propose_with_features(canvas, [*model.layers])
                 features = FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
             elif isinstance(looking, Eye):
-                _check_frame(seen, size, "seen")
-                points = torch.from_numpy(seen.resized(size).points).to(image)
+                seen = _fixations_of(seen, "seen", size, source)
+                points = torch.from_numpy(seen.points).to(image)
                 views = looking.features(looking.open(image[None]), points, [*model.layers])
                 features = features_so_far(views, points, points[None])
             else:
                 raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
             terms = model.to(image).terms(features, size[::-1])
-        return cls(model.cpu(), {name: each.cpu() for name, each in terms.items()}, size, reduced_copy(image), source)
+        terms, looks = {name: each.cpu() for name, each in terms.items()}, None if seen is None else len(seen)
+        return cls(model.cpu(), terms, size, reduced_copy(image), source, looks)
 
     @cached_property
     def density(self) -> Tensor:
@@ -249,23 +257,23 @@ class GazePrediction:
             given = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
         return torch.stack([*given.values()]).sum(0).flatten(1).softmax(1).mean(0).view_as(self.cells)
 
-    def next_density(self, scanpath: Fixations) -> Tensor:
+    def next_density(self, scanpath: ScanpathLike) -> Tensor:
         """Probability of a viewer's next fixation in each pixel of the picture, after the fixations so far.
 
         What is known of the picture is the same as for `density`: all of it, or with `agent.gaze(picture,
         seen=scanpath)` what a fovea has shown at these fixations.
 
         Args:
-            scanpath: the fixations so far, in any size of the picture.
+            scanpath: the fixations so far, or a record, in any size of the picture, or points in its pixels.
 
         Returns:
             `(H, W)`, with sum 1.
 
         Raises:
-            InputError: the frame of the fixations has other proportions.
+            InputError: they are not the fixations of one viewer of this picture.
         """
-        _check_frame(scanpath, self.size, "scanpath")
-        return self._over_pixels(self.given([scanpath], len(scanpath)).log())
+        viewed = _fixations_of(scanpath, "scanpath", self.size, self.source)
+        return self._over_pixels(self.given([viewed], len(viewed)).log())
 
     def compare(self, people: Sequence[Fixations]) -> dict[str, float]:
         """Compare the density with fixations of people in the same picture, all but the first of each person.
@@ -285,7 +293,7 @@ class GazePrediction:
         pictures = sorted({each.picture for each in people})
         check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
         for each in people:
-            _check_frame(each, self.size, "people")
+            check_viewed(each, "people", self.size)
         from semfov.metrics.scanpath.density import compare_density
 
         return compare_density(self, people)
@@ -386,10 +394,11 @@ class GazePrediction:
 
     def describe(self) -> str:
         """Describe the prediction in one line."""
-        first = self.peaks(1)[0]
+        first, plural = self.peaks(1)[0], "" if self.seen == 1 else "s"
+        known = "" if self.seen is None else f", after {self.seen} fixation{plural} seen by the fovea"
         return (
             f"{first['share']:.0%} of fixations within {_REACH:.0%} of ({first['x']:.0f}, {first['y']:.0f}); "
-            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits"
+            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{known}"
         )
 
     def __repr__(self) -> str:
@@ -410,8 +419,19 @@ class GazePrediction:
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
 
 
-def _check_frame(fixations: Fixations, size: tuple[int, int], name: str) -> None:
-    """Refuse fixations in a frame of other proportions than those of `(width, height)`, up to rounding."""
-    width, height = size
-    same = abs(fixations.size[0] * height - fixations.size[1] * width) <= max(width, height) + max(fixations.size)
-    check(same, name, f"fixations in a frame with the proportions of {width} × {height}", fixations.size)
+def _fixations_of(given: object, argument: str, size: tuple[int, int], source: str | None) -> Fixations:
+    """The fixations of one viewer in pixels of the picture of `(width, height)`; those far outside give a warning."""
+    one = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
+    if isinstance(given, GazeRecord):
+        given = given.as_fixations(given.source or source or "")
+    elif isinstance(given, list | tuple) and any(isinstance(each, Fixations | GazeRecord) for each in given):
+        check(False, argument, one, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
+    elif isinstance(given, list | tuple | np.ndarray | Tensor):
+        try:
+            given = Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
+        except InputError as error:
+            raise InputError(f"{argument}: expected {one}, got a {type(given).__name__} ({error})") from None
+    if not isinstance(given, Fixations):
+        raise InputError(f"{argument}: expected {one}, got {type(given).__name__}")
+    check_viewed(given, argument, size, source)
+    return warn_outside(argument, [given], stacklevel=4)[0].resized(size)

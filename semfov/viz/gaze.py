@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -49,7 +50,7 @@ def plot_gaze(
             str(number), place, color="white", ha="center", va="center",
             bbox={"boxstyle": "circle", "facecolor": GAZE, "edgecolor": "white"},
         )  # fmt: skip
-    axes.set(title=prediction.describe(), xlim=(0, width), ylim=(height, 0))
+    axes.set(title=fill(prediction.describe(), 80), xlim=(0, width), ylim=(height, 0))
     return figure
 
 

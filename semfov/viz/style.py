@@ -130,7 +130,11 @@ def make_figure(
 
 
 def only(ax: Axes | None) -> list[Axes] | None:
-    """Wrap a single `ax` in the list that `make_figure` takes."""
+    """Wrap a single `ax` in the list that `make_figure` takes; refuse others, such as the name of a file."""
+    from matplotlib.axes import Axes
+
+    remedy = "a figure is written by semfov.viz.save_figure(record.plot(), path)"
+    check(ax is None or isinstance(ax, Axes), "ax", "axes of Matplotlib, or None", f"{ax!r}; {remedy}")
     return None if ax is None else [ax]
 
 

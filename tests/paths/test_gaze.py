@@ -15,6 +15,7 @@ from semfov.gaze.saliency import FixationDensity
 from semfov.metrics.scanpath import auc, correlation, nss
 from semfov.paths import GazePrediction
 from semfov.sensor import LogPolar
+from tests import small
 from tests.small import rand
 
 
@@ -105,6 +106,37 @@ def test_the_next_density_is_over_the_pixels(gaze):
         gaze.next_density(Fixations("a.png", "1", np.array([[5.0, 5.0]]), (100, 100)))
 
 
+def test_the_fixations_of_one_viewer_are_taken_in_any_form(gaze):
+    path = gaze.scanpaths(1, seed=3)[0]
+    density = gaze.next_density(path)
+    for given in (path.points, torch.from_numpy(path.points), path.points.tolist()):
+        torch.testing.assert_close(gaze.next_density(given), density)
+    agent = small.agent(small.Fixed(("cup", "bowl")), grid=(4, 3), sigma=10.0, reference=64.0)
+    record = agent.explore(np.zeros((78, 104, 3), np.uint8), how="fovea", shifts=2)
+    torch.testing.assert_close(gaze.next_density(record), gaze.next_density(record.as_fixations("poster.png")))
+    with pytest.warns(UserWarning, match=r"scanpath: 1 of 1 fixations .* far outside"):
+        gaze.next_density([[9000.0, 5.0]])
+
+
+@pytest.mark.parametrize(
+    ("given", "got"),
+    [
+        (
+            [Fixations("poster.png", "1", [[5.0, 5.0]], (104, 78))] * 3,
+            r"a list of 3; take one: scanpath=scanpaths\[0\]",
+        ),
+        ([5.0, 5.0], r"a list \(points: expected \(n, 2\)"),
+        (np.array(["a", "b"]), r"a ndarray \(points: expected numbers"),
+        (None, "NoneType"),
+        ("paths.csv", "str"),
+        (Fixations("other.png", "1", [[5.0, 5.0]], (104, 78)), "in 'other.png'"),
+    ],
+)
+def test_what_is_not_one_viewers_fixations_of_the_picture_is_refused(gaze, given, got):
+    with pytest.raises(InputError, match=rf"^scanpath: expected (Fixations|fixations) .*, got {got}"):
+        gaze.next_density(given)
+
+
 class Colours(Detector):
     """Its only feature map is the picture itself, in pixels of 2."""
 
@@ -124,7 +156,9 @@ def test_what_a_fovea_has_seen_is_known_alone():
     points = np.array([[12.0, 30.0], [68.0, 30.0]])
 
     def predicted(points):
-        return GazePrediction.of(eye, image, model=model, seen=Fixations("a", "1", points, (80, 60))).terms["map"][0]
+        gaze = GazePrediction.of(eye, image, model=model, seen=points)
+        assert f"bits, after {len(points)} fixation" in gaze.describe()
+        return gaze.terms["map"][0]
 
     views = [foveate(image[None], torch.from_numpy(each).float(), sigma=8.0, growth=1.0)[0] for each in points]
     for each, view in zip(points, views, strict=True):

@@ -6,11 +6,13 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations
+from semfov.errors import check
 
 _Array = NDArray[np.float64]
 
@@ -166,6 +168,17 @@ def _durations(records: Sequence[Fixations]) -> list[str]:
     if (long := int((values > _LONG).sum())) > 0:
         found.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
     return found
+
+
+def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
+    """Refuse fixations in a frame of other proportions than `(width, height)`, or in another picture than the file."""
+    stretch = (fixations.size[0] * size[1]) / (fixations.size[1] * size[0])
+    got = f"{fixations.size[0]} × {fixations.size[1]} of {fixations.subject!r}"
+    expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
+    check(abs(stretch - 1) <= STRETCH, argument, expected, got)
+    name = Path(picture or fixations.picture).stem
+    same = Path(fixations.picture).stem == name
+    check(same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}")
 
 
 def warn_of_frames(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semfov.data.fixations.reading import read_fixations
 from semfov.data.fixations.record import Fixations, FixationValues
-from semfov.data.fixations.suspicions import STRETCH, warn_outside
+from semfov.data.fixations.suspicions import check_viewed, warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.conditional import auc, nss
@@ -104,7 +104,7 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
         table = read_fixations(people)
         people = [each for each in table if name is None or Path(each.picture).stem == name]
         check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
-    people = [people] if isinstance(people, Fixations | GazeRecord) else [*people]
+    people = [people] if isinstance(people, Fixations | GazeRecord) or not isinstance(people, Iterable) else [*people]
     named = own or next((each.picture for each in people if isinstance(each, Fixations)), "")
     viewed = [each.as_fixations(each.source or named) if isinstance(each, GazeRecord) else each for each in people]
     others = [type(each).__name__ for each in viewed if not isinstance(each, Fixations)]
@@ -112,17 +112,12 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
     check(len(viewed) > 0, "people", "fixations of at least one person", "none")
     pictures = sorted({each.picture for each in viewed})
     check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-    same = name is None or Path(pictures[0]).stem == name
-    check(same, "people", f"fixations in {name!r}, as those of the scanpath", f"in {pictures[0]!r}")
     ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
     targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
     check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
     size = viewed[0].size
     for each in (ours, *viewed):
-        stretch = (each.size[0] * size[1]) / (each.size[1] * size[0])
-        got = f"{each.size[0]} × {each.size[1]} of {each.subject!r}"
-        expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
-        check(abs(stretch - 1) <= STRETCH, "people", expected, got)
+        check_viewed(each, "people", size, own)
     records = [each.resized(size) for each in (ours, *viewed)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]

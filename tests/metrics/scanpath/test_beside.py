@@ -91,7 +91,7 @@ def test_people_are_given_as_one_record_or_as_a_table(tmp_path):
 def test_what_cannot_be_compared_is_refused():
     mine, *others = people(3)
     for changes, said in (
-        ({"picture": "b.jpg"}, "people: expected fixations in 'b', as those of the scanpath, got in 'a.jpg'"),
+        ({"picture": "b.jpg"}, "people: expected fixations in 'b', got in 'a.jpg'"),
         ({"target": "cup"}, "people: expected searches for one target, got for 'cup', 'fork'"),
         ({"size": (1680, 1050)}, "people: expected frames with the proportions of 800 × 600"),
     ):
