@@ -210,10 +210,14 @@ class FoveaEpisode(Episode[Scanpath]):
         self.thresholds = None if usually is None else usually.changed(give_up=fading).changed(confirm, give_up)
         self.ends: Callable[[Step], Tensor] | None = None
         self.to_goal = False
-        self._cells = None if cells is None else torch.tensor([[*cells]])
-        start, shifts = (start, shifts) if cells is None else (cells[0], len(cells) - 1)
-        self._most = sys.maxsize if shifts is None else shifts + 1
         columns, rows = agent.cells
+        if cells is not None:
+            check(len(cells) > 0, "cells", "one cell at least", "none")
+            for cell in cells:
+                check_whole(cell, "cells", 0, columns * rows - 1)
+            start, shifts = cells[0], len(cells) - 1
+        self._cells = None if cells is None else torch.tensor([[*cells]])
+        self._most = sys.maxsize if shifts is None else shifts + 1
         self._first = _first_cell(cell_at(start, agent.cells), seed, columns * rows)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None

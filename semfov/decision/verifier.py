@@ -35,10 +35,11 @@ class Verifier(Generic[LookType]):
 
     After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
     it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
-    and 1, or more; after `MOST_CLOSER` closer looks, with one of at least `confirm`. Otherwise it goes on,
-    until no look is worth a pass, or `most` closer looks were made. Then it has found the target at the best of the
-    examined places, if that is probable enough. If not, the target is absent or the search undecided, by the
-    probability that the picture holds it (`verified`). In a photograph that one look shows no place ends it at once.
+    and 1, or more; after `MOST_CLOSER` closer looks, with one of at least `confirm`. In a photograph that is looked at
+    by windows no place ends it (`by_worth`), as the next one may be surer. Otherwise it goes on, until no look is worth
+    a pass, or `most` closer looks were made. Then it has found the target at the best of the examined places, if that
+    is probable enough. If not, the target is absent or the search undecided, by the probability that the picture holds
+    it (`verified`).
 
     The candidates are cells of a grid (`CandidateCells`) or boxes in a large picture
     (`semfov.zoom.closer.CandidateBoxes`). Closer looks may follow a look at once (`look_closely`), or take frames of

@@ -112,7 +112,11 @@ def run_command(
         with _signals(goes_on):
             parser = make_parser(config, description, positional, program)
             command_line = sys.argv[1:] if arguments is None else arguments
-            parsed = parser.parse_args(_usual_form(command_line, config, parser._option_string_actions))
+            try:
+                usual = _usual_form(command_line, config, parser._option_string_actions)
+            except InputError as error:
+                parser.error(words(str(error)))
+            parsed = parser.parse_args(usual)
             parsed.pop("config", None)
             check_settings(config, parsed)
             settings = parser.instantiate(parsed)
@@ -208,7 +212,8 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
     """Bring arguments into the form that the parser understands.
 
     Names of options may have dashes instead of underscores. A flag needs no value. A list of words needs no brackets,
-    and `none` is the empty list. An option is given once.
+    and `none` is the empty list. An option is given once, but for flags and files of settings,
+    of which the last counts.
 
     >>> from semfov.runs.settings import Settings
     >>> from dataclasses import dataclass
@@ -220,6 +225,8 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
     >>> options = ["--give_up", "--looks", "--draw"]
     >>> _usual_form(["--give-up", "0.2", "--looks", "--draw", "path,views"], Example, options)
     ['--give_up', '0.2', '--looks=true', '--draw=[path,views]']
+    >>> _usual_form(["--config", "a.yaml", "--config", "b.yaml", "--looks", "--looks"], Example, [*options, "--config"])
+    ['--config', 'a.yaml', '--config', 'b.yaml', '--looks=true', '--looks=true']
     """
     hints, option_names, usual = _setting_types(config), set(options), list[str]()
     rest = list(arguments)
@@ -233,8 +240,9 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
             usual.append(word)
             continue
         hint, has_value = hints.get(option[2:]), bool(equals)
-        if any(each.partition("=")[0] == option for each in usual):
-            several = "; several values are given as a,b" if hint is str or _is_list(hint) else ""
+        again = any(each.partition("=")[0] == option for each in usual)
+        if again and hint is not bool and option != "--config":
+            several = "; where it takes several, as a,b" if hint is str or _is_list(hint) else ""
             raise InputError(f"{option[2:]}: expected once, got it again{several}")
         if hint is Path and (value if has_value else rest[0] if rest else "none") == "":
             raise InputError(f"{option[2:]}: expected the name of a file or folder, got an empty one")

@@ -15,7 +15,6 @@ from semfov.runs.command import make_parser
 
 REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
-    "search --target cup --target dog": "target: expected once, got it again; several values are given as a,b",
     "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
     "search --target qqq": "airplane and 75 more; `semfov detectors NAME` lists them",
     "search --target cup,fork": "; a search is for one class, and `semfov find` takes several",
@@ -28,8 +27,6 @@ REFUSED = {
     "explore FOLDER": "and --recursive also searches the folders in it, got none",
     "search nosuch.jpg cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "search zebr nosuch.jpg": "picture: expected a file or folder (a class is given by --target zebr), got zebr",
-    "find . --out=": "out: expected the name of a file or folder, got an empty one",
-    "find . --passes 1 --passes 2": "passes: expected once, got it again\n",
     "find nosuch --target cup": "picture: expected a file or folder (a class is given by --target nosuch)",
     "find --classes cup": "classes: expected none for yolov3-tiny, which has its own; --target names",
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
@@ -61,6 +58,9 @@ REFUSED = {
 }
 
 WRONG_USE = {
+    "find . --out=": "out: expected the name of a file or folder, got an empty one",
+    "search --target cup --target dog": "target: expected once, got it again; where it takes several, as a,b",
+    "find . --passes 1 --passes 2": "passes: expected once, got it again\n",
     "app --detector yolov3-tiny": "the detector has no option before it: semfov app DETECTOR",
     "fit --detector mine.onnx": "the model has no option before it: semfov fit MODEL",
     "find --picture a.jpg": "unknown option --picture; the picture has no option before it: semfov find PICTURE",

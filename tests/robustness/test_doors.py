@@ -400,3 +400,9 @@ def test_saliency_takes_pictures_of_any_type(tmp_path, model):
     expected = model()(read_image(tmp_path / "a.png")[None])
     for source in (tmp_path / "a.png", str(tmp_path / "a.png"), picture, np.asarray(picture)):
         assert torch.equal(model()(source), expected)
+
+
+@pytest.mark.parametrize("cells", [[], [0, 100], [0, -1], [0, 2.5], ["a"]])
+def test_cells_that_an_episode_cannot_look_at_are_refused(cells, agent):
+    with pytest.raises(SemfovError, match=r"^cells: expected "):
+        semfov.agents.FoveaEpisode(agent.fovea, None, cells=cells)
