@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
-from typing import Any, NoReturn, Self, get_args
+from typing import Any, Self, get_args
 
 from torch import Tensor, nn
 
@@ -85,10 +85,8 @@ class ActivePerception(nn.Module):
         grid: tuple[int, int] = (10, 10),
     ) -> None:
         super().__init__()
-        self.eye = eye
-        self.searching = Strategy(*search)
-        self.exploring = Strategy(*explore)
-        self.verification, self.windows = verification, windows
+        self.eye, self.verification, self.windows = eye, verification, windows
+        self.searching, self.exploring = Strategy(*search), Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
         self._check_parts()
@@ -216,8 +214,10 @@ class ActivePerception(nn.Module):
             raise AttributeError(f"an agent has search, find_all, explore, gaze and live, not {name!r}")
         return super().__getattr__(name)
 
-    def __call__(self, *_: Any, **__: Any) -> NoReturn:
-        raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
+    def __call__(self, *given: Any, **options: Any) -> Any:
+        if type(self).forward is nn.Module.forward:
+            raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
+        return super().__call__(*given, **options)
 
     def __repr__(self) -> str:
         """The detector, the sensor and the parts that were fitted, in one line."""

@@ -75,6 +75,8 @@ class GazePrediction:
     if not TYPE_CHECKING:  # to which any name would be one of a prediction
 
         def __getattr__(self, name: str) -> Any:
+            if hasattr(type(self), name):  # a property of it has failed with an error of its own
+                return object.__getattribute__(self, name)
             raise missing(type(self).__name__, name, GAZE_WORDS)
 
     @classmethod

@@ -334,6 +334,23 @@ def test_what_others_call_it_and_other_forms_of_a_call_are_refused_with_ours(cal
         call(agent)
 
 
+def test_an_error_in_a_property_of_a_record_is_told():
+    class Broken(semfov.paths.Scanpath):
+        mine = property(lambda self: [].nope)
+
+    with pytest.raises(AttributeError, match="'list' object has no attribute 'nope'"):
+        _ = object.__new__(Broken).mine
+
+
+def test_an_agent_with_a_forward_of_its_own_is_called(agent):
+    class Callable(semfov.ActivePerception):
+        forward = staticmethod(lambda picture: picture)
+
+    called = object.__new__(Callable)
+    called.__dict__ |= agent.__dict__
+    assert called(3) == 3
+
+
 def test_records_of_agents_are_compared_as_people_are(agent):
     path = agent.explore(PIXELS, how="fovea", shifts=3, seed=1)
     assert path.compare(path)["sequence score"].scanpath == 1
