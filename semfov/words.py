@@ -1,6 +1,7 @@
 """What others, and other programs, call an option or an attribute; the command reads it before it loads anything."""
 
 from collections.abc import Mapping
+from typing import Any
 
 OTHER_WORDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("conf", "conf_thres", "confidence", "min_score", "score", "threshold"), ("least", "confirm")),
@@ -57,3 +58,10 @@ def missing(owner: str, name: str, words: Mapping[str, str]) -> AttributeError:
     """The error of an attribute that is not there, with ours where others have another word for it."""
     ours = words.get(name)
     return AttributeError(f"{owner} has no attribute {name!r}" + ("" if ours is None else f"; use {ours}"))
+
+
+def not_there(owner: object, name: str, words: Mapping[str, str]) -> Any:
+    """What `__getattr__` of a record does: a property that has failed tells its own error, another name is missing."""
+    if hasattr(type(owner), name):
+        return object.__getattribute__(owner, name)
+    raise missing(type(owner).__name__, name, words)

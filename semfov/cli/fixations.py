@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, read_fixations, suspicions
-from semfov.data.fixations.reading import PictureSizes, frame_of, json_reader
+from semfov.data.fixations.reading import DATA_SETS, PictureSizes, frame_of, reader_of
+from semfov.data.fixations.table import FrameError
 from semfov.data.sources import PHOTOGRAPHS
-from semfov.errors import DataError, InputError, SemfovError, check, printable
+from semfov.errors import DataError, SemfovError, check, printable
 
 
 def check_fixations(options: CheckOptions) -> int:
@@ -42,7 +43,7 @@ def check_fixations(options: CheckOptions) -> int:
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
             continue
-        kind = json_reader(name)[0] if name.lower().endswith(".json") else None
+        kind = DATA_SETS.get(reader_of(name)) if name.lower().endswith(".json") else None
         usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
         print(f"{printable(name)}: {_content(records, usual)}")
         compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
@@ -52,20 +53,15 @@ def check_fixations(options: CheckOptions) -> int:
     return 1 if wrong else 0
 
 
-def _records(path: Path, given: Mapping[str, Any], sizes: PictureSizes | None) -> list[Fixations]:
+def _records(path: Path, given: dict[str, Any], sizes: PictureSizes | None) -> list[Fixations]:
     """The records of a file; where it has no frames, they are the pictures."""
-    try:
-        return read_fixations(path, **given)
-    except InputError as error:
-        if "picture" not in given or not str(error).startswith("picture: expected an option"):
-            raise
+    if "picture" in given and "picture" not in signature(reader_of(path)).parameters:
         # The file names its pictures.
         check(sizes is not None, "picture", "a picture or folder that exists", given["picture"])
-        return _records(path, {name: value for name, value in given.items() if name != "picture"}, sizes)
-    except DataError as error:
-        # A frame of EyeLink is a screen.
-        if "size" in given or "give size=" not in str(error) or path.suffix.lower() == ".asc":
-            raise
+        given = {name: value for name, value in given.items() if name != "picture"}
+    try:
+        return read_fixations(path, **given)
+    except FrameError as error:
         if sizes is None:
             raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
         return read_fixations(path, **given, size=sizes)

@@ -23,7 +23,7 @@ from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
-from semfov.words import RECORD_WORDS, missing
+from semfov.words import RECORD_WORDS, not_there
 
 if TYPE_CHECKING:
     import pandas
@@ -52,9 +52,7 @@ class Conversion(ABC):
     if not TYPE_CHECKING:  # to which any name would be one of a record
 
         def __getattr__(self, name: str) -> Any:
-            if hasattr(type(self), name):  # a property of it has failed with an error of its own
-                return object.__getattribute__(self, name)
-            raise missing(type(self).__name__, name, RECORD_WORDS)
+            return not_there(self, name, RECORD_WORDS)
 
     @property
     @abstractmethod

@@ -29,7 +29,7 @@ from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
 from semfov.paths.base import GazeRecord
 from semfov.paths.stimulus import reduced_copy
-from semfov.words import GAZE_WORDS, missing
+from semfov.words import GAZE_WORDS, not_there
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,9 +75,7 @@ class GazePrediction:
     if not TYPE_CHECKING:  # to which any name would be one of a prediction
 
         def __getattr__(self, name: str) -> Any:
-            if hasattr(type(self), name):  # a property of it has failed with an error of its own
-                return object.__getattribute__(self, name)
-            raise missing(type(self).__name__, name, GAZE_WORDS)
+            return not_there(self, name, GAZE_WORDS)
 
     @classmethod
     def of(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import Line, Origin, Size, Units, named_columns, of_source, records_of
+from semfov.data.fixations.table import FrameError, Line, Origin, Size, Units, named_columns, of_source, records_of
 from semfov.errors import DataError, check
 
 
@@ -124,7 +124,8 @@ def read_export(
 
     Raises:
         InputError: an argument is unknown.
-        DataError: it is no table of these programs, or has no fixation, no picture or no size.
+        DataError: it is no table of these programs, or has no fixation or no picture.
+        FrameError: a `DataError`, it has no frame and `size` is not given.
 
     >>> import tempfile
     >>> text = "id,start_timestamp,duration,norm_pos_x,norm_pos_y,dispersion\n7,1.2,240,0.5,0.75,1.1\n"
@@ -172,7 +173,7 @@ def read_export(
             f"{where}: expected the name of the picture, which {export.program} does not give; give picture="
         )
     if size is None and not all(line["width"] and line["height"] for _, line in lines):
-        raise DataError(f"{where}: expected the size of the frame, which {export.program} does not give; give size=")
+        raise FrameError(f"{where}: expected the size of the frame, which {export.program} does not give; give size=")
     return records_of(where, lines, size, units or export.units, origin or export.origin)
 
 

@@ -19,6 +19,14 @@ from semfov.data.sources import picture_files
 from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import check_regular, read_text
 
+_Reader = Callable[..., list[Fixations]]
+DATA_SETS: dict[_Reader, str] = {
+    read_cocosearch: "COCO-Search18",
+    read_osie: "OSIE",
+    read_ruarte: "Ruarte and others",
+}
+"""Readers of JSON, with the data set whose form they read."""
+
 
 def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fixations]:
     r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
@@ -45,11 +53,9 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     ...     len(read_fixations(path))
     1
     """
-    kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
-    if kind == ".asc":
-        return _read(read_eyelink, source, options)
-    if kind == ".json":
-        name, reader = json_reader(source)
+    reader = reader_of(source, options.get("columns"))
+    if reader in DATA_SETS:
+        name = DATA_SETS[reader]
         if "size" in options and reader is not read_osie:
             has = f"none for {source}, a file of {name}, whose frame is that of each trial"
             check(reader is read_cocosearch, "size", has, options["size"])
@@ -58,13 +64,23 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
             return _read(reader, source, options)
         except DataError as error:
             raise DataError(f"{error}; it was read as a file of {name}") from None
+    return _read(reader, source, options)
+
+
+def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | None = None) -> _Reader:
+    """The reader of a file or a `pandas.DataFrame`, by its ending and content; `columns` as for `read_table`."""
+    kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
+    if kind == ".asc":
+        return read_eyelink
+    if kind == ".json":
+        return _json_reader(source)
     _, header, _ = of_source(source)
     ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header}
-    ours = ours or not {*(options.get("columns") or ())} <= {*OURS}
-    return _read(read_export if is_export(header) and not ours else read_table, source, options)
+    ours = ours or not {*(columns or ())} <= {*OURS}
+    return read_export if is_export(header) and not ours else read_table
 
 
-def _read(reader: Callable[..., list[Fixations]], source: Any, options: dict[str, Any]) -> list[Fixations]:
+def _read(reader: _Reader, source: Any, options: dict[str, Any]) -> list[Fixations]:
     """The records that a reader gives, if it has these options."""
     known = [*signature(reader).parameters][1:]
     check_options(
@@ -77,8 +93,8 @@ _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 """How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""
 
 
-def json_reader(path: str | PathLike[str]) -> tuple[str, Callable[..., list[Fixations]]]:
-    """The data set that a file of JSON has the form of, as it begins, and its reader."""
+def _json_reader(path: str | PathLike[str]) -> _Reader:
+    """The reader of the data set that a file of JSON has the form of, as it begins."""
     check_regular(path)
     try:
         begins = _BEGINNING.match(read_text(path))
@@ -88,8 +104,8 @@ def json_reader(path: str | PathLike[str]) -> tuple[str, Callable[..., list[Fixa
         raise DataError(f"{path}: expected JSON, a list or an object, got other text; correct or replace the file")
     trials, people = begins.groups()
     if trials:
-        return "COCO-Search18", read_cocosearch
-    return ("OSIE", read_osie) if people else ("Ruarte and others", read_ruarte)
+        return read_cocosearch
+    return read_osie if people else read_ruarte
 
 
 class PictureSizes(Mapping[str, tuple[int, int]]):

@@ -54,6 +54,10 @@ Line = tuple[str, Mapping[str, str]]
 """The place of a line in words, and its fields by our names of the columns."""
 
 
+class FrameError(DataError):
+    """A table does not tell the frame of its points, which `size` may give."""
+
+
 def read_table(
     source: str | PathLike[str] | Any,
     *,
@@ -90,6 +94,7 @@ def read_table(
     Raises:
         InputError: an argument is unknown.
         DataError: the content does not have this form; the message names the file, the line and the column.
+        FrameError: a `DataError`, the table has no frame and `size` is not given.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -110,11 +115,13 @@ def read_table(
     needed = (*_COLUMNS, *(() if size is not None else _SIZE))
     missing = [named.get(name, name) for name in needed if named.get(name, name) not in header]
     if missing:
-        sized = " or give size=" if {*missing} & {*_SIZE} else ""
-        raise DataError(
+        text = (
             f"{where}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
-            f"{', '.join(map(repr, header))[:300]}; name them by columns={{…}}{sized}"
+            f"{', '.join(map(repr, header))[:300]}; name them by columns={{…}}"
         )
+        if {*missing} & {*_SIZE}:
+            raise FrameError(f"{text} or give size=")
+        raise DataError(text)
     lines = [(place, {name: row.get(named.get(name, name), "") for name in (*needed, *_MORE)}) for place, row in rows]
     return records_of(where, lines, size, units, origin)
 
