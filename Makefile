@@ -18,7 +18,7 @@ NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 	$(patsubst %,tests/zoom/test_%.py,belief certainty modules networks survey)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test numeric lab app test-all test-quick gpu coverage mutation docs lint types constraints clean
+.PHONY: help setup search test numeric library lab app test-all test-quick gpu coverage mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
@@ -36,12 +36,12 @@ help:
 
 setup: $(STAMP)
 
-# Two processes unpack the packages: torch and its libraries are as large as all others together.
+# Three processes unpack the packages: torch, its libraries and all others are about equally large.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	awk '/^[a-z]/ {print >("$(VENV)/" (part = /^(torch|triton|nvidia|cuda)/ ? "torch" : "others") ".txt")} \
-		/^ / {print >("$(VENV)/" part ".txt")}' constraints.txt
-	$(BIN)/python -m pip $(INSTALL) $(VENV)/torch.txt & $(BIN)/python -m pip $(INSTALL) $(VENV)/others.txt && wait $$!
+	awk '/^[a-z]/ {part = /^(nvidia|cuda)/ ? "cuda" : /^(torch|triton)/ ? "torch" : "others"} \
+		/^[a-z ]/ {print >("$(VENV)/" part ".txt")}' constraints.txt
+	printf "$(VENV)/%s.txt\n" cuda torch others | xargs -n 1 -P 3 $(BIN)/python -m pip $(INSTALL)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
@@ -58,9 +58,11 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
-# The type checker and the numbers have one core each.
+# Types and numbers are checked while the tests run: no core waits for another.
 test: lint
-	$(MAKE) --jobs=2 types numeric
+	$(MAKE) --jobs=3 types numeric library
+
+library: $(STAMP)
 	$(PYTEST) -m "not lab and not long"
 
 # Numbers are computed a second time as on a processor without AVX, on one thread: other processors round otherwise.

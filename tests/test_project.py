@@ -64,9 +64,8 @@ def test_each_pinned_version_has_digests_and_no_registry(name):
 def test_what_is_installed_before_tests_and_releases_is_checked_against_digests():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert "$(STAMP): pyproject.toml constraints.txt" in makefile
-    assert makefile.count("' constraints.txt\n") == 1  # which is split in two
-    parts = {"$(VENV)/torch.txt", "$(VENV)/others.txt", ".ci/app.txt"}
-    assert set(re.findall(r"pip \$\(INSTALL\) (\S+)", makefile)) == parts
+    assert makefile.count("' constraints.txt\n") == 1  # which is split in parts
+    assert re.findall(r"pip \$\(INSTALL\)( \S+)?$", makefile, re.MULTILINE) == ["", " .ci/app.txt"]
     assert re.search("^INSTALL := install .*--require-hashes --requirement$", makefile, re.MULTILINE)
     release = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
     assert "install --require-hashes --requirement .ci/build.txt && python -m build --no-isolation" in release
