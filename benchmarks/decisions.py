@@ -99,13 +99,13 @@ def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> R
 def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], grid: Grid) -> dict[str, Run]:
     """Programs of decisions from a belief."""
     kinds = {
-        "non-predictive": policies.NonPredictive(),
-        "predictive": policies.Predictive(model),
-        "KL divergence": policies.KL(model),
-        "negative entropy": policies.Negentropy(model),
-        "two peaks": policies.Peaks(model),
+        "non-predictive": policies.Policy("non-predictive"),
+        "predictive": policies.Policy("predictive", model),
+        "KL divergence": policies.Policy("kl", model),
+        "negative entropy": policies.Policy("negative-entropy", model),
+        "two peaks": policies.Policy("two-peaks", model),
     }
-    runs = {"random": decide(policies.Random()(None, grid), maps["raw"])}
+    runs = {"random": decide(policies.Policy("random")(None, grid), maps["raw"])}
     for name, policy in kinds.items():
         runs |= {f"{name}, {scores}": decide(policy(TARGET, grid), belief) for scores, belief in maps.items()}
     return runs

@@ -19,7 +19,7 @@ import semfov
 from benchmarks.tables import begin, command, number, page, table, write
 from benchmarks.timing import Run, Spread, interleaved
 from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, Scenery, open_scenery
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 
 STEPS = 20
 WORLDS: dict[str, tuple[Task, str, tuple[int, int]]] = {

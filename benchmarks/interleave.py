@@ -96,9 +96,9 @@ def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
     model = semfov.FovealObservationModel.identity(classes, EDGES).eval()
     raw, calibrated = (semfov.observers.Semantic(1 + len(classes), observation) for observation in (None, model))
     return {
-        "search, non-predictive, raw": Strategy(raw, semfov.policies.NonPredictive()),
-        "search, predictive, calibrated": Strategy(calibrated, semfov.policies.Predictive(model)),
-        "exploration, KL divergence, calibrated": Strategy(calibrated, semfov.policies.KL(model)),
+        "search, non-predictive, raw": Strategy(raw, semfov.policies.Policy("non-predictive")),
+        "search, predictive, calibrated": Strategy(calibrated, semfov.policies.Policy("predictive", model)),
+        "exploration, KL divergence, calibrated": Strategy(calibrated, semfov.policies.Policy("kl", model)),
     }
 
 

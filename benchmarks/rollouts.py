@@ -29,7 +29,7 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     detections = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
     todo = [episode(n) for n in range(episodes)]
     noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
-    strategy = Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive())
+    strategy = Strategy(observers.Semantic(CLASSES + 1), policies.Policy("non-predictive"))
 
     def run(count: int, batch: int) -> object:
         looks = looks_of(todo[:count], detections, grid)

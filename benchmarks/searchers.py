@@ -30,8 +30,8 @@ share of {} random beliefs, before the first look."""
 def searchers(side: int) -> dict[str, acquisition.AcquisitionFunction]:
     """All searchers on a grid of `side` × `side` cells."""
     model = FovealObservationModel.from_pretrained(MODEL).requires_grad_(False)
-    means, grid = policies.Means(model), Grid(side, side, (640, 480))
-    return {name: policies.named_policy(policy, "search", means)(TARGET, grid) for name, policy in POLICIES.items()}
+    grid = Grid(side, side, (640, 480))
+    return {name: policies.Policy(policy, model)(TARGET, grid) for name, policy in POLICIES.items()}
 
 
 def choices(value: acquisition.AcquisitionFunction, cells: int, episodes: int) -> Tensor:

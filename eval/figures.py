@@ -27,7 +27,7 @@ from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
 from semfov.gaze.choice import select_fixation
-from semfov.gaze.policies import KL, Predictive
+from semfov.gaze.policies import Policy
 from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
@@ -147,7 +147,9 @@ def _search_example(config: _FiguresConfig) -> Example:
     eye = make_eye(config.detector, sensor)
     model = make_observation(config.model, eye)
     observer = Semantic(len(eye.detector.classes) + 1, model)
-    agent = ActivePerception(eye, (observer, Predictive(model)), (observer, KL(model)), grid=config.grid)
+    agent = ActivePerception(
+        eye, (observer, Policy("predictive", model)), (observer, Policy("kl", model)), grid=config.grid
+    )
     image = EmbeddedScenes(eye.detector.classes[1:])[0].image if config.picture is None else as_image(config.picture)
     scanpath = agent.search(image, config.target, how="fovea", start=config.start, shifts=config.shifts)
     assert isinstance(scanpath, Scanpath)

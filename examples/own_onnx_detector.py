@@ -69,7 +69,7 @@ def main() -> None:
         print(f"{name}: negative log likelihood of {loss:.2f} nats per detection on other scenes")
 
     observer = semfov.observers.Semantic(len(detector.classes) + 1, model)
-    search, explore = semfov.policies.Predictive(model), semfov.policies.KL(model)
+    search, explore = semfov.policies.Policy("predictive", model), semfov.policies.Policy("kl", model)
     agent = semfov.ActivePerception(eye, (observer, search), (observer, explore)).eval()
     scanpath = agent.search(others[0].image, "person", start=0)
     print(f"person {'found' if scanpath.found else 'not found'} after {len(scanpath)} looks")

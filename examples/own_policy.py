@@ -24,7 +24,10 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
         width: w in units of the image's longer side.
     """
 
-    def __init__(self, target: int | Tensor, width: float) -> None:
+    name = "wide-inhibition"
+    tasks = ("search",)
+
+    def __init__(self, target: int | Tensor, width: float = 0.1) -> None:
         super().__init__()
         self.target = target
         self.width = width
@@ -35,25 +38,6 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
         return belief.probability(self.target) * (1 - inhibition)
 
 
-class WideInhibition(policies.Policy):
-    """Search with `InhibitedPosterior`. Defining the class registers the policy under its name.
-
-    Args:
-        width: width w of the inhibition, in units of the image's longer side.
-    """
-
-    name = "wide-inhibition"
-    tasks = ("search",)
-
-    def __init__(self, width: float = 0.1) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, target: int | Tensor | None, grid: semfov.Grid) -> semfov.acquisition.AcquisitionFunction:
-        """Make the acquisition function for a target on a grid."""
-        return InhibitedPosterior(policies.required_target(target, self.name), self.width)
-
-
 def main() -> None:
     """Search embedded scenes for all their classes, without the wide inhibition and with it."""
     detector = semfov.load_detector("yolov3-tiny")
@@ -61,8 +45,8 @@ def main() -> None:
     observer = semfov.observers.Semantic(len(detector.classes) + 1)
     scenes = semfov.EmbeddedScenes(detector.classes, count=4)
     for name in ("non-predictive", "wide-inhibition"):
-        policy = policies.named_policy(name, "search")  # or WideInhibition(width=0.15)
-        agent = semfov.ActivePerception(eye, search=(observer, policy), explore=(observer, policies.Random()))
+        policy = policies.Policy(name)  # or policies.Policy("wide-inhibition", width=0.15)
+        agent = semfov.ActivePerception(eye, search=(observer, policy), explore=(observer, policies.Policy("random")))
         shifts = []
         for index in range(len(scenes)):
             scene = scenes[index]

@@ -18,7 +18,7 @@ from semfov.detection.torchvision import PREFIX
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import DataError, InputError, lookup
 from semfov.eye import Eye
-from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
+from semfov.gaze.policies import Policy
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside
 from semfov.io.manifest import PARTS, Manifest, find_file
@@ -148,7 +148,7 @@ class ModelFolder:
     def search(self) -> tuple[Observer, Policy]:
         """Observer and policy for search."""
         evidence = self._models.get("evidence")
-        return (Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()), NonPredictive()
+        return (Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()), Policy("non-predictive")
 
     def verification(self) -> Verification | None:
         """The model of closer looks; None for an agent that decides without them."""
@@ -159,8 +159,8 @@ class ModelFolder:
         """Observer and policy for exploration."""
         learned, sensor = self._models.get("map"), self.manifest.sensor
         if isinstance(learned, MapEvidence):
-            return LearnedMap(learned), Closer(self._sensor.width(sensor) / sensor["reference"])
-        return Semantic(len(self.manifest.classes) + 1), Random()
+            return LearnedMap(learned), Policy("closer-look", fovea=self._sensor.width(sensor) / sensor["reference"])
+        return Semantic(len(self.manifest.classes) + 1), Policy("random")
 
     def windows(self) -> GlimpseEvidence | None:
         """The evidence for large pictures; None for an agent that looks at slices."""

@@ -15,7 +15,7 @@ from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
-from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
+from semfov.gaze.policies import Policy
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
 from semfov.model_folder import open_folder
@@ -53,11 +53,11 @@ def recommended_arguments(
     name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
     evidence = TargetEvidence.from_pretrained(name)
     everything = MapEvidence.from_pretrained(name)
-    mapping = LearnedMap(everything), Closer(sigma / eye.reference)
+    mapping = LearnedMap(everything), Policy("closer-look", fovea=sigma / eye.reference)
     verification = Verification.if_shipped(name)
     return {
         "eye": eye,
-        "search": (Target(evidence), NonPredictive()),
+        "search": (Target(evidence), Policy("non-predictive")),
         "explore": mapping,
         "verification": verification,
         "windows": GlimpseEvidence.if_shipped(detector.name),
@@ -87,12 +87,12 @@ def published_arguments(
         fitted = published_model(eye.detector.name, fovea, eye.detector.selection.threshold)
         model = FovealObservationModel.from_pretrained(shipped_model(FovealObservationModel, fitted, fspath(name)))
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
-    policy = Predictive(model) if search == "predictive" else NonPredictive()
-    return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}
+    policy = Policy("predictive", model) if search == "predictive" else Policy("non-predictive")
+    return {"eye": eye, "search": (observer, policy), "explore": (observer, Policy("kl", model)), "grid": grid}
 
 
 def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:
     """Arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
-    return {"eye": eye, "search": (observer, NonPredictive()), "explore": (observer, Random())}
+    return {"eye": eye, "search": (observer, Policy("non-predictive")), "explore": (observer, Policy("random"))}

@@ -10,8 +10,8 @@ from semfov.belief.observers import AnyOf, Observer
 from semfov.belief.observers.any_of import TargetLike
 from semfov.data.classes import class_index
 from semfov.errors import check
-from semfov.gaze.acquisition import AcquisitionFunction
-from semfov.gaze.policies import NonPredictive, Policy, Random
+from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
+from semfov.gaze.policies import Policy
 
 
 def _weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
@@ -47,7 +47,7 @@ class Strategy(nn.Module):
             return self, index, {index: 1.0}
         by_target: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
         weights, policy = _weights_by_class(by_target, classes[1:]), self.policy
-        suits = isinstance(policy, NonPredictive | Random) or policy.by_place
+        suits = policy.name in (TargetPosterior.name, Uniform.name) or policy.function.by_place
         check(
             suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(by_target)
         )

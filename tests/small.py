@@ -14,7 +14,7 @@ from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence
 from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 
 CLASSES = ("cat", "cup", "person")
@@ -267,7 +267,7 @@ class Fixed(Detector):
 def agent(detector: Detector, *, grid=(8, 6), sigma=40.0, reference=160.0) -> ActivePerception:
     """An agent with the beliefs of the paper from raw scores; it explores at random."""
     observer, eye = Semantic(len(detector.classes) + 1), Eye(Foveation(sigma), detector, reference=reference)
-    return ActivePerception(eye, (observer, NonPredictive()), (observer, Random()), grid=grid).eval()
+    return ActivePerception(eye, (observer, Policy("non-predictive")), (observer, Policy("random")), grid=grid).eval()
 
 
 class RedBoxes:

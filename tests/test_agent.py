@@ -13,7 +13,7 @@ from semfov.decision import confirms
 from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
-from semfov.gaze.policies import KL, NonPredictive, Predictive, Random
+from semfov.gaze.policies import Policy
 from semfov.io.state import without_settings
 from semfov.paths import GazePrediction
 from semfov.sensor import foveate
@@ -38,7 +38,9 @@ def squares_eye():
 
 @pytest.fixture
 def agent():
-    return ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
+    return ActivePerception(
+        squares_eye(), (Semantic(3), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(8, 6)
+    )
 
 
 def test_search_goes_to_the_target(agent, image):
@@ -89,7 +91,9 @@ def test_objects_count_from_the_asked_score_on(agent, image, how):
 
 def test_predictive_policies_search_for_one_class_only(image):
     model = FovealObservationModel.identity(["red", "green"], [0.2])
-    ahead = ActivePerception(squares_eye(), (Semantic(3), Predictive(model)), (Semantic(3), Random()), grid=(8, 6))
+    ahead = ActivePerception(
+        squares_eye(), (Semantic(3), Policy("predictive", model)), (Semantic(3), Policy("random")), grid=(8, 6)
+    )
     with pytest.raises(InputError, match="one class for policy 'predictive'"):
         ahead.search(image, {"red": 1.0, "green": 0.8})
 
@@ -110,7 +114,9 @@ def test_half_precision_is_for_the_detector_alone(image, dtype):
     """In half precision the agent does what it does with only its detector in half precision."""
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     eye = Eye(Foveation(40.0), Weighted(), reference=160.0)
-    agent = ActivePerception(eye, (Semantic(3, model), NonPredictive()), (Semantic(3), KL(model)), grid=(8, 6))
+    agent = ActivePerception(
+        eye, (Semantic(3, model), Policy("non-predictive")), (Semantic(3), Policy("kl", model)), grid=(8, 6)
+    )
     agent.requires_grad_(False)
     other = copy.deepcopy(agent)
     other.eye.detector.to(dtype)
@@ -130,7 +136,7 @@ def test_half_precision_is_for_the_detector_alone(image, dtype):
 def test_search_keeps_the_beliefs_of_both_observers(image, mapper):
     """The map of all classes is that of the exploring observer, the posterior that of the searching observer."""
     agent = ActivePerception(
-        squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3, **mapper), Random()), grid=(8, 6)
+        squares_eye(), (Semantic(3), Policy("non-predictive")), (Semantic(3, **mapper), Policy("random")), grid=(8, 6)
     )
     scanpath = agent.search(image, "green", start=20, shifts=4, boxes=torch.tensor([[0.0, 119, 1, 120]]))
     assert len(scanpath) == 5
@@ -149,8 +155,10 @@ def test_search_keeps_the_beliefs_of_both_observers(image, mapper):
 def test_an_observer_shared_by_both_tasks_has_one_belief(image):
     """If both tasks share an observer, the map and the posterior of a search are one belief."""
     shared = Semantic(3)
-    agent = ActivePerception(squares_eye(), (shared, NonPredictive()), (shared, Random()), grid=(8, 6))
-    apart = ActivePerception(squares_eye(), (shared, NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
+    agent = ActivePerception(squares_eye(), (shared, Policy("non-predictive")), (shared, Policy("random")), grid=(8, 6))
+    apart = ActivePerception(
+        squares_eye(), (shared, Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(8, 6)
+    )
     one, other = (each.search(image, "green", start=0) for each in (agent, apart))
     assert torch.equal(one.cells, other.cells)
     assert torch.equal(one.probabilities, other.probabilities)
@@ -161,8 +169,8 @@ def test_learned_models_are_submodules_of_the_agent(image):
     """State, dtype, gradients and copies of the agent include the models of its observers and policies."""
     misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
     evidence, expected = TargetEvidence(4, 4), FovealObservationModel.identity(["red", "green"], [0.3])
-    search = Target(evidence), NonPredictive()
-    agent = ActivePerception(squares_eye(), search, (Semantic(3, misses=misses), KL(expected)), grid=(8, 6))
+    search = Target(evidence), Policy("non-predictive")
+    agent = ActivePerception(squares_eye(), search, (Semantic(3, misses=misses), Policy("kl", expected)), grid=(8, 6))
     learned = {
         "searching.observer.model": evidence,
         "exploring.observer.misses": misses,
@@ -195,7 +203,7 @@ def test_learned_models_are_submodules_of_the_agent(image):
         next(other.searching.observer.model.parameters()).add_(1)
     assert torch.equal(agent.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
     # This agent has no learned models; the state of another agent is loaded into this one.
-    plain = ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()))
+    plain = ActivePerception(squares_eye(), (Semantic(3), Policy("non-predictive")), (Semantic(3), Policy("random")))
     assert all(name.startswith("eye.") for name in plain.state_dict())
     other.load_state_dict(agent.state_dict())
     assert torch.equal(other.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
@@ -205,7 +213,9 @@ def test_a_model_shared_by_observer_and_policy_is_stored_once(image):
     """Observer and policy use the same model, and so do the observer and policy of a copy."""
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     observer = Semantic(3, model)
-    agent = ActivePerception(squares_eye(), (observer, Predictive(model)), (observer, KL(model)), grid=(8, 6))
+    agent = ActivePerception(
+        squares_eye(), (observer, Policy("predictive", model)), (observer, Policy("kl", model)), grid=(8, 6)
+    )
     assert [*agent.parameters()] == [*squares_eye().parameters(), *model.parameters()]
     twin = copy.deepcopy(agent)
     assert twin.exploring.policy.model is twin.searching.policy.model is twin.searching.observer.observation
@@ -226,7 +236,9 @@ def explorer():
     alpha = 1 + torch.eye(3)[:, None] * clarity[:, None]
     model = FovealObservationModel(alpha, [0.2, 0.4], ["red", "green"]).requires_grad_(False).eval()
     observer = Semantic(3, model)
-    return ActivePerception(squares_eye(), (observer, NonPredictive()), (observer, KL(model)), grid=(8, 6))
+    return ActivePerception(
+        squares_eye(), (observer, Policy("non-predictive")), (observer, Policy("kl", model)), grid=(8, 6)
+    )
 
 
 def test_exploration_makes_the_given_number_of_gaze_shifts(explorer, image):
@@ -249,7 +261,9 @@ def test_exploration_makes_the_given_number_of_gaze_shifts(explorer, image):
 
 
 def test_exploration_ends_when_every_cell_was_visited(image):
-    agent = ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=(3, 2))
+    agent = ActivePerception(
+        squares_eye(), (Semantic(3), Policy("random")), (Semantic(3), Policy("random")), grid=(3, 2)
+    )
     assert sorted(agent.explore(image, shifts=50).cells.tolist()) == list(range(6))
     first, second = (agent.explore(image, shifts=5, seed=seed).cells for seed in (1, 2))
     assert torch.equal(agent.explore(image, shifts=5, seed=1).cells, first)
@@ -404,12 +418,14 @@ def test_the_kind_of_look_follows_from_the_picture(agent):
 def test_grids_and_parts_that_do_not_suit_are_refused():
     for grid in [(0, 5), (5, -1), (5, 1.5), (5,), (5, 5, 5), (201, 1)]:
         with pytest.raises(InputError, match=r"^grid: expected"):
-            ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)
+            ActivePerception(squares_eye(), (Semantic(3), Policy("random")), (Semantic(3), Policy("random")), grid=grid)
     settings = Eye(Foveation(40.0, growth=1.0), Coloured(), reference=160.0).settings()
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     model.metadata.update(sensor=settings["sensor"])
     with pytest.raises(InputError, match=r"growth is 2\.0, the model was fitted with 1\.0"):
-        ActivePerception(squares_eye(), (Semantic(3, model), NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
+        ActivePerception(
+            squares_eye(), (Semantic(3, model), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(8, 6)
+        )
 
 
 def test_all_objects_are_found_by_the_fovea(agent, image):

@@ -59,12 +59,7 @@ def public(keep: Callable[[Any], bool]) -> dict[str, Any]:
 
 
 MODULES = public(
-    lambda thing: (
-        inspect.isclass(thing)
-        and issubclass(thing, nn.Module)
-        and not inspect.isabstract(thing)
-        and (not issubclass(thing, semfov.policies.Policy) or hasattr(thing, "name"))  # a base of others has none
-    )
+    lambda thing: inspect.isclass(thing) and issubclass(thing, nn.Module) and not inspect.isabstract(thing)
 )
 
 
@@ -162,7 +157,6 @@ def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
         "compare_scanpath": ((path, [person, person]), {}),
         "episode_data": ((path, image, [image] * 3), {"name": "a.jpg"}),
         "merge_boxes": ((torch.tensor([[4.0, 4, 9, 9]]), torch.rand(1), torch.ones(1, dtype=torch.long)), {}),
-        "required_target": ((torch.tensor(2), "a policy"), {}),
         "rollout": (episode, {"most": 3}),
         "trace": ((Steps(*episode), small.GRID, ("background", "cat", "cup"), 1, None), {}),
     }

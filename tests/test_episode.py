@@ -13,7 +13,7 @@ from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from
-from semfov.gaze.policies import KL, NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.small import Coloured, tensors
 
 GRID = Grid(3, 2, (90, 60))
@@ -284,12 +284,12 @@ def observed():
 
 
 STRATEGIES = {
-    "map, non-predictive": lambda: (Semantic(21), NonPredictive()),
-    "map with misses, non-predictive": lambda: (Semantic(21, observed(), misses=observed()), NonPredictive()),
-    "soft map, non-predictive": lambda: (Semantic(21, tempering=0.25, footprint="soft"), NonPredictive()),
-    "closest look, kl": lambda: (Semantic(21, memory="closest"), KL(observed())),
-    "target, non-predictive": lambda: (Target(evidence()), NonPredictive()),
-    "map, random": lambda: (Semantic(21), Random()),
+    "map, non-predictive": lambda: (Semantic(21), Policy("non-predictive")),
+    "map with misses, non-predictive": lambda: (Semantic(21, observed(), misses=observed()), Policy("non-predictive")),
+    "soft map, non-predictive": lambda: (Semantic(21, tempering=0.25, footprint="soft"), Policy("non-predictive")),
+    "closest look, kl": lambda: (Semantic(21, memory="closest"), Policy("kl", observed())),
+    "target, non-predictive": lambda: (Target(evidence()), Policy("non-predictive")),
+    "map, random": lambda: (Semantic(21), Policy("random")),
 }
 
 

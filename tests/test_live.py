@@ -12,7 +12,7 @@ from semfov.agents import FoveaEpisode
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.episode import Forgetting
-from semfov.gaze.policies import Closer, NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.small import Coloured, tensors
 
 SIZE = (160, 120)
@@ -44,9 +44,9 @@ def observers():
 
 def agent_with(observer, policy=None):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
-    policy = policy or NonPredictive()
+    policy = policy or Policy("non-predictive")
     mapper = Semantic(3) if observer.by_target else observer
-    return ActivePerception(eye, (observer, policy), (mapper, Random()), grid=(8, 6)).eval()
+    return ActivePerception(eye, (observer, policy), (mapper, Policy("random")), grid=(8, 6)).eval()
 
 
 @pytest.mark.parametrize("name", observers())
@@ -80,7 +80,10 @@ def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration
     model = learned(MapEvidence)
     agent = agent_with(Semantic(3))
     agent = ActivePerception(
-        agent.eye, (Semantic(3), NonPredictive()), (LearnedMap(model), Closer(0.2)), grid=(8, 6)
+        agent.eye,
+        (Semantic(3), Policy("non-predictive")),
+        (LearnedMap(model), Policy("closer-look", fovea=0.2)),
+        grid=(8, 6),
     ).eval()
     live, image = agent.live(rate=0, start=3), scene(60, 60)
     with torch.inference_mode():

@@ -8,7 +8,7 @@ import torch
 from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence
 from semfov.agents.fovea import _WORTH
 from semfov.belief.observers import LearnedMap, Semantic
-from semfov.gaze.policies import Closer, Gain, NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.small import Coloured
 
 SIZE = (160, 120)
@@ -35,7 +35,9 @@ def model():
 
 def agent_of(model, policy=None, grid=(5, 4)):
     eye, observer = Eye(Foveation(40.0), Coloured(), reference=160.0), LearnedMap(model)
-    return ActivePerception(eye, (Semantic(3), NonPredictive()), (observer, policy or Closer(0.25)), grid=grid)
+    return ActivePerception(
+        eye, (Semantic(3), Policy("non-predictive")), (observer, policy or Policy("closer-look", fovea=0.25)), grid=grid
+    )
 
 
 def largest_gains(model, scanpath):
@@ -56,7 +58,7 @@ def largest_gains(model, scanpath):
     return answer
 
 
-@pytest.mark.parametrize("policy", [None, Random()], ids=["closer-look", "random"])
+@pytest.mark.parametrize("policy", [None, Policy("random")], ids=["closer-look", "random"])
 def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     agent = agent_of(model, policy)
     whole = agent.explore(image, start=0, shifts=12, worth=0, seed=1)
@@ -83,7 +85,7 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
 @pytest.mark.slow
 def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, image):
     """After the last look every gain is below the price; after every earlier look at least one is not."""
-    agent = agent_of(model, Gain(model))
+    agent = agent_of(model, Policy("expected-gain", model))
     scanpath = agent.explore(image, start=7, shifts=19, worth=0.25)
     assert scanpath.ending == "worth"
     expected = largest_gains(model, scanpath)
@@ -132,7 +134,7 @@ def test_the_map_of_a_search_is_the_learned_map(model, image):
 
 def test_prices_are_numbers_for_an_agent_with_a_learned_map(image, model):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
-    agent = ActivePerception(eye, (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(5, 4))
+    agent = ActivePerception(eye, (Semantic(3), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(5, 4))
     with pytest.raises(InputError, match=r"^worth: expected None for an agent without a learned map"):
         agent.explore(image, worth=0.1)
     assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, worth=0).ending == "shifts"

@@ -44,7 +44,7 @@ def agent_with(
     """An agent that searches by `policy` and explores at random."""
     observer = observers.Semantic(len(CLASSES) + 1, model)
     eye = Eye(Foveation(10.0), detector, reference=64.0)
-    return ActivePerception(eye, (observer, policy), (observer, policies.Random()), grid=grid)
+    return ActivePerception(eye, (observer, policy), (observer, policies.Policy("random")), grid=grid)
 
 
 def detectors(draw: Draw, _: Path) -> Case:
@@ -55,7 +55,7 @@ def detectors(draw: Draw, _: Path) -> Case:
     model = None
     if draw.flag("calibrated"):
         model = FovealObservationModel.identity(CLASSES, [0.2, 0.4]).eval().requires_grad_(False)
-    policy = policies.named_policy(draw.choose(("non-predictive", "random"), "policy"), "search")
+    policy = policies.Policy(draw.choose(("non-predictive", "random"), "policy"))
     width, height = draw.integer(1, 40, "width"), draw.integer(1, 40, "height")
     grid = draw.integer(1, 6, "columns"), draw.integer(1, 6, "rows")
     agent = agent_with(Fixed(candidates, selection), grid, model, policy)
@@ -120,7 +120,7 @@ def agent_arguments(draw: Draw, _: Path) -> Case:
             if not (isinstance(value, int) and not isinstance(value, bool) and low <= value <= high):
                 wrong.add(name)
     seen = Candidates(torch.tensor([[[4.0, 4, 20, 20]]]), torch.tensor([[[0.1, 0.9, 0.1]]]), None)
-    agent = agent_with(Fixed(seen, Selection()), (4, 3), None, policies.NonPredictive())
+    agent = agent_with(Fixed(seen, Selection()), (4, 3), None, policies.Policy("non-predictive"))
     seek = draw.flag("search")
 
     def check(path: Scanpath) -> None:

@@ -110,7 +110,7 @@ _ = axes[0].legend()
 
 # %% alt="The scanpath over the coins to a large one, with the foveated view and the probability of large coins at each fixation"
 observer = semfov.observers.Semantic(3, model)
-search, explore = semfov.policies.NonPredictive(), semfov.policies.KL(model)
+search, explore = semfov.policies.Policy("non-predictive"), semfov.policies.Policy("kl", model)
 agent = semfov.ActivePerception(eye, (observer, search), (observer, explore), grid=(10, 8)).eval()
 scanpath = agent.search(image, "large coin", start=0)
 print(scanpath)

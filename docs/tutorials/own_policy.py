@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Your policy
 #
-# A policy chooses the next fixation. It provides an acquisition function, which gives every cell a value, and the next
-# fixation is the best cell not visited. The policy of this tutorial keeps away from earlier fixations: it looks at the
-# cell that is farthest from its closest fixation. It does not use the detections.
+# A policy chooses the next fixation by an acquisition function, which gives every cell a value: the next fixation is the
+# best cell not visited. The function of this tutorial keeps away from earlier fixations: it prefers the cell that is
+# farthest from its closest fixation. It does not use the detections.
 
 # %%
 import matplotlib.pyplot as plt
@@ -17,22 +17,14 @@ torch.set_grad_enabled(False)
 
 
 class Farthest(semfov.acquisition.AcquisitionFunction):
-    """Distance to the closest fixation so far."""
-
-    def forward(self, belief: semfov.Belief, visited: torch.Tensor) -> torch.Tensor:
-        """Values `(B, X·Y)`."""
-        return belief.closest  # every belief keeps it
-
-
-class KeepAway(policies.Policy):
-    """Explore with `Farthest`; the definition of the class registers the policy under its name."""
+    """Distance to the closest fixation so far; the definition of the class registers it under its name."""
 
     name = "keep-away"
     tasks = ("exploration",)
 
-    def forward(self, target: int | None, grid: semfov.Grid) -> semfov.acquisition.AcquisitionFunction:
-        """The acquisition function on a grid."""
-        return Farthest()
+    def forward(self, belief: semfov.Belief, visited: torch.Tensor) -> torch.Tensor:
+        """Values `(B, X·Y)`."""
+        return belief.closest  # every belief keeps it
 
 
 print(policies.policy_names("exploration"))
@@ -49,7 +41,7 @@ search = recommended.searching.observer, recommended.searching.policy
 mapper, closer = recommended.exploring.observer, recommended.exploring.policy
 agents = {
     policy.name: semfov.ActivePerception(recommended.eye, search, (mapper, policy)).eval()
-    for policy in (KeepAway(), closer, policies.Random())
+    for policy in (policies.Policy("keep-away"), closer, policies.Policy("random"))
 }
 scenes = semfov.EmbeddedScenes(recommended.classes[1:], count=4)
 explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, worth=0)

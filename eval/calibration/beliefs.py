@@ -22,8 +22,9 @@ from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.episode import Step, Stopwatch, rollout
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
+from semfov.gaze.acquisition.base import Task
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
-from semfov.gaze.policies import NonPredictive, Task
+from semfov.gaze.policies import Policy
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.presets import label
@@ -119,7 +120,7 @@ class BeliefCalibrationRun(ComparedLooking):
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
             return list(rollout(looks, self.observers[name], acquisition, search.start, choice, most=most))
 
-        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(search.noise)))
+        led = walk(self.guide, Policy("non-predictive")(target, looks.grid), Greedy(drawn_from(search.noise)))
         path = torch.cat([step.cell for step in led])
         beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:

@@ -12,7 +12,6 @@ from eval.comparison.saliency import SaliencyStore, saliency_table
 from semfov.belief.grid import Grid
 from semfov.errors import lookup
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
-from semfov.gaze.policies import SaliencyMaximum
 from semfov.runs.config import RunConfig, SaliencyModel
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import store_folder
@@ -31,7 +30,7 @@ class Candidate(Strategy):
         if self.saliency is None:
             return super().acquisition(target, grid, cell)
         salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
-        if isinstance(self.policy, SaliencyMaximum):
+        if self.policy.function is Static:
             return Static(salient)
         return SaliencyPrior(self.policy(target, grid), salient, weight=self.weight)
 

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from semfov.errors import InputError, check
 from semfov.eye import Eye
-from semfov.gaze.policies import POLICIES
+from semfov.gaze.acquisition.base import FUNCTIONS
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DetectorConfig, PolicyConfig, RunConfig, SensorConfig
 from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
@@ -90,7 +90,7 @@ def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
     if policy.policy == EVIDENCE:
         return ["evidence"]
     learned = ["map"] if policy.scores == "learned" else []
-    model = policy.policy in POLICIES and POLICIES[policy.policy].needs_model
+    model = policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model()
     return [*learned, *(["observation"] if model or policy.scores == "calibrated" else [])]
 
 

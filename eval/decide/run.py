@@ -28,7 +28,8 @@ from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conc
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, Stopwatch, StoredLooks
 from semfov.eye import Eye
-from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
+from semfov.gaze.acquisition.base import Task
+from semfov.gaze.policies import Policy
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig, RunConfig
@@ -141,7 +142,7 @@ class DecisionRun(ComparedLooking):
             self.windows = if_shipped(_window_evidence, config.windows, self.eye)
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
-        learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
+        learned, random = Strategy(observer, Policy("non-predictive")), Strategy(observer, Policy("random"))
         self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
         if not config.references:
             return
@@ -151,7 +152,7 @@ class DecisionRun(ComparedLooking):
         model = if_shipped(make_observation, config.belief.model, self.eye)
         if model is not None:
             self.models = self.models._replace(observation=model)
-            published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
+            published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Policy("predictive", model))
             name = CALIBRATED if model.metadata.get("method") == "discriminative" else PUBLISHED
             self.compared |= {
                 name: (published, self._by_thresholds),

@@ -15,7 +15,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch, StoredLooks
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 from semfov.metrics.exploration import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.exploration_protocol import (

@@ -1,17 +1,15 @@
 """IVSN over foveal looks: attention to what resembles the target, and the search that follows it."""
 
-from typing import Self
-
 import torch
 from torch import Tensor
 
 from eval.comparison.looking import Candidate
 from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
-from semfov.errors import InputError, check, check_shape
+from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import acuity
-from semfov.gaze.policies import Means, Policy, required_target
+from semfov.gaze.policies import Policy
 from semfov.strategy import Strategy
 
 
@@ -42,6 +40,7 @@ class TemplateAttention(AcquisitionFunction):
     tensor([[0.1000, 0.9000]])
     """
 
+    name, tasks, by_belief = "ivsn", ("search",), False
     target: Tensor
     attention: Tensor
     weight: Tensor
@@ -67,27 +66,6 @@ class TemplateAttention(AcquisitionFunction):
         return (weight * attention).sum(-2) / weight.sum(-2).clamp(min=torch.finfo(attention.dtype).tiny)
 
 
-class TemplateSearch(Policy):
-    """Look at what resembles the template of the target's class, with a fovea of this width (`Means.fovea`)."""
-
-    name = "ivsn"
-    tasks = ("search",)
-    by_belief = False
-
-    def __init__(self, fovea: float = 100 / 640) -> None:
-        super().__init__()
-        self.fovea = fovea
-
-    @classmethod
-    def make(cls, means: Means) -> Self:
-        """The policy with the width of the fovea."""
-        return cls(means.fovea)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """Raise an error, since there is no attention without a scene."""
-        raise InputError("policy 'ivsn': expected the attention of a scene, which `python -m eval.ivsn` computes")
-
-
 class Attending(Candidate):
     """IVSN in one scene, with the attention `(X·Y, K, X·Y)` of `TemplateAttention`."""
 
@@ -97,4 +75,4 @@ class Attending(Candidate):
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The attention to the target, accumulated over the fixated cells."""
-        return TemplateAttention(required_target(target, TemplateSearch.name), self.attention, grid, self.fovea)
+        return Policy(TemplateAttention, attention=self.attention, fovea=self.fovea)(target, grid)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from eval.comparison.looking import Candidate
-from eval.ivsn.attention import Attending, TemplateSearch
+from eval.ivsn.attention import Attending, TemplateAttention
 from eval.ivsn.templates import ClassTemplates, at_points
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import check
@@ -26,7 +26,12 @@ class IVSNConfig(SearchConfig):
         out: folder for tables, figures, per-episode records and the manifest.
     """
 
-    policies: tuple[str | PolicyConfig, ...] = ("random", "non-predictive-raw", TemplateSearch.name, "target-evidence")
+    policies: tuple[str | PolicyConfig, ...] = (
+        "random",
+        "non-predictive-raw",
+        TemplateAttention.name,
+        "target-evidence",
+    )
     templates: str | None = None
     out: Path = Path("runs/ivsn")
 
@@ -50,10 +55,9 @@ class IVSNRun(SearchRun):
     def candidate(self, name: str, index: int) -> Candidate:
         """The policy of this name in tables, for a scene."""
         candidate = super().candidate(name, index)
-        policy = candidate.strategy.policy
-        if not isinstance(policy, TemplateSearch):
+        if candidate.strategy.policy.function is not TemplateAttention:
             return candidate
-        return Attending(candidate.strategy, attention=self.attention(index), fovea=policy.fovea)
+        return Attending(candidate.strategy, attention=self.attention(index), fovea=self.config.sensor.fovea)
 
     def attention(self, index: int) -> Tensor:
         """Attention to every class in the cells of a scene, from every cell `(X·Y, K, X·Y)`; computed at each call."""

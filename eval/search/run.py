@@ -9,7 +9,7 @@ import torch
 
 from eval.comparison.looking import ComparedLooking
 from semfov.episode import Stopwatch
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise

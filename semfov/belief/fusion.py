@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import wraps
 
 import torch
 from torch import Tensor
@@ -9,9 +10,28 @@ from torch import Tensor
 from semfov.errors import check, check_shape, check_tensor, lookup, values_known
 from semfov.threads import one_thread_if_small
 
+__all__ = ["fuse", "kaplan", "product", "semba", "sum"]
+
 _Rule = Callable[[Tensor, Tensor], Tensor]
+RULES: dict[str, _Rule] = {}
+"""The rules by name, without checks, for likelihoods from `scale_likelihood`."""
 
 
+def _rule(rule: _Rule) -> _Rule:
+    """Register a rule, and check and scale what is given to it."""
+    RULES[rule.__name__] = rule
+
+    @wraps(rule)
+    def checked(beta: Tensor, likelihood: Tensor) -> Tensor:
+        check_parameters(beta)
+        scaled = scale_likelihood(likelihood)
+        check_shape(likelihood, "likelihood", *beta.shape[-1:])
+        return rule(beta, scaled)
+
+    return checked
+
+
+@_rule
 def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
     r"""Kaplan's rule: match the mean of the exact posterior, and keep the parameter of the least likely class.
 
@@ -39,9 +59,12 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> kaplan(torch.ones(3), torch.tensor([1.0, 0.0, 0.0]))
     tensor([2., 1., 1.])
     """
-    return kaplan_scaled(beta, _checked(beta, likelihood))
+    least = likelihood.amin(-1, keepdim=True)
+    expected = (beta * likelihood).sum(-1, keepdim=True)
+    return torch.addcdiv(beta, beta * (likelihood - least), expected + least)
 
 
+@_rule
 def product(beta: Tensor, likelihood: Tensor) -> Tensor:
     r"""Product rule: Bayes' rule for the mean, with one more unit of evidence.
 
@@ -64,9 +87,13 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([2.2500, 0.7500])
     """
-    return product_scaled(beta, _checked(beta, likelihood))
+    joint = beta * likelihood
+    # The floor keeps parameters positive after any number of likelihoods of 0.
+    joint = joint.clamp(min=torch.finfo(joint.dtype).tiny)
+    return (1 + beta.sum(-1, keepdim=True)) * joint / joint.sum(-1, keepdim=True)
 
 
+@_rule
 def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
     r"""Sum rule: count the normalised likelihood as one soft observation.
 
@@ -88,72 +115,12 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([1.7500, 1.2500])
     """
-    return sum_scaled(beta, _checked(beta, likelihood))
+    return beta + likelihood / likelihood.sum(-1, keepdim=True)
 
 
-def _checked(beta: Tensor, likelihood: Tensor) -> Tensor:
-    """Check parameters and likelihood, and scale the likelihood."""
-    check_parameters(beta)
-    scaled = scale_likelihood(likelihood)
-    check_shape(likelihood, "likelihood", *beta.shape[-1:])
-    return scaled
-
-
-def kaplan_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """Kaplan's rule (`kaplan`) without checks, for scaled likelihoods.
-
-    Args:
-        beta: `(..., K+1)`, Dirichlet parameters, positive.
-        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
-
-    Returns:
-        `(..., K+1)`, new parameters.
-
-    >>> kaplan_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
-    tensor([1.2500, 1.0000])
-    """
-    least = scaled.amin(-1, keepdim=True)
-    expected = (beta * scaled).sum(-1, keepdim=True)
-    return torch.addcdiv(beta, beta * (scaled - least), expected + least)
-
-
-def product_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """Product rule (`product`) without checks, for scaled likelihoods.
-
-    Args:
-        beta: `(..., K+1)`, Dirichlet parameters, positive.
-        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
-
-    Returns:
-        `(..., K+1)`, new parameters.
-
-    >>> product_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
-    tensor([2., 1.])
-    """
-    joint = beta * scaled
-    # The floor keeps parameters positive after any number of likelihoods of 0.
-    joint = joint.clamp(min=torch.finfo(joint.dtype).tiny)
-    return (1 + beta.sum(-1, keepdim=True)) * joint / joint.sum(-1, keepdim=True)
-
-
-def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """Sum rule (`sum`) without checks, for scaled likelihoods.
-
-    Args:
-        beta: `(..., K+1)`, Dirichlet parameters, positive.
-        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
-
-    Returns:
-        `(..., K+1)`, new parameters.
-
-    >>> sum_scaled(torch.ones(2), torch.tensor([1.0, 0.25]))
-    tensor([1.8000, 1.2000])
-    """
-    return beta + scaled / scaled.sum(-1, keepdim=True)
-
-
-def semba_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    r"""The rule in the code of SemBA, without checks, for scaled likelihoods.
+@_rule
+def semba(beta: Tensor, likelihood: Tensor) -> Tensor:
+    r"""The rule in the code of SemBA.
 
     .. math:: \beta'_k = \beta_k \left(1 + \frac{\lambda_k / D}{1 + \min_j \lambda_j / D}\right), \quad
               D = \sum_j \beta_j \lambda_j
@@ -164,35 +131,20 @@ def semba_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
 
     Args:
         beta: `(..., K+1)`, Dirichlet parameters, positive.
-        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
+        likelihood: `(..., K+1)`, λ, as for `product`.
 
     Returns:
         `(..., K+1)`, new parameters.
 
-    >>> semba_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
+    >>> semba(torch.ones(2), torch.tensor([1.0, 0.5]))
     tensor([1.5000, 1.2500])
     """
-    joint = beta * scaled
-    return torch.addcdiv(beta, joint, joint.sum(-1, keepdim=True) + scaled.amin(-1, keepdim=True))
-
-
-RULES: dict[str, _Rule] = {"kaplan": kaplan_scaled, "semba": semba_scaled, "product": product_scaled, "sum": sum_scaled}
+    joint = beta * likelihood
+    return torch.addcdiv(beta, joint, joint.sum(-1, keepdim=True) + likelihood.amin(-1, keepdim=True))
 
 
 def check_parameters(beta: Tensor) -> None:
-    """Check that Dirichlet parameters are positive and finite.
-
-    Args:
-        beta: `(...)`, the parameters.
-
-    Raises:
-        InputError: one is not, or they are not a tensor.
-
-    >>> check_parameters(torch.tensor([1.0, 0.0]))
-    Traceback (most recent call last):
-    ...
-    semfov.errors.InputError: beta: expected positive, finite Dirichlet parameters, got 0 to 1
-    """
+    """Raise `InputError` unless Dirichlet parameters are positive and finite."""
     check_tensor(beta, "beta")
     if not beta.numel() or not values_known(beta):
         return
@@ -203,34 +155,17 @@ def check_parameters(beta: Tensor) -> None:
 
 
 def scale_likelihood(likelihood: Tensor) -> Tensor:
-    """Check likelihoods, and scale each row to a maximum of 1. No fusion rule depends on a common factor.
-
-    Args:
-        likelihood: `(..., K+1)`, not negative, not all zero in a row.
-
-    Returns:
-        `(..., K+1)`, scaled.
-
-    Raises:
-        InputError: a row is zero, a likelihood is negative or not finite, or they are not a tensor.
-
-    >>> scale_likelihood(torch.tensor([0.1, 0.4]))
-    tensor([0.2500, 1.0000])
-    """
+    """Check likelihoods `(..., K+1)`, and scale each row to a maximum of 1: no rule depends on a common factor."""
     check_tensor(likelihood, "likelihood")
     largest = likelihood.amax(-1, keepdim=True)
     if values_known(likelihood) and likelihood.numel():
         # NaN and infinity pass through the maximum and the minimum, so two reductions check every condition.
         least = likelihood.detach().amin()
         if not bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()):
-            check(False, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
+            negative = "a negative value" if (likelihood < 0).any() else "a row of zeros"
+            got = negative if torch.isfinite(likelihood).all() else "NaN or infinity"
+            check(False, "likelihood", "finite values, none negative, not all zero", got)
     return likelihood / largest
-
-
-def _describe(likelihood: Tensor) -> str:
-    if not torch.isfinite(likelihood).all():
-        return "NaN or infinity"
-    return "a negative value" if (likelihood < 0).any() else "a row of zeros"
 
 
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
@@ -279,21 +214,7 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
 
 @one_thread_if_small
 def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> Tensor:
-    """Update every cell with the detections that cover it (`fuse`), without checks.
-
-    Args:
-        beta: `(B, X·Y, K+1)`, Dirichlet parameters, positive.
-        scaled: `(B, L, K+1)`, likelihoods from `scale_covering`.
-        footprint: `(B, L, X·Y)`, the cells that each detection updates.
-        rule: `kaplan`, `semba`, `product` or `sum`.
-
-    Returns:
-        `(B, X·Y, K+1)`, new parameters.
-
-    >>> fuse_scaled(torch.ones(1, 2, 2), torch.tensor([[[0.0, 1.0]]]), torch.tensor([[[True, False]]]), "kaplan")
-    tensor([[[1., 2.],
-             [1., 1.]]])
-    """
+    """`fuse` without checks, for likelihoods from `scale_covering`."""
     update, covered, soft = RULES[rule], footprint > 0, footprint.is_floating_point()
     if not values_known(beta, scaled, footprint):
         return _fuse_one_by_one(beta, scaled, footprint, update)
@@ -317,24 +238,7 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
 
 
 def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
-    """Scale the likelihoods of detections that cover a cell (`scale_likelihood`); the others become 1.
-
-    Padding may hold zeros, which no rule accepts.
-
-    Args:
-        likelihood: `(..., L, K+1)`, likelihoods of the classes given each detection.
-        footprint: `(..., L, X·Y)`, the cells that each detection updates.
-
-    Returns:
-        `(..., L, K+1)`, scaled.
-
-    Raises:
-        InputError: a likelihood of a detection that covers a cell is negative or not finite, or all of them are zero.
-
-    >>> scale_covering(torch.tensor([[0.1, 0.4], [0.0, 0.0]]), torch.tensor([[True], [False]]))
-    tensor([[0.2500, 1.0000],
-            [1.0000, 1.0000]])
-    """
+    """Likelihoods of the detections that cover a cell, scaled; those of the others, such as padding, become 1."""
     return scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))
 
 

@@ -19,7 +19,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, check_whole
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 from semfov.metrics.exploration import answers_of
 from semfov.runs.config import (
     BeliefConfig,

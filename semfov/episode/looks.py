@@ -26,7 +26,7 @@ class Sight:
         seconds: time by stage.
         frames: frames of a stream since the look before, including this one.
 
-    >>> from semfov.belief.observers import SemanticLook
+    >>> from semfov.belief.observers.semantic import SemanticLook
     >>> look = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
     >>> sight = Sight(look, lambda: None, {"detect": 0.02})
     >>> sight.seconds

@@ -16,9 +16,10 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score, look_features
-from semfov.belief.observers import Observer, Semantic, TargetBelief
+from semfov.belief.observers import Observer, Semantic
 from semfov.belief.observers.base import own
-from semfov.belief.observers.target import Target, TargetLook
+from semfov.belief.observers.gathering import EvidenceLook
+from semfov.belief.observers.target import Target, TargetBelief
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms, decide, place_known
@@ -31,7 +32,7 @@ from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
-from semfov.gaze.policies import NonPredictive
+from semfov.gaze.policies import Policy
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
@@ -104,9 +105,9 @@ class _TargetExamples(Examples):
     goal: Tensor
     target: Tensor
 
-    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> TargetLook:
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> EvidenceLook:
         """Process stored looks with the model in training; see `Examples.look`."""
-        return TargetLook(
+        return EvidenceLook(
             own(observer, Target, "observer").model.evidence(self.features[episodes, cell].float()),
             self.distance[episodes, cell],
             self.score[episodes, cell],
@@ -450,11 +451,11 @@ class EvidenceFit(PartFit):
         config, run, inputs = self.settings, self.run, self.inputs
         fit = fit_evidence(config, run)
         fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
-        learned = strategy(Target(fit.model), NonPredictive())
+        learned = strategy(Target(fit.model), Policy("non-predictive"))
         ways = {
             "fitted": learned,
-            "raw": strategy(Semantic(inputs.components), NonPredictive()),
-            "fused": strategy(inputs.semantic, NonPredictive()),
+            "raw": strategy(Semantic(inputs.components), Policy("non-predictive")),
+            "fused": strategy(inputs.semantic, Policy("non-predictive")),
         }
         protocol, judged = inputs.protocol, inputs.judged
         curves = _search_curves(run, judged, ways, protocol, config.max_target_area)

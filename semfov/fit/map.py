@@ -15,8 +15,9 @@ from torch.nn import functional as F
 from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
-from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Observer, Semantic
+from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.belief.observers.base import own
+from semfov.belief.observers.learned_map import MapBelief, MapLook
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError, InputError
 from semfov.fit.descent import descend
@@ -26,7 +27,7 @@ from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
-from semfov.gaze.policies import Closer, Random
+from semfov.gaze.policies import Policy
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of, success_rate
@@ -362,9 +363,9 @@ class MapFit(PartFit):
         fit = fit_map_evidence(self.settings, run)
         fovea = self.config.sensor.fovea
         ways = {
-            "fitted": strategy(LearnedMap(fit.model), Closer(fovea)),
-            "raw": strategy(Semantic(inputs.components), Random()),
-            "fused": strategy(inputs.semantic, Closer(fovea)),
+            "fitted": strategy(LearnedMap(fit.model), Policy("closer-look", fovea=fovea)),
+            "raw": strategy(Semantic(inputs.components), Policy("random")),
+            "fused": strategy(inputs.semantic, Policy("closer-look", fovea=fovea)),
         }
         protocol = inputs.protocol
         curves = _explore_curves(run, inputs.judged, ways, protocol)

@@ -10,7 +10,7 @@ from semfov.belief.observers import CellMemory
 from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import lookup
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 from semfov.gaze.saliency.cells import Reduction
 from semfov.model_folder import ModelFolder
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers

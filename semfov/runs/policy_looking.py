@@ -11,7 +11,9 @@ from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.eye import Eye
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
+from semfov.gaze.acquisition.base import FUNCTIONS, Task
+from semfov.gaze.acquisition.static import Uniform
+from semfov.gaze.policies import Policy
 from semfov.io.code import class_digest
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
@@ -49,9 +51,9 @@ class PolicyLooking(Looking):
     @cached_property
     def code(self) -> str:
         """Digest of the code of the run, and of policies that the user registered."""
-        chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
-        foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
-        return digest_of([super().code, [class_digest(POLICIES[name]) for name in foreign]])
+        chosen = {policy.policy for policy in self.policies.values()} & FUNCTIONS.keys()
+        foreign = [name for name in sorted(chosen) if not FUNCTIONS[name].__module__.startswith("semfov.")]
+        return digest_of([super().code, [class_digest(FUNCTIONS[name]) for name in foreign]])
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the models of all policies, and the settings of belief, protocol and policies."""
@@ -104,7 +106,7 @@ def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
     if _by_evidence(policy, task):
         return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
-    return replace(policy, policy=Random.name, saliency=None, samples=None)
+    return replace(policy, policy=Uniform.name, saliency=None, samples=None)
 
 
 def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
@@ -112,7 +114,7 @@ def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -
     return any(
         policy.scores == "calibrated"
         or _of(policy.misses, belief.misses)
-        or (policy.policy in POLICIES and POLICIES[policy.policy].needs_model)
+        or (policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model())
         for policy in policies
     )
 
@@ -122,10 +124,15 @@ def _make_strategy(
 ) -> Strategy:
     """Build the observer and the policy that settings describe."""
     if policy.policy == TARGET_EVIDENCE:
-        return Strategy(Target(_required(models.evidence, "policy", "learned target evidence")), NonPredictive())
+        return Strategy(
+            Target(_required(models.evidence, "policy", "learned target evidence")), Policy("non-predictive")
+        )
     calibrated = policy.scores == "calibrated"
-    means = Means(models.observation, models.map, fovea, belief.prior, policy.samples, calibrated)
-    chosen = named_policy(policy.policy, task, means)
+    function = FUNCTIONS[policy.policy]
+    model = models.map if function.needs_map else models.observation
+    common = {"fovea": fovea, "prior": belief.prior}
+    own = {name: common[name] for name in common.keys() & function.takes()}
+    chosen = Policy(function, model, samples=policy.samples, calibrated=calibrated, **own)
     if _by_evidence(policy, task):
         return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":

@@ -9,7 +9,9 @@ from typing import get_args
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
 from semfov.errors import InputError, check, lookup
-from semfov.gaze.policies import POLICIES, Random, SaliencyMaximum, Task, policy_names
+from semfov.gaze.acquisition.base import FUNCTIONS, Task
+from semfov.gaze.acquisition.static import Static, Uniform
+from semfov.gaze.policies import policy_names
 from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 
 TARGET_EVIDENCE = "target-evidence"
@@ -48,22 +50,22 @@ def presets(task: Task) -> Mapping[str, PolicyConfig]:
 
 @cache
 def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
-    plain = {name: PolicyConfig(name) for name in policies if name != SaliencyMaximum.name}
-    salient = {model: PolicyConfig(SaliencyMaximum.name, saliency=model) for model in _SALIENCY_MODELS}
+    plain = {name: PolicyConfig(name) for name in policies if name != Static.name}
+    salient = {model: PolicyConfig(Static.name, saliency=model) for model in _SALIENCY_MODELS}
     if task == "search":
         # The scores do not matter to these: no belief guides them, or one of their own.
-        alone = {name: PolicyConfig(name) for name in (Random.name, TARGET_EVIDENCE)}
-        alone |= {name: policy for name, policy in plain.items() if not POLICIES[name].by_belief} | salient
+        alone = {name: PolicyConfig(name) for name in (Uniform.name, TARGET_EVIDENCE)}
+        alone |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief} | salient
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: policy for name, policy in plain.items() if name not in alone}
-        alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
+        alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if FUNCTIONS[name].by_place}
     else:
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
-        scored = {name: policy for name, policy in plain.items() if not POLICIES[name].needs_map} | salient
+        scored = {name: policy for name, policy in plain.items() if not FUNCTIONS[name].needs_map} | salient
         alone = {
             f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
             for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
-            if not POLICIES[policy.policy].needs_model
+            if not FUNCTIONS[policy.policy].needs_model()
         }
     both = {
         f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
@@ -88,8 +90,8 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
     lookup(choice.policy, _valid_policies(task), "policy")
-    saliency = choice.saliency if choice.policy == SaliencyMaximum.name else None
-    if choice.policy == SaliencyMaximum.name and saliency is None:
+    saliency = choice.saliency if choice.policy == Static.name else None
+    if choice.policy == Static.name and saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
     for setting, words in _WORDS.items():
@@ -97,8 +99,10 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
         check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
-    if choice.samples is not None and not (choice.policy in POLICIES and POLICIES[choice.policy].by_samples):
-        names = ", ".join(name for name in policy_names(task) if POLICIES[name].by_samples)
+    if choice.samples is not None and not (
+        choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes()
+    ):
+        names = ", ".join(name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes())
         raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
     known = presets(task).values()
     scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]
@@ -123,7 +127,7 @@ def label(choice: PolicyChoice, task: Task) -> str:
         for name, preset in presets(task).items()
         if name not in _ALIASES and not name.startswith(_MAXIMUM_A_POSTERIORI)
     }
-    alone = settings.saliency if settings.policy == SaliencyMaximum.name else None
+    alone = settings.saliency if settings.policy == Static.name else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
     differs = []
     for field in fields(PolicyConfig)[2:]:

@@ -187,7 +187,7 @@ def _run_batch(
     def lands(step: Step) -> Tensor:
         return goals[seeking[step.episodes], step.next_cell]
 
-    if strategy.policy.by_belief:
+    if strategy.policy.function.by_belief:
         observer, source = strategy.observer, looks.of(seeking)
     else:
         # No look changes what the policy does, and most of the time would go into the belief.

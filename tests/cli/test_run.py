@@ -16,7 +16,7 @@ import semfov
 from semfov import DataError, InputError, read_image
 from semfov.cli.options import FindOptions
 from semfov.cli.search import _FindJob
-from semfov.gaze.policies import Random
+from semfov.gaze.policies import Policy
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import digest_of
 from semfov.runs.settings import Settings
@@ -74,7 +74,7 @@ def test_only_outcomes_of_the_same_agent_are_continued(agent, flight):
     assert key(agent) == before
     eye, strategies = agent.eye, [(each.observer, each.policy) for each in (agent.searching, agent.exploring)]
     other_cells = semfov.ActivePerception(eye, *strategies, grid=(agent.columns + 1, agent.rows))
-    other_policy = semfov.ActivePerception(eye, (strategies[0][0], Random()), strategies[1])
+    other_policy = semfov.ActivePerception(eye, (strategies[0][0], Policy("random")), strategies[1])
     assert len({before, key(other_cells), key(other_policy)}) == 3
 
 

@@ -9,7 +9,7 @@ from semfov import ActivePerception, Belief, DataError, Eye, Foveation, InputErr
 from semfov.belief.observers import Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.decision.test_rule import Nothing, Scripted, Square, cells
 from tests.decision.test_verifier import AT, FromScore
 
@@ -27,7 +27,7 @@ class Fine(Square):
 def agent(observer, detector=None, thresholds=AT):
     eye = Eye(Foveation(200.0), detector or Square(), reference=160.0)
     verification = FromScore(thresholds=thresholds)
-    search, explore = (observer, NonPredictive()), (Semantic(3), Random())
+    search, explore = (observer, Policy("non-predictive")), (Semantic(3), Policy("random"))
     return ActivePerception(eye, search, explore, verification=verification, grid=(4, 3)).eval()
 
 
@@ -80,7 +80,7 @@ def test_without_closer_looks_or_without_their_model_the_belief_decides(image):
     script = [(cells(c5=0.4), 0.9), (cells(c11=0.9), 0.9), (cells(c11=0.95), 0.97)]
     made = agent(Scripted(*script))
     plain = ActivePerception(
-        made.eye, (Scripted(*script), NonPredictive()), (Semantic(3), Random()), grid=(4, 3)
+        made.eye, (Scripted(*script), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(4, 3)
     ).eval()
     for one in (
         made.search(image, "red", start=0, closer=0),

@@ -13,7 +13,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from semfov.detection import Candidates, Detector
 from semfov.episode import Forgetting
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.decision.test_rule import Scripted
 from tests.decision.test_verifier import AT, GRID, Closer, FromScore, Told, box_of, look, step
 
@@ -56,7 +56,7 @@ def spots(*cells, contrast=0.8):
 def agent(observer, thresholds=AT, verification=True):
     eye = Eye(Foveation(60.0), Spots(), reference=160.0)
     model = FromScore(thresholds=thresholds) if verification else None
-    search, explore = (observer, NonPredictive()), (Semantic(3), Random())
+    search, explore = (observer, Policy("non-predictive")), (Semantic(3), Policy("random"))
     return ActivePerception(eye, search, explore, verification=model, grid=(4, 3)).eval()
 
 

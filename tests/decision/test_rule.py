@@ -13,7 +13,7 @@ from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, F
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision, conclude, decide, goal_cells, strength, strongest
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.small import Coloured
 
 SIZE = (160, 120)
@@ -217,7 +217,9 @@ def cells(**at):
 
 def agent(observer):
     eye = Eye(Foveation(200.0), Square(), reference=160.0)
-    return ActivePerception(eye, (observer, NonPredictive()), (Semantic(3), Random()), grid=(4, 3)).eval()
+    return ActivePerception(
+        eye, (observer, Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(4, 3)
+    ).eval()
 
 
 def test_search_ends_when_the_target_is_found(image):

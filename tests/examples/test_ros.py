@@ -17,7 +17,7 @@ from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from tests.examples.messages import KINDS, plain
 from tests.small import Coloured
 
@@ -184,7 +184,7 @@ def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     monkeypatch.delitem(sys.modules, "examples.ros_node", raising=False)
     node_module = importlib.import_module("examples.ros_node")
     eye = semfov.Eye(semfov.Foveation(40.0), Coloured(CLASSES, (64, 64), score=0.9), reference=64.0)
-    searching, exploring = (Semantic(4), NonPredictive()), (Semantic(4), Random())
+    searching, exploring = (Semantic(4), Policy("non-predictive")), (Semantic(4), Policy("random"))
     sure = Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
     agent = semfov.ActivePerception(eye, searching, exploring, verification=sure)
     monkeypatch.setattr(semfov.ActivePerception, "recommended", lambda name: agent)

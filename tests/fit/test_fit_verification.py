@@ -26,7 +26,7 @@ from semfov.fit.verification import (
     fit_in_folds,
     verify,
 )
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from semfov.io.storage import read
 from semfov.runs.store import cell_store
 from tests.small import CLASSES, Blobs
@@ -211,7 +211,7 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     model = _shipped_mean()
     config = FitVerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
     model.thresholds = Thresholds(confirm, config.give_up, config.place)
-    searching, exploring = (Target(evidence), NonPredictive()), (Semantic(4), Random())
+    searching, exploring = (Target(evidence), Policy("non-predictive")), (Semantic(4), Policy("random"))
     agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
     searches = iter(verified_in(found, [model, model], evidence, config))
     ends = []

@@ -10,7 +10,7 @@ from scipy.stats import beta as beta_distribution
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition, dirichlet, fusion, policies
 from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
-from semfov.gaze.policies import POLICIES, Means, named_policy
+from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.policy_looking import _make_strategy, _Models
 from semfov.runs.presets import label, resolve
@@ -152,21 +152,20 @@ def test_models_of_the_posterior_and_no_samples_are_refused():
     with pytest.raises(InputError, match="model: expected an observation model whose Dirichlets are densities"):
         sampled_likelihoods(two_classes(expected=torch.full((2, 2, 2), 0.5, dtype=torch.float64)), 4)
     with pytest.raises(InputError, match="samples: expected 1 or more, got 0"):
-        policies.KL(two_classes(), samples=0)
+        policies.Policy("kl", two_classes(), samples=0)
     with pytest.raises(InputError, match="likelihoods"):
         look_ahead_by_samples(torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)
 
 
 def test_policies_take_the_expectation_by_their_settings():
     model = four_classes()
-    for task in ("search", "exploration"):
-        for name, kind in POLICIES.items():
-            if kind.by_samples and task in kind.tasks:
-                target = 1 if task == "search" else None
-                made = named_policy(name, task, Means(model, samples=4, calibrated=False))(target, GRID)
-                assert torch.equal(made.likelihoods, sampled_likelihoods(model, 4, calibrated=False))
-                assert named_policy(name, task, Means(model))(target, GRID).likelihoods is None
-    assert {name for name, kind in POLICIES.items() if kind.by_samples} >= {"predictive", "kl"}
+    for name, kind in acquisition.FUNCTIONS.items():
+        if "likelihoods" in kind.takes():
+            made = Policy(name, model, samples=4, calibrated=False)(1, GRID)
+            assert torch.equal(made.likelihoods, sampled_likelihoods(model, 4, calibrated=False))
+            assert Policy(name, model)(1, GRID).likelihoods is None
+    with pytest.raises(InputError, match="samples: expected None for policy 'random', which predicts no look, got 4"):
+        Policy("random", samples=4)
     settings = PolicyConfig("kl", "calibrated", samples=8)
     assert label(settings, "exploration") == "kl-calibrated, samples 8"
     for scores in ("raw", "calibrated"):

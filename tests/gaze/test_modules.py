@@ -97,29 +97,29 @@ class PolicyTester(AcquisitionTester):
         return module(2, GRID)(DirichletBelief(beta, closest), closest == 0)
 
 
-class TestIdealObserver(TensorTester):
+class TestPolicyCorrectLocalisation(TensorTester):
     batched = (0, 1)
     inputs = PolicyTester.inputs
     call = staticmethod(PolicyTester.call)
 
     def make(self):
-        return policies.IdealObserver(model())
+        return policies.Policy("ideal-observer", model())
 
 
-for kind in (each for each in policies.POLICIES.values() if each.__module__.startswith("semfov.")):
-    if kind not in (policies.IdealObserver, policies.SaliencyMaximum) and not kind.needs_map:
-        made = {kind.__name__: lambda kind=kind: kind.make(policies.Means(model().requires_grad_(False)))}
+for kind in (each for each in acquisition.FUNCTIONS.values() if each.__module__.startswith("semfov.")):
+    if kind not in (acquisition.CorrectLocalisation, acquisition.Static) and not kind.needs_map:
+        made = {f"Policy{kind.__name__}": lambda kind=kind: policies.Policy(kind, model().requires_grad_(False))}
         globals().update(make_testers(PolicyTester, made))
 
 
-globals().update(make_testers(PolicyTester, {"SaliencyMaximum": lambda: policies.SaliencyMaximum(rand(len(GRID)))}))
+globals().update(make_testers(PolicyTester, {"Policy": lambda: policies.Policy("saliency", values=rand(len(GRID)))}))
 
 
-class TestGain(PolicyTester):
+class TestPolicyExpectedGain(PolicyTester):
     inputs = TestExpectedGain.inputs
 
     def make(self):
-        return policies.Gain(mapping())
+        return policies.Policy("expected-gain", mapping())
 
     @staticmethod
     def call(module, scores, boxes, fixation):

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition, policies
-from semfov.gaze.policies import POLICIES, Means, Policy, named_policy, policy_names
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition
+from semfov.gaze.acquisition import FUNCTIONS
+from semfov.gaze.policies import Policy, policy_names
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -23,132 +24,104 @@ def model():
 
 
 @pytest.fixture
-def means(model):
+def mapping():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        everything = MapEvidence(4, 4, components=3).requires_grad_(False)
-    return Means(model, everything)
+        return MapEvidence(4, 4, components=3).requires_grad_(False)
 
 
-OWN = {name for name, kind in POLICIES.items() if kind.__module__.startswith("semfov.")}
-"""Policies of the package; others may be registered."""
-
-# Policies of each acquisition function, for a search for class 1 and for exploration.
-MADE = {
-    "random": lambda means: acquisition.Uniform(),
-    "non-predictive": lambda means: acquisition.TargetPosterior(1),
-    "predictive": lambda means: acquisition.PredictedTargetPosterior(1, means.model),
-    "neighbourhood": lambda means: acquisition.NeighbourhoodPosterior(1, means.model, GRID),
-    "foveal-hit": lambda means: acquisition.FovealHit(1, means.model, GRID),
-    "place-information": lambda means: acquisition.PlaceInformation(1, means.model, GRID),
-    "kl": lambda means: acquisition.KLDivergence(means.model, GRID, prior=means.prior),
-    "surprise": lambda means: acquisition.BayesianSurprise(means.model, GRID),
-    "negative-entropy": lambda means: acquisition.NegativeEntropy(means.model, GRID),
-    "two-peaks": lambda means: acquisition.TwoPeaks(means.model, GRID),
-    "upper-confidence-bound": lambda means: acquisition.UpperConfidenceBound(means.model, GRID),
-    "probability-of-improvement": lambda means: acquisition.ProbabilityOfImprovement(means.model, GRID),
-    "expected-accuracy": lambda means: acquisition.ExpectedAccuracy(means.model, GRID),
-    "closer-look": lambda means: acquisition.CloserLook(GRID, means.fovea),
-}
+OWN = {name for name, kind in FUNCTIONS.items() if kind.__module__.startswith("semfov.")}
+"""Functions of the package; others may be registered."""
 
 
-@pytest.mark.parametrize("name", MADE)
+def model_for(name, model, mapping):
+    return mapping if FUNCTIONS[name].needs_map else model
+
+
+@pytest.mark.parametrize("name", sorted(OWN - {"expected-gain", "saliency"}))
 def test_a_policy_makes_its_acquisition_function(name, model):
     beta = 0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1))
-    for means in (Means(model, fovea=0.2), Means(model, fovea=0.2, prior=2.0)):
-        for task in POLICIES[name].tasks:
-            made = named_policy(name, task, means)(1 if task == "search" else None, GRID)
-            assert torch.equal(values_of(made, beta), values_of(MADE[name](means), beta))
+    given = {"target": 1, "model": model, "grid": GRID}
+    expected = FUNCTIONS[name](**{each: given[each] for each in FUNCTIONS[name].takes() if each in given})
+    assert torch.equal(values_of(Policy(name, model)(1, GRID), beta), values_of(expected, beta))
 
 
-def test_the_policy_of_expected_gain_keeps_its_map(means):
-    policy = named_policy("expected-gain", "exploration", means)
-    assert policy.model is means.map
-    assert isinstance(policy(None, GRID), acquisition.ExpectedGain)
+def test_settings_reach_the_function(model, mapping):
+    beta = 0.5 + torch.rand(1, 12, 3, generator=torch.Generator().manual_seed(1))
+    for made, expected in [
+        (Policy("kl", model, prior=2.0), acquisition.KLDivergence(model, GRID, prior=2.0)),
+        (Policy(acquisition.CloserLook, fovea=0.2), acquisition.CloserLook(GRID, 0.2)),
+        (Policy("neighbourhood", model, sigma=2.0), acquisition.NeighbourhoodPosterior(1, model, GRID, sigma=2.0)),
+    ]:
+        assert torch.equal(values_of(made(1, GRID), beta), values_of(expected, beta))
+    policy = Policy("expected-gain", mapping)
+    assert policy.model is mapping
+    assert policy(None, GRID).model is mapping
+    with pytest.raises(InputError, match="unknown setting of policy 'kl' 'prio'; did you mean 'prior'"):
+        Policy("kl", model, prio=1.0)
+    with pytest.raises(InputError, match="policy 'saliency': expected values of a scene, got none"):
+        Policy("saliency")(None, GRID)
 
 
-@pytest.mark.parametrize(
-    ("name", "task"),
-    [
-        ("foveal-hit", "search"),
-        ("place-information", "search"),
-        ("entropy-limit", "search"),
-        ("expected-accuracy", "exploration"),
-    ],
-)
-def test_a_model_without_miss_rates_is_refused(name, task):
-    means = Means(FovealObservationModel.identity(["cup", "cat"], [0.2]))
+@pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "expected-accuracy"])
+def test_a_model_without_miss_rates_is_refused(name):
     with pytest.raises(InputError, match="miss rates"):
-        named_policy(name, task, means)(1 if task == "search" else None, GRID)
+        Policy(name, FovealObservationModel.identity(["cup", "cat"], [0.2]))(1, GRID)
 
 
-def test_every_policy_class_is_public():
+def test_every_named_function_is_public():
     for name in OWN:
-        kind = POLICIES[name]
-        assert kind.name == name
-        assert getattr(policies, kind.__name__) is kind
-        assert kind.__name__ in policies.__all__
+        assert getattr(acquisition, FUNCTIONS[name].__name__) is FUNCTIONS[name]
 
 
-@pytest.mark.parametrize("name", POLICIES)
-def test_models_are_submodules_of_the_policy(name, means):
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_models_are_submodules_of_the_policy(name, model, mapping):
     """They are in its state dict, and change dtype with it."""
-    policy = POLICIES[name].make(means)
-    assert isinstance(policy, Policy)
-    part = means.model if policy.needs_model else means.map if policy.needs_map else None
-    assert list(policy.state_dict()) == ([] if part is None else [f"model.{name}" for name in part.state_dict()])
+    policy, part = Policy(name, model_for(name, model, mapping)), model_for(name, model, mapping)
+    needed = "model" in FUNCTIONS[name].takes()
+    assert list(policy.state_dict()) == ([f"model.{name}" for name in part.state_dict()] if needed else [])
     policy.double()
     moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
     assert set(moved) <= {torch.float64}
-    assert bool(moved) == (part is not None)
+    assert bool(moved) == needed
 
 
-def test_a_user_defined_policy_is_registered_under_its_name():
-    class Last(Policy):
+def test_a_user_defined_function_is_registered_under_its_name():
+    class Last(acquisition.Static):
         name = "last-of-all"
         tasks = ("search",)
 
-        def forward(self, target, grid):
-            return acquisition.Static(torch.arange(float(len(grid))))
-
-    class Nameless(Policy):
-        def forward(self, target, grid):
-            return acquisition.Uniform()
+    class Nameless(acquisition.Uniform):
+        pass
 
     try:
         assert policy_names("search")[-1] == "last-of-all"
         assert "last-of-all" not in policy_names("exploration")
-        made = named_policy("last-of-all", "search")
+        made = Policy("last-of-all", values=torch.arange(12.0))(1, GRID)
         assert isinstance(made, Last)
-        assert values_of(made(1, GRID), torch.ones(1, 12, 3)).argmax() == 11
-        assert Nameless not in POLICIES.values()
+        assert values_of(made, torch.ones(1, 12, 3)).argmax() == 11
+        assert Nameless not in FUNCTIONS.values()
     finally:
-        del POLICIES["last-of-all"]
+        del FUNCTIONS["last-of-all"]
 
 
 def test_a_missing_model_is_an_error_when_the_policy_is_made():
-    for task in ("search", "exploration"):
-        for name in policy_names(task):
-            kind = POLICIES[name]
-            if not (kind.needs_model or kind.needs_map):
-                named_policy(name, task)
-                continue
-            needed = "a learned map" if kind.needs_map else "an observation model"
-            with pytest.raises(InputError, match=f"policy '{name}': expected {needed}"):
-                named_policy(name, task)
+    for name, kind in FUNCTIONS.items():
+        if "model" not in kind.takes():
+            Policy(name)
+            continue
+        needed = "a learned map" if kind.needs_map else "an observation model"
+        with pytest.raises(InputError, match=f"policy '{name}': expected {needed}, got none"):
+            Policy(name)
 
 
 @pytest.mark.parametrize("name", sorted(OWN & set(policy_names("search")) - {"random", "saliency"}))
-def test_the_error_for_a_missing_target_names_the_policy(name, means):
+def test_the_error_for_a_missing_target_names_the_policy(name, model):
     with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
-        named_policy(name, "search", means)(None, GRID)
+        Policy(name, model)(None, GRID)
 
 
-def test_other_names_and_tasks_are_refused_with_a_suggestion(means):
-    for name, task, meant in [("two-peak", "exploration", "two-peaks"), ("predicitve", "search", "predictive")]:
+def test_other_names_are_refused_with_a_suggestion():
+    for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:
         with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-            named_policy(name, task)
-    with pytest.raises(InputError, match="search policy 'kl'"):
-        named_policy("kl", "search", means)
-    with pytest.raises(InputError, match="exploration policy 'predictive'"):
-        named_policy("predictive", "exploration", means)
+            Policy(name)

@@ -15,7 +15,7 @@ import scipy.stats
 import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition
-from semfov.gaze.policies import Means, named_policy
+from semfov.gaze.policies import Policy
 from tests.small import kaplan
 
 LEVELS = 8
@@ -166,7 +166,7 @@ def assert_agree(got, wanted, tolerance, constant=False):
 
 @pytest.mark.parametrize("name", EXPLORATION)
 def test_exploration(name, paper):
-    wanted, function = EXPLORATION[name](paper), named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
+    wanted, function = EXPLORATION[name](paper), Policy(name, paper.model)(None, paper.grid)
     assert_agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
     assert_agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
 
@@ -175,7 +175,7 @@ def test_exploration(name, paper):
 def test_search(paper, target):
     searches = {"non-predictive": paper.non_predictive(target), "predictive": paper.predictive(target)}
     for name, wanted in searches.items():
-        function = named_policy(name, "search", Means(paper.model))(target, paper.grid)
+        function = Policy(name, paper.model)(target, paper.grid)
         assert_agree(paper.values(function), wanted, 1e-12)
         assert_agree(paper.values(function, torch.float32), wanted, 1e-6)
 
@@ -194,12 +194,12 @@ def test_neighbourhood(paper, sigma):
 @pytest.mark.parametrize("prior", [0.1, 0.5, 2.0])
 def test_divergence_from_another_prior(prior):
     paper = Paper(SHAPES["wide"], 5, 3)
-    function = named_policy("kl", "exploration", Means(paper.model, prior=prior))(None, paper.grid)
+    function = Policy("kl", paper.model, prior=prior)(None, paper.grid)
     assert_agree(paper.values(function), paper.total(lambda beta: divergence(beta, prior)), DOUBLE, constant=True)
 
 
 @pytest.mark.parametrize(("name", "metric"), [("kl", divergence), ("negative-entropy", negentropy)])
 def test_the_constant_is_the_value_of_the_present_map(name, metric, paper):
-    function = named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
+    function = Policy(name, paper.model)(None, paper.grid)
     present = sum(metric(beta) for beta in paper.beta)
     np.testing.assert_allclose(paper.values(function), np.array(paper.total(metric)) - present, rtol=0, atol=1e-9)

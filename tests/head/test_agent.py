@@ -9,7 +9,7 @@ from semfov import ActivePerception, Detections, Flat, HeadAgent, InputError, Pa
 from semfov.agents.head import _decide_look
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
@@ -178,7 +178,10 @@ def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
 
 
 def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama):
-    strategies = (Target(agent.target_evidence), NonPredictive()), (LearnedMap(agent.map_evidence), Random())
+    strategies = (
+        (Target(agent.target_evidence), Policy("non-predictive")),
+        (LearnedMap(agent.map_evidence), Policy("random")),
+    )
     whole = ActivePerception(agent.eye, *strategies)
     path = whole.find_all(Panorama(panorama), passes=2)
     assert path.actions == agent.find_all(Panorama(panorama), passes=2).actions

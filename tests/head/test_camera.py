@@ -10,7 +10,7 @@ from PIL import Image
 from examples.pan_tilt import SimulatedCamera
 from semfov import ActivePerception, DataError, Eye, Flat, Foveation, HeadAgent, InputError, Panorama
 from semfov.belief.observers import LearnedMap, Target
-from semfov.gaze.policies import NonPredictive, Random
+from semfov.gaze.policies import Policy
 from semfov.head import (
     CameraFrame,
     CameraScene,
@@ -253,7 +253,9 @@ def test_the_record_of_a_camera_shows_what_it_saw_and_is_stored(agent, panorama,
 
 def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_path):
     """The kind of look follows from the picture; the record is that of the part of the agent that turns a head."""
-    one = ActivePerception(eye, (Target(models[0]), NonPredictive()), (LearnedMap(models[1]), Random())).eval()
+    one = ActivePerception(
+        eye, (Target(models[0]), Policy("non-predictive")), (LearnedMap(models[1]), Policy("random"))
+    ).eval()
     head = HeadAgent(eye, *models).eval()
     file = tmp_path / "around.png"
     Image.fromarray(panorama.mul(255).byte().permute(1, 2, 0).numpy()).save(file)

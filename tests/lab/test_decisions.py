@@ -15,7 +15,7 @@ from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.gaze.policies import Predictive
+from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
@@ -128,7 +128,7 @@ def test_records_match_searches_run_step_by_step(run):
             observer, at_the_gaze = Target(evidence), record["policy"] == FUSED[1]
             if record["policy"] in FUSED:
                 model = run.models.observation
-                observer, acquisition = Semantic(81, model), Predictive(model)(target, grid)
+                observer, acquisition = Semantic(81, model), Policy("predictive", model)(target, grid)
             looks = StoredLooks(detections, grid, torch.tensor([target]))
             steps, ended = [], 0
             with torch.inference_mode():

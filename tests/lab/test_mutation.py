@@ -15,8 +15,8 @@ def test_every_change_that_is_set_aside_is_one_of_the_present_code():
     [
         ("semfov.belief.fusion.gone", "return a"),
         ("semfov.gone.fuse", "return a"),
-        ("semfov.belief.fusion.sum_scaled", "return beta - scaled / scaled.total(-1, keepdim=True)"),
-        ("semfov.belief.fusion.sum_scaled", "return beta + scaled / scaled.sum(-1, keepdim=True)"),
+        ("semfov.belief.fusion.sum", "return beta - likelihood / likelihood.total(-1, keepdim=True)"),
+        ("semfov.belief.fusion.sum", "return beta + likelihood / likelihood.sum(-1, keepdim=True)"),
         ("semfov.belief.fusion.fuse_scaled", "order = rank.argsort(stable=False)"),
         ("semfov.fuse", "soft = None"),
     ],

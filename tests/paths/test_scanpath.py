@@ -44,7 +44,7 @@ def agent():
     eye = Eye(Foveation(20.0), Bright(), reference=130.0)
     observer = observers.Semantic(3)
     return ActivePerception(
-        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(5, 4)
+        eye, (observer, policies.Policy("non-predictive")), (observer, policies.Policy("random")), grid=(5, 4)
     ).eval()
 
 

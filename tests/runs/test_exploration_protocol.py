@@ -8,7 +8,7 @@ import torch
 
 from eval.comparison.looking import Candidate
 from semfov import Detections, FovealObservationModel, Grid, policies
-from semfov.belief.observers import SemanticLook
+from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.exploration import answers_of
@@ -108,7 +108,7 @@ def explore_by_loop(episode, look, model, answers, noise, shifts):
 def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
     # In float64, so that the reference finds the same ties.
     double = SemanticLook(look.likelihood.double(), look.footprint, look.distance.double())
-    explorer = Candidate(Strategy(FixedLook(double), policies.KL(model.double())))
+    explorer = Candidate(Strategy(FixedLook(double), policies.Policy("kl", model.double())))
     looks = StoredLooks(Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask), GRID)
     episodes, noise, progress = explored(explorer, starts=5, shifts=shifts, batch=batch, looks=looks)
     right_classes = [set(row.nonzero()[:, 0].tolist()) for row in ANSWERS]
@@ -121,7 +121,7 @@ def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
 def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
     """The next fixation maximises the policy's value times the saliency as seen from the current cell."""
     table = torch.rand(12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
-    observer, policy = FixedLook(look), policies.Surprise(model)
+    observer, policy = FixedLook(look), policies.Policy("surprise", model)
     explorer = Candidate(Strategy(observer, policy), saliency=table, weight=0.5)
     _, _, progress = explored(explorer, starts=4, shifts=6, batch=3)
     for fixated, _ in progress:
@@ -138,7 +138,7 @@ def test_saliency_alone_replaces_the_policy(look):
     """The next fixation is the most salient cell as seen from the current one, whatever the belief."""
     saliency = torch.rand(12, 12, generator=torch.Generator().manual_seed(1))
     for table in (saliency, saliency[:1]):
-        explorer = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
+        explorer = Candidate(Strategy(FixedLook(look), policies.Policy("saliency")), table)
         episodes, _, progress = explored(explorer, starts=12, shifts=11, index=1)
         assert sorted(episode.start for episode in episodes) == list(range(12))
         for episode, (fixated, _) in zip(episodes, progress, strict=True):

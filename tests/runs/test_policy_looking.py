@@ -11,7 +11,14 @@ from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence, observers, policies
 from semfov.belief import MapEvidence
-from semfov.gaze.acquisition import ExpectedAccuracy, PredictedTargetPosterior, SaliencyPrior, Static, TargetPosterior
+from semfov.gaze.acquisition import (
+    FUNCTIONS,
+    ExpectedAccuracy,
+    PredictedTargetPosterior,
+    SaliencyPrior,
+    Static,
+    TargetPosterior,
+)
 from semfov.runs import policy_looking
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.policy_looking import (
@@ -54,10 +61,10 @@ def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, m
 
 @pytest.mark.parametrize(
     "name",
-    [name for name, kind in policies.POLICIES.items() if not kind.by_belief and kind.__module__.startswith("semfov.")],
+    [name for name, kind in FUNCTIONS.items() if not kind.by_belief and kind.__module__.startswith("semfov.")],
 )
 def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(name):
-    made, cell = Strategy(observers.Semantic(3), policies.POLICIES[name]()), torch.tensor([1, 5])
+    made, cell = Strategy(observers.Semantic(3), policies.Policy(name)), torch.tensor([1, 5])
     saliency = torch.rand(12, 12) if name == "saliency" else None
     values = Candidate(made, saliency).acquisition(1, GRID, cell)
     beliefs = (DirichletBelief(0.5 + torch.rand(2, 12, components)) for components in (1, 3))
@@ -173,14 +180,14 @@ def test_target_evidence_brings_its_own_belief():
     sought = strategy("target-evidence", evidence=evidence)
     assert isinstance(sought.observer, observers.Target)
     assert sought.observer.model is evidence
-    assert isinstance(sought.policy, policies.NonPredictive)
+    assert sought.policy.name == "non-predictive"
     with pytest.raises(InputError, match="learned"):
         strategy("target-evidence")
 
 
 def test_saliency_alone_keeps_the_belief_of_the_run(model):
     made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
-    assert isinstance(made.policy, policies.SaliencyMaximum)
+    assert made.policy.name == "saliency"
     assert made.observer.observation is model
 
 
@@ -190,11 +197,11 @@ def test_saliency_replaces_a_policy_or_is_combined_with_it(rows):
     table = torch.rand(rows, 12, generator=torch.Generator().manual_seed(0))
     seen = table[cell] if rows > 1 else table.expand(2, -1)
     belief = DirichletBelief(0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)))
-    salient = Strategy(observers.Semantic(3), policies.SaliencyMaximum())
+    salient = Strategy(observers.Semantic(3), policies.Policy("saliency"))
     alone = Candidate(salient, table).acquisition(1, GRID, cell)
     assert isinstance(alone, Static)
     torch.testing.assert_close(alone(belief, visited), seen)
-    sought = Strategy(observers.Semantic(3), policies.NonPredictive())
+    sought = Strategy(observers.Semantic(3), policies.Policy("non-predictive"))
     beside = Candidate(sought, saliency=table, weight=0.4).acquisition(1, GRID, cell)
     assert isinstance(beside, SaliencyPrior)
     raised = seen + 1e-3 * seen.amax(-1, keepdim=True)

@@ -9,7 +9,8 @@ import pytest
 from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
 from semfov.errors import InputError
-from semfov.gaze.policies import Task, policy_names
+from semfov.gaze.acquisition.base import Task
+from semfov.gaze.policies import policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import _WORDS, _valid_policies, label, presets, resolve

@@ -8,7 +8,7 @@ import torch
 
 from eval.chance import random_search
 from semfov import Detections, Grid, fusion, policies
-from semfov.belief.observers import SemanticLook
+from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
 from semfov.metrics.search import cumulative_performance
 from semfov.runs.config import ProtocolConfig
@@ -93,7 +93,7 @@ def search_by_loop(episode, look, noise, shifts):
 @pytest.mark.parametrize("ties", ["random", "first"])
 def test_search_equals_a_scalar_reference(scenes, look, ties):
     protocol = ProtocolConfig(starts=6, shifts=9, ties=ties)
-    episodes, noise, outcomes = run(scenes, look, policies.NonPredictive(), protocol)
+    episodes, noise, outcomes = run(scenes, look, policies.Policy("non-predictive"), protocol)
     assert len(episodes) == 18
     for episode, random, outcome in zip(episodes, noise, outcomes, strict=True):
         assert outcome == search_by_loop(episode, look, random, 9)
@@ -101,7 +101,7 @@ def test_search_equals_a_scalar_reference(scenes, look, ties):
 
 def test_random_search_follows_the_hypergeometric_formula(scenes, look):
     protocol = ProtocolConfig(starts=4000, shifts=24)
-    episodes, _, outcomes = run(scenes, look, policies.Random(), protocol)
+    episodes, _, outcomes = run(scenes, look, policies.Policy("random"), protocol)
     for target, goals in ((1, 2), (2, 1), (3, 5)):
         found = [found_at for e, (_, found_at) in zip(episodes, outcomes, strict=True) if e.target == target]
         curve = cumulative_performance(np.array(found), 24)
@@ -119,8 +119,8 @@ class Unread(FixedLook):
 
 def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look):
     protocol = ProtocolConfig(starts=4, shifts=9)
-    episodes, noise, expected = run(scenes, look, policies.Random(), protocol)
-    looks, candidate = looks_of(episodes, NOTHING, GRID), Strategy(Unread(look), policies.Random())
+    episodes, noise, expected = run(scenes, look, policies.Policy("random"), protocol)
+    looks, candidate = looks_of(episodes, NOTHING, GRID), Strategy(Unread(look), policies.Policy("random"))
     assert run_episodes(episodes, candidate, looks, noise, shifts=9, batch=8) == expected
     for episode, random, outcome in zip(episodes, noise, expected, strict=True):
         cells = [episode.start]
@@ -128,12 +128,14 @@ def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look
             random[len(cells) - 1][cells] = -1
             cells.append(int(random[len(cells) - 1].argmax()))
         assert outcome[0] == cells
-    seeing = Strategy(Unread(look), policies.NonPredictive())
+    seeing = Strategy(Unread(look), policies.Policy("non-predictive"))
     with pytest.raises(AssertionError, match="updated"):
         run_episodes(episodes, seeing, looks, noise, shifts=9, batch=8)
 
 
-@pytest.mark.parametrize("policy", [policies.Random(), policies.NonPredictive()], ids=lambda policy: policy.name)
+@pytest.mark.parametrize(
+    "policy", [policies.Policy("random"), policies.Policy("non-predictive")], ids=lambda policy: policy.name
+)
 def test_outcomes_do_not_depend_on_the_batch_size(scenes, look, policy):
     protocol = ProtocolConfig(starts=7, shifts=12)
     _, _, whole = run(scenes, look, policy, protocol)
@@ -187,7 +189,7 @@ def test_a_search_ends_when_no_cell_is_left(scenes, look):
     episodes = episodes_of(scenes, 0, 5, 5, protocol)[:1]
     hidden = [episodes[0]._replace(goal=())]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
-    candidate = Strategy(FixedLook(look), policies.Random())
+    candidate = Strategy(FixedLook(look), policies.Policy("random"))
     cells, found_at = run_episodes(hidden, candidate, looks_of(hidden, NOTHING, GRID), noise, shifts=40, batch=8)[0]
     assert found_at == -1
     assert sorted(cells) == list(range(25))

@@ -15,8 +15,7 @@ import torch
 from eval.comparison.records import StoredRecords
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import DataError, InputError
-from semfov.gaze.acquisition import TargetPosterior
-from semfov.gaze.policies import POLICIES, Policy
+from semfov.gaze.acquisition import FUNCTIONS, TargetPosterior
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import SceneResults
@@ -80,12 +79,8 @@ def test_only_other_code_is_reported_for_scenes_that_are_left(tmp_path, monkeypa
 
 
 def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, monkeypatch):
-    class OwnPolicy(Policy):
+    class Own(TargetPosterior):
         name = "own-of-a-test"
-        tasks = ("search",)
-
-        def forward(self, target, grid):
-            return TargetPosterior(target)
 
     try:
         chosen = replace(config, policies=(PolicyConfig("own-of-a-test"),))
@@ -95,7 +90,7 @@ def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, 
         assert SearchRun(chosen).key != key
         assert SearchRun(config).settings_key != SearchRun(chosen).settings_key
     finally:
-        del POLICIES["own-of-a-test"]
+        del FUNCTIONS["own-of-a-test"]
 
 
 def test_a_part_of_another_image_is_not_loaded(tmp_path):

@@ -16,7 +16,7 @@ from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
-from semfov.gaze.policies import Task
+from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise

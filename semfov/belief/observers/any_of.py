@@ -19,16 +19,7 @@ TargetLike = str | int | Sequence[str | int] | Mapping[str, float] | Mapping[int
 
 @dataclass(frozen=True)
 class AnyLook(Look):
-    """Evidence of looks about several classes.
-
-    Attributes:
-        inner: looks of the inner observer: one for each class, or a single one about all classes.
-
-    >>> from semfov.belief.observers import SemanticLook
-    >>> look = AnyLook((SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4)),))
-    >>> look[:1].inner[0].distance.shape
-    torch.Size([1, 4])
-    """
+    """Looks of the inner observer: one for each class, or a single one about all classes."""
 
     inner: tuple[Look, ...]
 
@@ -39,15 +30,7 @@ class AnyBelief(Belief):
 
     .. math:: P(x) = 1 - \prod_k (1 - w_k \, p_k(x))
 
-    Attributes:
-        inner: beliefs of the inner observer: one for each class, or a single one about all classes.
-        weights: w, by class.
-        closest: `(B, X·Y)`, see `Belief`.
-
-    >>> from semfov.belief import DirichletBelief
-    >>> inner = DirichletBelief(torch.tensor([[[1.0, 2.0, 1.0]]]))  # one cell; probabilities 0.25, 0.5, 0.25
-    >>> AnyBelief((inner,), {1: 1.0, 2: 0.4}, inner.closest).probability(1)
-    tensor([[0.5500]])
+    The inner beliefs are one for each class, or a single one about all classes; w are the weights by class.
     """
 
     inner: tuple[Belief, ...]
@@ -67,11 +50,7 @@ class AnyBelief(Belief):
         return self._any(lambda belief, index: belief.presence(index))
 
     def likeliest(self) -> Tensor:
-        """The class with the most probable cell, weights included.
-
-        Returns:
-            `(B,)`, class indices.
-        """
+        """The class with the most probable cell, weights included, `(B,)`."""
         peaks = [weight * belief.probability(index).amax(-1) for belief, index, weight in self._each()]
         return torch.tensor(list(self.weights), device=peaks[0].device)[torch.stack(peaks).argmax(0)]
 

@@ -23,7 +23,7 @@ class Look:
     A subclass is a dataclass of tensors `(B, ...)`, of other looks, also in tuples, and of values that all looks share.
     One that holds its tensors in another way implements indexing and `join`.
 
-    >>> from semfov.belief.observers import SemanticLook
+    >>> from semfov.belief.observers.semantic import SemanticLook
     >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
     >>> SemanticLook.join([look[:1], look]).distance.shape
     torch.Size([3, 4])

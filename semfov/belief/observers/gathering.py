@@ -18,7 +18,11 @@ from semfov.belief.observers.base import Look, Observer
 
 @dataclass(frozen=True)
 class EvidenceLook(Look):
-    """Evidence `(B, X·Y)` of looks about one class, or `(B, T, X·Y)` about T classes at once."""
+    """Evidence `(B, X·Y)` of looks about one class, log odds, or `(B, T, X·Y)` about T classes at once.
+
+    Distances `(B, X·Y)` are those of the fixation from every cell; scores and targets are `(B,)` or `(B, T)`, and the
+    fixated cell is `(B,)`.
+    """
 
     evidence: Tensor
     distance: Tensor
@@ -30,7 +34,11 @@ class EvidenceLook(Look):
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
-    """Base of beliefs that are computed from the evidence of all looks, about one class or each of K classes."""
+    """Base of beliefs that are computed from the evidence of all looks, about one class or each of K classes.
+
+    Of each cell, `(B, X·Y)` or `(B, K, X·Y)`: the evidence of its closest look, the strongest one, and the sum weighted
+    by nearness; of the image: the highest score in any detection `(B,)` or `(B, K)`, and the number of looks `(B,)`.
+    """
 
     closest: Tensor
     nearest: Tensor

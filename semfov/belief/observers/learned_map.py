@@ -17,46 +17,14 @@ from semfov.detection.detections import Detections
 
 @dataclass(frozen=True)
 class MapLook(EvidenceLook):
-    """Evidence of looks about T classes in every cell.
-
-    Attributes:
-        evidence: `(B, T, X·Y)`, log odds.
-        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
-        score: `(B, T)`, highest score of each class in any detection.
-        fixated: `(B,)`, the cell that holds the fixation.
-        target: `(B, T)`, the classes.
-        columns: X, cells in a row.
-        stands_for: `(B, T)`, number of classes that each given class represents; 1 if all K are given.
-
-    >>> observer, grid = LearnedMap(MapEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
-    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
-    >>> observer.weigh(seen, torch.tensor([[30.0, 10.0]]), grid).fixated
-    tensor([1])
-    """
+    """Evidence of looks about T classes; each stands for `(B, T)` classes: 1, or in training more."""
 
     stands_for: Tensor
 
 
 @dataclass(frozen=True)
 class MapBelief(GatheredBelief):
-    """Belief about all classes, as marginal probabilities. Several classes can share a cell.
-
-    Attributes:
-        closest: `(B, X·Y)`, see `Belief`.
-        nearest: `(B, K, X·Y)`, evidence of the closest look at each cell.
-        best: `(B, K, X·Y)`, strongest evidence of any look.
-        total: `(B, K, X·Y)`, sum of the evidence of all looks, weighted by their nearness.
-        weight: `(B, X·Y)`, sum of the nearness of all looks.
-        score: `(B, K)`, highest score of each class in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
-        probabilities: `(B, X·Y, K+1)`, probability that a cell holds each class; the first is background, that it holds
-            none.
-
-    >>> observer, grid = LearnedMap(MapEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
-    >>> observer.start(1, grid, torch.zeros(1)).probabilities[0, 0]
-    tensor([0.3333, 0.3333, 0.3333])
-    """
+    """Belief about all classes `(B, X·Y, K+1)`, as marginal probabilities: several classes can share a cell."""
 
     probabilities: Tensor
 

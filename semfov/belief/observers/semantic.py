@@ -23,18 +23,7 @@ CellMemory = Literal["all", "closest"]
 
 @dataclass(frozen=True)
 class SemanticLook(Look):
-    """Likelihoods of a batch of looks, ready for fusion.
-
-    Attributes:
-        likelihood: `(B, L, K+1)`, likelihood of each class given each detection, scaled to a maximum of 1.
-        footprint: `(B, L, X·Y)`, the cells that each detection updates: boolean, or weights in [0, 1] that are used as
-            exponents of the likelihood; false or 0 for padding.
-        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
-
-    >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
-    >>> look[:1].likelihood.shape
-    torch.Size([1, 5, 3])
-    """
+    """Likelihoods of a batch of looks `(B, L, K+1)`, scaled, and the cells that they update `(B, L, X·Y)` (`fuse`)."""
 
     likelihood: Tensor
     footprint: Tensor
@@ -137,9 +126,6 @@ class Semantic(Observer):
         r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
 
         The closest look counts as one from farther away, as in the learned observers (`Gatherer.fade`).
-
-        Returns:
-            The faded belief.
         """
         belief = dirichlet_belief(belief)
         if keep == 1:

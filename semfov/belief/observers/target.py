@@ -16,31 +16,9 @@ from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
 
-class TargetLook(EvidenceLook):
-    """Evidence of looks about the target in every cell; the attributes are those of `EvidenceLook` for one class."""
-
-
 @dataclass(frozen=True)
 class TargetBelief(GatheredBelief):
-    """Belief about a single target.
-
-    Attributes:
-        closest: `(B, X·Y)`, see `Belief`.
-        nearest: `(B, X·Y)`, evidence of the closest look at each cell.
-        best: `(B, X·Y)`, strongest evidence of any look.
-        total: `(B, X·Y)`, sum of the evidence of all looks, weighted by their nearness.
-        weight: `(B, X·Y)`, sum of the nearness of all looks.
-        score: `(B,)`, highest score of the target in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
-        present: `(B, X·Y)`, probability that a cell holds the target.
-        following: `(B, X·Y)`, probability that a cell holds the target, given that no fixated cell holds it.
-        anywhere: `(B,)`, probability that the image holds the target.
-
-    >>> observer, grid = Target(TargetEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
-    >>> observer.start(1, grid, torch.zeros(1)).presence(1)
-    tensor([0.5000])
-    """
+    """Belief about a single target: in each cell, there if no fixated cell holds it `(B, X·Y)`, and anywhere `(B,)`."""
 
     present: Tensor
     following: Tensor
@@ -90,25 +68,18 @@ class Target(Gatherer):
         even, anywhere = like.new_full((batch, len(grid)), 0.5), like.new_full((batch,), 0.5)
         return TargetBelief(**self.nothing(batch, grid, like), present=even, following=even, anywhere=anywhere)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
-        """Evidence for the target.
-
-        Returns:
-            A batch of B looks.
-
-        Raises:
-            InputError: `target` is None.
-        """
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> EvidenceLook:
+        """Evidence for the target, which must be given."""
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
         score = highest_score(detections, target)
         targets = torch.full((len(fixation),), target, device=fixation.device)
-        return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), targets, grid.columns)
+        return EvidenceLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), targets, grid.columns)
 
     def update(self, belief: Belief, look: Look) -> TargetBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        belief, look = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
+        belief, look = own(belief, TargetBelief, "belief"), own(look, EvidenceLook, "look")
         columns = look.columns
         all_looks = self.gather(belief, look)
 

@@ -1,7 +1,7 @@
 """Acquisition functions: the value of fixating each cell next, given the belief."""
 
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy, ExpectedGain
-from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
 from semfov.gaze.acquisition.exploration import (
     BayesianSurprise,
@@ -18,6 +18,7 @@ from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTarg
 from semfov.gaze.acquisition.static import Static, Uniform
 
 __all__ = [
+    "FUNCTIONS",
     "AcquisitionFunction",
     "BayesianSurprise",
     "CloserLook",

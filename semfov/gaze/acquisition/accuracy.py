@@ -46,6 +46,7 @@ class ExpectedAccuracy(AcquisitionFunction):
     tensor(1)
     """
 
+    name, tasks = "expected-accuracy", ("exploration",)
     levels: Tensor
     miss: Tensor
     named: Tensor
@@ -91,6 +92,7 @@ class ExpectedGain(AcquisitionFunction):
     torch.Size([1, 3])
     """
 
+    name, tasks, needs_map = "expected-gain", ("exploration",), True
     distance: Tensor
 
     def __init__(self, model: MapEvidence, grid: Grid) -> None:

@@ -1,10 +1,17 @@
-"""The base class of acquisition functions."""
+"""The base class of acquisition functions, and their registry by name."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from inspect import Parameter, signature
+from typing import ClassVar, Literal
 
 from torch import Tensor, nn
 
 from semfov.belief.belief import Belief
+
+Task = Literal["search", "exploration"]
+FUNCTIONS: dict[str, type["AcquisitionFunction"]] = {}
+"""All named acquisition functions."""
 
 
 class AcquisitionFunction(nn.Module, ABC):
@@ -12,16 +19,50 @@ class AcquisitionFunction(nn.Module, ABC):
 
     A subclass implements `forward`. The next fixation is the cell of the highest value that was not visited
     (`semfov.gaze.select_fixation`). The function itself may value visited cells too: inhibition of return excludes
-    them.
+    them. A subclass with a `name` is registered when it is defined: `semfov.policies.Policy` and the settings of runs
+    refer to it by that name. Its arguments say what it is made from: `target`, `grid` and `model` for the target, the
+    cells and a fitted model, and settings of its own.
+
+    Attributes:
+        name: name in settings.
+        tasks: tasks that the function is for.
+        needs_map: whether its `model` is a learned map, whose belief alone it works on.
+        by_belief: whether its values depend on the belief.
+        by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
     >>> import torch
-    >>> from semfov import DirichletBelief
+    >>> from semfov import DirichletBelief, Grid, policies
     >>> class Background(AcquisitionFunction):
+    ...     name, tasks = "background", ("search", "exploration")
     ...     def forward(self, belief, visited):
     ...         return belief.class_probabilities()[..., 0]
-    >>> Background()(DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]])), torch.zeros(1, 2, dtype=torch.bool))
+    >>> look = policies.Policy("background")(None, Grid(2, 1, (20, 10)))
+    >>> look(DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]])), torch.zeros(1, 2, dtype=torch.bool))
     tensor([[0.2500, 0.5000]])
+    >>> del FUNCTIONS["background"]
     """
+
+    name: ClassVar[str] = ""
+    tasks: ClassVar[tuple[Task, ...]] = ()
+    needs_map: ClassVar[bool] = False
+    by_belief: ClassVar[bool] = True
+    by_place: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "name" in cls.__dict__:
+            FUNCTIONS[cls.name] = cls
+
+    @classmethod
+    def takes(cls) -> Mapping[str, Parameter]:
+        """The arguments that the function is made from, by name."""
+        parameters = signature(cls).parameters.items()
+        return {name: each for name, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+
+    @classmethod
+    def needs_model(cls) -> bool:
+        """Whether the function is made from an observation model."""
+        return "model" in cls.takes() and not cls.needs_map
 
     @abstractmethod
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:

@@ -36,6 +36,7 @@ class CloserLook(AcquisitionFunction):
     1
     """
 
+    name, tasks = "closer-look", ("exploration",)
     seen: Tensor
 
     def __init__(self, grid: Grid, fovea: float = 100 / 640) -> None:

@@ -50,6 +50,8 @@ class KLDivergence(Lookahead):
     tensor(1)
     """
 
+    name, tasks = "kl", ("exploration",)
+
     def __init__(
         self, model: FovealObservationModel, grid: Grid, *, prior: float = 0.5, likelihoods: Tensor | None = None
     ) -> None:
@@ -86,6 +88,8 @@ class BayesianSurprise(Lookahead):
     tensor(1)
     """
 
+    name, tasks = "surprise", ("exploration",)
+
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Divergence of the predicted posterior from the present one."""
         return divergence(outlook)
@@ -113,6 +117,8 @@ class NegativeEntropy(Lookahead):
     tensor(1)
     """
 
+    name, tasks = "negative-entropy", ("exploration",)
+
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Decrease of the entropy."""
         surprise = torch.xlogy(outlook.mean, outlook.mean)[..., None, :]
@@ -139,6 +145,8 @@ class TwoPeaks(Lookahead):
     >>> TwoPeaks(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
     tensor(1)
     """
+
+    name, tasks = "two-peaks", ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Absolute change of the margin."""
@@ -172,6 +180,8 @@ class UpperConfidenceBound(Lookahead):
     >>> UpperConfidenceBound(model, Grid(3, 1, (30, 10)), kappa=0.5)(belief, torch.zeros(3, dtype=torch.bool)).shape
     torch.Size([3])
     """
+
+    name, tasks = "upper-confidence-bound", ("exploration",)
 
     def __init__(self, model: FovealObservationModel, grid: Grid, *, kappa: float = 2.0) -> None:
         super().__init__(model, grid)
@@ -215,6 +225,8 @@ class ProbabilityOfImprovement(Lookahead):
     >>> ProbabilityOfImprovement(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
     tensor(1)
     """
+
+    name, tasks = "probability-of-improvement", ("exploration",)
 
     def __init__(self, model: FovealObservationModel, grid: Grid, *, margin: float = 0.0) -> None:
         super().__init__(model, grid)

@@ -66,6 +66,8 @@ class EntropyLimit(_SignalSearch):
     tensor(1)
     """
 
+    name, tasks, by_place = "entropy-limit", ("search",), True
+
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
         """The sum, in nats."""
         return (signal.square() @ place[..., None])[..., 0] / 2
@@ -102,6 +104,8 @@ class CorrectLocalisation(_SignalSearch):
     >>> CorrectLocalisation(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
     tensor(1)
     """
+
+    name, tasks, by_place = "ideal-observer", ("search",), True
 
     def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid, *, nodes: int = 64) -> None:
         super().__init__(target, model, grid)

@@ -57,6 +57,8 @@ class FovealHit(_TargetVisibility):
     tensor(1)
     """
 
+    name, tasks, by_place = "foveal-hit", ("search",), True
+
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
         """Probability of a detection."""
         return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
@@ -86,6 +88,8 @@ class PlaceInformation(_TargetVisibility):
     >>> PlaceInformation(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
     tensor(1)
     """
+
+    name, tasks, by_place = "place-information", ("search",), True
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
         """Expected decrease of the entropy of the place, in nats."""

@@ -28,6 +28,7 @@ class TargetPosterior(AcquisitionFunction):
     tensor([[0.7500, 0.5000]])
     """
 
+    name, tasks = "non-predictive", ("search",)
     target: Tensor
 
     def __init__(self, target: int | Tensor) -> None:
@@ -70,6 +71,7 @@ class PredictedTargetPosterior(AcquisitionFunction):
     tensor(0)
     """
 
+    name, tasks = "predictive", ("search",)
     target: Tensor
     likelihoods: Tensor | None
 
@@ -118,6 +120,7 @@ class NeighbourhoodPosterior(AcquisitionFunction):
     tensor(1)
     """
 
+    name, tasks = "neighbourhood", ("search",)
     target: Tensor
     levels: Tensor
     kernel: Tensor

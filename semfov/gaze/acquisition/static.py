@@ -16,6 +16,8 @@ class Uniform(AcquisitionFunction):
     tensor([[0., 0., 0.]])
     """
 
+    name, tasks, by_belief = "random", ("search", "exploration"), False
+
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Zeros `(..., X·Y)`."""
         return belief.closest.new_zeros(belief.closest.shape)
@@ -34,6 +36,7 @@ class Static(AcquisitionFunction):
     tensor([[0.1000, 0.7000, 0.2000]])
     """
 
+    name, tasks, by_belief = "saliency", ("search", "exploration"), False
     values: Tensor
 
     def __init__(self, values: Tensor) -> None:

@@ -9,7 +9,8 @@ import torch
 
 from semfov import FovealObservationModel, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, highest_score
-from semfov.belief.observers import LearnedMap, MapBelief, Target
+from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers.learned_map import MapBelief
 from semfov.gaze.acquisition import KLDivergence
 from tests.belief import reference
 

@@ -5,7 +5,8 @@ import torch
 
 from semfov import Detections, FovealObservationModel, Grid, InputError
 from semfov.belief import fusion, likelihoods
-from semfov.belief.observers import Semantic, SemanticLook
+from semfov.belief.observers import Semantic
+from semfov.belief.observers.semantic import SemanticLook
 
 GRID = Grid(5, 4, (100, 80))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]

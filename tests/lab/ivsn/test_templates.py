@@ -4,12 +4,12 @@ import pytest
 import torch
 from scipy.spatial.distance import cosine
 
-from eval.ivsn.attention import Attending, TemplateAttention, TemplateSearch
+from eval.ivsn.attention import Attending, TemplateAttention
 from eval.ivsn.templates import ClassTemplates, at_points
 from semfov import DirichletBelief, Grid, InputError
 from semfov.belief.observers import Semantic
 from semfov.detection.placement import Placement, letterbox
-from semfov.gaze.policies import Means
+from semfov.gaze.policies import Policy
 from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (80, 60))
@@ -94,7 +94,7 @@ def test_other_classes_and_invalid_arguments_are_refused():
 
 
 def test_a_search_follows_the_attention_of_its_scene():
-    strategy, attention = Strategy(Semantic(4), TemplateSearch.make(Means(fovea=0.2))), make_attention()
+    strategy, attention = Strategy(Semantic(4), Policy("ivsn", fovea=0.2)), make_attention()
     candidate = Attending(strategy, attention=attention, fovea=0.2)
     visited = torch.zeros(1, 12, dtype=torch.bool)
     visited[0, 5] = True
@@ -102,7 +102,7 @@ def test_a_search_follows_the_attention_of_its_scene():
     torch.testing.assert_close(value[0], attention[5, 1])
     with pytest.raises(InputError, match="policy 'ivsn': expected a target"):
         candidate.acquisition(None, GRID, torch.tensor([5]))
-    with pytest.raises(InputError, match="policy 'ivsn': expected the attention of a scene"):
+    with pytest.raises(InputError, match="policy 'ivsn': expected attention of a scene"):
         strategy.policy(1, GRID)
 
 
