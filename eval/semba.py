@@ -1,24 +1,30 @@
-"""The searcher of SemBA, with Kaplan's rule and with the rule in its code: `python -m eval.semba`.
+"""The searcher of SemBA, step by step from this project's looks to those of its code: `python -m eval.semba`.
 
     python -m eval.semba --data.root val --data.annotations instances_val.json
 
 A search starts in the middle of the photograph, looks through a multi-scale fovea, fuses raw scores on a grid of
 32 × 20 cells, fixates the most probable cell that was not fixated before, and ends after six gaze shifts or where the
 target has a probability of 0.1 in the fixated cell (Luzio, Bernardino and Moreno, 2026; the code of SemBA,
-vislab-tecnico-lisboa/SemBA). To continue a stopped run, give the same command again.
+vislab-tecnico-lisboa/SemBA). Each row of the table takes over one more thing from that code, with Kaplan's rule and
+with the rule of the code. To continue a stopped run, give the same command again.
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
-from semfov.belief.observers import Semantic
-from semfov.episode import Step, rollout
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Observer, Semantic
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight, Step, rollout
 from semfov.errors import DataError
+from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.files import write_text
@@ -28,21 +34,26 @@ from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.seeds import noise_for
-from semfov.runs.settings import Share
+from semfov.runs.settings import Positive, Share
 from semfov.runs.store import RememberedLooks
-from semfov.runs.tables import percent, table
+from semfov.runs.tables import table
 
 _RULES = ("kaplan", "semba")
 _SHIFTS = (1, 3, 6)
+_STEPS = ("here", "scores", "and native picture", "and 3 × 3 inhibition", "and escape")
+"""What a row takes over from the code of SemBA, beside what the rows before it do."""
+_SCORES, _NATIVE, _INHIBITION, _ESCAPE = range(1, 5)
+_LEAST = 1e-12
 
 
 @dataclass(frozen=True)
 class _SembaConfig(LookingConfig):
-    """Search as SemBA does, with both rules of fusion.
+    """Search as SemBA does, with both rules of fusion; `detector.limit` boxes of a crop are fused.
 
     Args:
         belief: the belief; `columns`, `rows` and `prior` are used.
         protocol: the protocol; `shifts`, `ties` and `seed` are used.
+        native: longer side in pixels of the pictures of SemBA (COCO-Search18).
         stop: probability of the target in the fixated cell at which a search ends.
         out: folder for the table.
         workers: ignored; the photographs are searched in this process.
@@ -53,12 +64,80 @@ class _SembaConfig(LookingConfig):
     sensor: SensorConfig = field(default_factory=lambda: SensorConfig("multi-scale"))
     belief: BeliefConfig = field(default_factory=lambda: BeliefConfig(columns=32, rows=20, prior=1.0))
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=6))
+    native: Positive = 1680.0
     stop: Share = 0.1
     out: Path = Path("runs/semba")
 
 
+class _CodeLooks(Looks):
+    """Looks at an image `(1, 3, H, W)` as in the code of SemBA: the boxes of all crops, the best of each.
+
+    They have a softmax over the logits of the K classes, and are not suppressed. Of the last look of each of A episodes
+    it tells the cells `(A,)`, and whether a crop showed nothing, `empty` `(A,)`.
+    """
+
+    cell: Tensor
+    empty: Tensor
+
+    def __init__(self, eye: Eye, image: Tensor, grid: Grid) -> None:
+        self.eye, self.grid, self.like = eye, grid, image
+        self._crops: RememberedLooks[int, Detections] = RememberedLooks(self._open)
+
+    def _open(self) -> Callable[[int], Detections]:
+        view, (detector, sensor) = self.eye.open(self.like), (self.eye.detector, self.eye.sensor)
+
+        def look(cell: int) -> Detections:
+            gaze = view.placement.points_to_canvas(self.grid.centres.to(self.like)[[cell]])
+            found = detector.propose(sensor.look(view.state, gaze)).precise()
+            best = found.confidence.topk(min(detector.selection.limit, found.confidence.shape[1])).indices[..., None]
+            boxes, classes = (each.take_along_dim(best, 1) for each in (found.boxes, found.classes))
+            scores = classes.double().logit(_LEAST).softmax(-1).to(classes)
+            boxes = view.placement.boxes_to_image(sensor.boxes_to_canvas(view.state, gaze, boxes))
+            return Detections(boxes, scores, scores.amax(-1) > detector.selection.threshold)
+
+        return look
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Look, and weigh."""
+        crops = Detections.stack([self._crops(number) for number in cell.tolist()])
+        rows = crops.mask.unflatten(0, (len(cell), -1))
+        self.cell, self.empty = cell, ~rows.any(-1).all(-1)
+        boxes, scores = (each.unflatten(0, rows.shape[:2]).flatten(1, 2) for each in (crops.boxes, crops.scores))
+        detections = Detections(boxes, scores, rows.flatten(1))
+        return Sight(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
+
+
+class _Inhibited(Greedy):
+    """Chooses as the code of SemBA does: none of the 3 × 3 cells around those that were chosen before.
+
+    With `escape` none around the present cell either, if a crop shows nothing. The start alone inhibits nothing.
+    Shapes: noise `(B, shifts, X·Y)`.
+    """
+
+    def __init__(self, noise: Tensor, looks: _CodeLooks, *, escape: bool) -> None:
+        super().__init__(drawn_from(noise))
+        self.looks, self.escape = looks, escape
+        self.inhibited = torch.zeros(len(noise), noise.shape[-1], dtype=torch.bool)
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the centre of the best cell and the cell, and inhibit the cells around it."""
+        if self.escape:
+            self.inhibited[episodes] |= self._around(self.looks.cell) & self.looks.empty[:, None]
+        fixation, cell = super().__call__(shift, episodes, values, self.inhibited[episodes], centres)
+        self.inhibited[episodes] |= self._around(cell)
+        return fixation, cell
+
+    def _around(self, cell: Tensor) -> Tensor:
+        columns, place = self.looks.grid.columns, torch.arange(len(self.looks.grid))
+        across = (place % columns - cell[:, None] % columns).abs()
+        down = (place // columns - cell[:, None] // columns).abs()
+        return (across <= 1) & (down <= 1)
+
+
 def _search_as_semba(config: _SembaConfig) -> None:
-    """Search for every target of every photograph with both rules, and write the table."""
+    """Search for every target of every photograph in each way, and write the table."""
     run = Looking(config)
     results: list[Tensor] = []
     scenes: list[int] = []
@@ -76,14 +155,23 @@ def _search_as_semba(config: _SembaConfig) -> None:
         return torch.cat([chosen[..., :-2].mean(0), torch.stack([stopped, right], -1)], -1)
 
     bootstrap = Bootstrap.of(measure, scenes)
-    head = ["rule", *(f"CP@{n}" for n in _SHIFTS), "stopped", "right of those"]
-    rows = [
-        [rule, *(percent(float(v), float(e)) for v, e in zip(bootstrap.value[n], bootstrap.error[n], strict=True))]
-        for n, rule in enumerate(_RULES)
-    ]
-    text = "\n".join([f"{len(results)} searches in {len(set(scenes))} photographs", "", *table([head, *rows]), ""])
+    head = [*(f"CP@{n}" for n in _SHIFTS), "stopped", "right of those"]
+    ways = [f"{step}, {rule}" for step in _STEPS for rule in _RULES]
+    rows = [["as in the code of SemBA, rule", *head]]
+    rows += [[way, *_cells(bootstrap, n)] for n, way in enumerate(ways)]
+    apart = [["less the row of this rule before", *head]]
+    for n, way in enumerate(ways[2:]):
+        apart.append([way, *_cells(bootstrap.less(n), n + 2, "+")])
+    lines = [*table(rows), "", *table(apart)]
+    text = "\n".join([f"{len(results)} searches in {len(set(scenes))} photographs", "", *lines, ""])
     write_text(config.out / "summary.md", text)
     print(text)
+
+
+def _cells(figures: Bootstrap, row: int, sign: str = "") -> list[str]:
+    """Cells of a row of the table, in %."""
+    pairs = zip(figures.value[row].tolist(), figures.error[row].tolist(), strict=True)
+    return [f"{100 * value:{sign}.1f} ± {100 * error:.1f}" for value, error in pairs]
 
 
 @torch.inference_mode()
@@ -102,36 +190,57 @@ def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor
     remembered = RememberedLooks(
         lambda: photograph_looks(run.eye, lambda: image, grid), store, lambda: run.digest(index)
     )
-    shifts = config.protocol.shifts
+    eyes = [Eye(run.eye.sensor, run.eye.detector, reference=each) for each in (run.eye.reference, config.native)]
+    here, codes = CellLooks(remembered, grid, image), [_CodeLooks(eye, image, grid) for eye in eyes]
     noise = torch.stack([noise_for(config.protocol, len(grid), index, target) for target in targets.tolist()])
     results = []
-    for rule in _RULES:
-        observer = Semantic(len(run.scenes.classes) + 1, prior=config.belief.prior, fusion=rule)
-
-        def sure(step: Step) -> Tensor:
-            probability = step.belief.probability(targets[step.episodes])
-            return probability.gather(-1, step.cell[:, None])[:, 0] >= config.stop
-
-        fixated = torch.zeros(len(targets), shifts + 1, dtype=torch.bool)
-        stopped = torch.zeros(len(targets), 2, dtype=torch.bool)
-        steps = rollout(
-            CellLooks(remembered, grid, image),
-            observer,
-            lambda episodes, cell: TargetPosterior(targets[episodes]),
-            middle.expand(len(targets)),
-            Greedy(drawn_from(noise)),
-            most=shifts + 1,
-            ends=sure,
-        )
-        for step in steps:
-            on = goal[step.episodes, step.cell]
-            fixated[step.episodes, step.shift :] |= on[:, None]
-            ended = sure(step)
-            stopped[step.episodes[ended], 0] = True
-            stopped[step.episodes[ended], 1] = on[ended]
-        results.append(torch.cat([fixated[:, [n for n in _SHIFTS if n <= shifts]], stopped], -1).float())
+    for step, rule in product(range(len(_STEPS)), _RULES):
+        code, choice = codes[step >= _NATIVE], Greedy(drawn_from(noise))
+        if step >= _INHIBITION:
+            choice = _Inhibited(noise, code, escape=step >= _ESCAPE)
+        looks: Looks = here if step < _SCORES else code
+        # Without a component for background the classes are components from 0 on.
+        first = int(step < _SCORES)
+        observer = Semantic(len(run.scenes.classes) + first, prior=config.belief.prior, fusion=rule)
+        results.append(_search(config, looks, observer, targets - 1 + first, goal, middle, choice))
     remembered.save()
     return list(torch.stack(results, 1))
+
+
+def _search(
+    config: _SembaConfig,
+    looks: Looks,
+    observer: Observer,
+    targets: Tensor,
+    goal: Tensor,
+    middle: Tensor,
+    choice: Greedy,
+) -> Tensor:
+    """Search for components `(T,)` on cells `(T, X·Y)` from the middle; figures `(T, 5)`."""
+    shifts = config.protocol.shifts
+
+    def sure(step: Step) -> Tensor:
+        probability = step.belief.probability(targets[step.episodes])
+        return probability.gather(-1, step.cell[:, None])[:, 0] >= config.stop
+
+    fixated = torch.zeros(len(targets), shifts + 1, dtype=torch.bool)
+    stopped = torch.zeros(len(targets), 2, dtype=torch.bool)
+    steps = rollout(
+        looks,
+        observer,
+        lambda episodes, cell: TargetPosterior(targets[episodes]),
+        middle.expand(len(targets)),
+        choice,
+        most=shifts + 1,
+        ends=sure,
+    )
+    for step in steps:
+        on = goal[step.episodes, step.cell]
+        fixated[step.episodes, step.shift :] |= on[:, None]
+        ended = sure(step)
+        stopped[step.episodes[ended], 0] = True
+        stopped[step.episodes[ended], 1] = on[ended]
+    return torch.cat([fixated[:, [n for n in _SHIFTS if n <= shifts]], stopped], -1).float()
 
 
 main = command(_search_as_semba, _SembaConfig, __doc__)

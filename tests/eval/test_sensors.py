@@ -1,10 +1,15 @@
 """Sensors compared at equal pixels of the detector, and the searcher of SemBA."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from eval import semba, sensors
-from eval.semba import _search_scene, _SembaConfig
+from eval.semba import _Inhibited, _search_scene, _SembaConfig
+from semfov.belief.grid import Grid
+from semfov.eye import Eye
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
 from tests.colours import write_home
@@ -57,17 +62,51 @@ def test_too_few_shifts_for_the_table_are_refused(home, capsys):
     assert "protocol.shifts: expected 15 or more, got 9" in capsys.readouterr().err
 
 
-def search_by_loop(run, index, target, rule, stop, shifts):
-    """One search in scalars; ties go to the first cell."""
+def crops_in_scalars(eye, view, centre, threshold, limit):
+    """Boxes and scores of each crop as in the code of SemBA, with the 2^l of the crops."""
+    gaze, crops = view.placement.points_to_canvas(centre[None]), []
+    for level, canvas in enumerate(eye.sensor.look(view.state, gaze)):
+        found, seen = eye.detector.propose(canvas[None]), []
+        confidence = found.classes[0].amax(-1) * (1 if found.objectness is None else found.objectness[0])
+        for row in confidence.argsort(descending=True, stable=True)[:limit].tolist():
+            odds = found.classes[0, row].double().clamp(1e-12, 1 - 1e-12).numpy()
+            scores = odds / (1 - odds) / (odds / (1 - odds)).sum()
+            corner = gaze[0] + 0.5 - eye.sensor.side * 2**level / 2
+            box = view.placement.boxes_to_image(found.boxes[0, row] * 2**level + corner.repeat(2))
+            if scores.max() > threshold:
+                seen.append((box, scores))
+        crops.append(seen)
+    return crops
+
+
+def search_by_loop(run, index, target, rule, stop, shifts, eye=None):
+    """One search in scalars; ties go to the first cell. With an eye it is that of the code of SemBA."""
     grid, annotation = run.grid(index), run.scenes.annotation(index)
     goal = grid.footprint(annotation.boxes[annotation.labels == target]).any(0)
-    view, cell = run.eye.open(run.scenes[index].image[None]), int(grid.cell_of(grid.extent / 2))
-    beta, visited, on = np.ones((len(grid), len(run.scenes.classes) + 1)), [], []
+    code, eye, selection = eye is not None, eye or run.eye, run.eye.detector.selection
+    view, cell = eye.open(run.scenes[index].image[None]), int(grid.cell_of(grid.extent / 2))
+    beta, visited, on = np.ones((len(grid), len(run.scenes.classes) + (not code))), [], []
+    inhibited, target, empty = set(), target - code, 0
+
+    def inhibit(around):
+        for other in range(len(grid)):
+            gap = np.abs(np.subtract(divmod(other, grid.columns), divmod(around, grid.columns)))
+            inhibited.update([other] if gap.max() <= 1 else [])
+
     while True:
         visited.append(cell)
         on.append(bool(goal[cell]))
-        seen = run.eye.look(view, grid.centres[cell])
-        for box, scores in zip(seen.boxes[0], seen.scores[0].double().numpy(), strict=True):
+        if code:
+            crops = crops_in_scalars(eye, view, grid.centres[cell], selection.threshold, selection.limit)
+            looked = [each for crop in crops for each in crop]
+            if not all(crops):
+                inhibit(cell)
+                empty += 1
+        else:
+            seen = eye.look(view, grid.centres[cell])
+            looked = [*zip(seen.boxes[0], seen.scores[0].double().numpy(), strict=True)]
+            inhibited.add(cell)
+        for box, scores in looked:
             for covered in grid.footprint(box[None])[0].nonzero()[:, 0].tolist():
                 b = beta[covered]
                 total, least = (scores * b).sum(), scores.min()
@@ -79,23 +118,27 @@ def search_by_loop(run, index, target, rule, stop, shifts):
         stopped = probability[cell] >= stop
         if stopped or len(visited) > shifts:
             found = [any(on[: n + 1]) for n in (1, 3, 6)]
-            return [*found, stopped, stopped and on[-1]]
-        cell = int(np.where(np.isin(np.arange(len(grid)), visited), -1, probability).argmax())
+            return [*found, stopped, stopped and on[-1]], empty
+        cell = int(np.where(np.isin(np.arange(len(grid)), [*inhibited]), -1, probability).argmax())
+        if code:
+            inhibit(cell)
 
 
 def test_the_searcher_of_semba_equals_a_loop(home):
     photographs = home / "photographs"
     config = _SembaConfig(
         data=DataConfig(photographs, photographs / "instances.json", min_instances=0),
-        detector=DetectorConfig(str(home / "colours.onnx"), background="none"),
+        detector=DetectorConfig(str(home / "colours.onnx"), background="none", threshold=0.9, limit=9),
         sensor=SensorConfig("multi-scale", **CROPS),
-        belief=BeliefConfig(columns=5, rows=4, prior=1.0),
+        belief=BeliefConfig(columns=7, rows=6, prior=1.0),
         protocol=ProtocolConfig(shifts=6, ties="first"),
-        stop=0.3,
+        native=300.0,
+        stop=0.4,
         cache=home / "cache",
         out=home / "semba",
     )
-    run, stopped = Looking(config), 0
+    run, stopped, empty = Looking(config), 0, 0
+    eye = Eye(run.eye.sensor, run.eye.detector, reference=300.0)
     for index in range(2):
         results = _search_scene(config, run, index)
         grid, annotation = run.grid(index), run.scenes.annotation(index)
@@ -104,14 +147,38 @@ def test_the_searcher_of_semba_equals_a_loop(home):
         assert len(results) == len(targets) > 0
         for target, result in zip(targets, results, strict=True):
             for number, rule in enumerate(("kaplan", "semba")):
-                expected = search_by_loop(run, index, target, rule, 0.3, 6)
-                assert result[number].tolist() == [float(each) for each in expected]
-                stopped += expected[-2]
+                for row, code in ((number, None), (number - 2, eye)):
+                    expected, nothing = search_by_loop(run, index, target, rule, config.stop, 6, code)
+                    assert result[row].tolist() == [float(each) for each in expected]
+                    stopped, empty = stopped + expected[-2], empty + nothing
     assert stopped > 0
+    assert empty > 0
+
+
+@pytest.mark.parametrize("escape", [False, True])
+def test_cells_around_chosen_and_empty_ones_are_not_chosen(escape):
+    generator = torch.Generator().manual_seed(3)
+    grid, shifts = Grid(9, 8, (90, 80)), 5
+    looks = SimpleNamespace(grid=grid)
+    choice = _Inhibited(torch.rand(4, shifts, len(grid), generator=generator), looks, escape=escape)
+    left, cell = [{*range(len(grid))} for _ in range(4)], torch.tensor([36, 0, 8, 71])
+    for shift in range(shifts):
+        episodes = torch.arange(4)[shift // 3 :]  # the first one ends early
+        looks.cell, looks.empty = cell[episodes], torch.rand(len(episodes), generator=generator) < 0.5
+        values = torch.rand(len(episodes), len(grid), generator=generator)
+        point, cells = choice(shift, episodes, values, torch.zeros(0), grid.centres)
+        assert torch.equal(point, grid.centres[cells])
+        for row, (episode, now, chosen) in enumerate(zip(episodes, looks.cell, cells, strict=True)):
+            apart = [(grid.centres[:, None] - grid.centres).abs().amax(-1)[each] < 15 for each in (now, chosen)]
+            if escape and looks.empty[row]:
+                left[episode] -= {*apart[0].nonzero()[:, 0].tolist()}
+            assert int(chosen) == max(left[episode], key=lambda each: float(values[row, each]))
+            left[episode] -= {*apart[1].nonzero()[:, 0].tolist()}
+        cell[episodes] = cells
 
 
 def test_the_command_writes_its_table(home, capsys):
     few = ["--data.limit", "3", "--sensor.settings.side", "64", "--belief.columns", "7", "--belief.rows", "5"]
     assert semba.main(given(home, "semba", *few)) == 0
-    assert "| semba" in capsys.readouterr().out
+    assert "escape, semba" in capsys.readouterr().out
     assert (home / "semba/summary.md").read_text(encoding="utf-8").startswith("7 searches in 3 photographs")
