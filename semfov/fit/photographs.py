@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import (
@@ -22,12 +22,13 @@ from semfov.fit.verification import (
     verification_report,
     verify,
 )
-from semfov.fit.windows_certainty import fit_certainty, logistic_regression
+from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread, left_out, logistic_regression
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -38,6 +39,9 @@ from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import usual_slices
 
 _FOLDS = 5
+_CHECKED = (1, 5)
+"""Numbers of looks, at the whole and at all slices, after which the expected number is compared with the annotated one.
+"""
 _ABSENT = 20
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
 _FALSE_ALARMS = 0.007
@@ -111,7 +115,7 @@ def fit_photographs(
     evidence = PhotographEvidence(model.classes).eval().requires_grad_(False)
     evidence.usual.copy_(_usual(held.sum(0), count))
     searches: list[_WholeSearch] = []
-    facts, right = [], []
+    explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
     for number, index in enumerate(track(single[: config.photographs], "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
         glances = StoredGlances(eye, pictures, index, None)
@@ -122,18 +126,36 @@ def fit_photographs(
         for place, target in enumerate(choose_classes(pictures, index, annotation, 2, _AREA, config.seed, _ABSENT)):
             boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
             searches.append(_WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
-        for some in (looks[:1], looks):
-            found, about = merge_with_facts(some, glances.lattice)
-            hits = right_boxes(found, annotation)
-            facts.append(about[hits >= 0])
-            right.append(hits[hits >= 0] > 0)
-    certainty = fit_certainty(torch.cat(facts), torch.cat(right))
-    evidence.certainty = replace(certainty, strength=1.0)  # looks at all slices leave nothing to expect
+        explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, glances.lattice, annotation)
+    numbers = left_out(explored, _fit_objects, _CHECKED)
+    certainty = _fit_objects([each for fold in explored.values() for each in fold])
+    evidence.certainty, told = certainty, []
+    if numbers:
+        spread, told = fit_spread(numbers)
+        evidence.certainty = replace(certainty, spread=spread)
     _fit_whole(evidence, [each for each in searches if not each.spare], held, count)
     text = _fit_closer(evidence, searches, config, prior)
     model.photograph = evidence
     model.metadata["photograph"] = {"photographs": len(single[: config.photographs]), "frequencies": count}
-    return text
+    return "\n".join([text, *told])
+
+
+def _explored(looks: Sequence[Glance], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
+    """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
+    for target in (None, *annotation.labels.mode().values[None].tolist()[: len(annotation.labels)]):
+        objects = {}
+        for number in (1, len(looks)):
+            found, facts = merge_with_facts(looks[:number], lattice, target)
+            objects[number] = facts, right_boxes(found, annotation)
+        held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
+        yield Exploration(target, held, objects, [(0.0, 0.0)] * len(looks), [0.0] * len(looks))
+
+
+def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
+    """Fit the probability of objects of all classes; looks at all slices leave nothing to expect."""
+    after = [seen for each in explored if each.target is None for seen in each.objects.values()]
+    facts, right = (torch.cat(column) for column in zip(*after, strict=True))
+    return replace(fit_certainty(facts[right >= 0], right[right >= 0] > 0), strength=1.0)
 
 
 def _usual(held: Tensor, count: int) -> Tensor:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice, product
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from semfov.runs.progress import track
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
-from semfov.zoom.certainty import FACTS, Certainty, number_of, reacts
+from semfov.zoom.certainty import FACTS, SPREAD, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
@@ -35,13 +36,15 @@ _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
 
 _SPREADS = tuple(0.05 * n for n in range(41))
+_FEW = 40
+"""Below this number of claims the spread is not less than that of a model for which none was fitted."""
 _CHECKED = (8, 24)
 """Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""
 _COVERED = 0.8
 """Share of the pictures in which the annotated number should be within two errors of the expected one."""
 
 
-class _Exploration(NamedTuple):
+class Exploration(NamedTuple):
     """An exploration of a picture for all classes, or for a target of which it holds a number of objects.
 
     After numbers of looks, the last one included, it has the facts about the objects `(n, 14)` and whether they are
@@ -85,7 +88,7 @@ class _Exploration(NamedTuple):
 @torch.inference_mode()
 def _explorations(
     model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> Iterator[_Exploration]:
+) -> Iterator[Exploration]:
     """Explore pictures, for objects of all classes and for those of the most frequent class of each."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
@@ -102,7 +105,7 @@ def _explorations(
                 found, facts = merge_with_facts(glances[:number], looks.lattice, target)
                 objects[number] = facts, right_boxes(found, annotation)
             held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
-            yield _Exploration(target, held, objects, remaining, promised[1:])
+            yield Exploration(target, held, objects, remaining, promised[1:])
         looks.save()
 
 
@@ -146,7 +149,7 @@ def fit_certainty(facts: Tensor, right: Tensor) -> Certainty:
     return Certainty(offset, tuple(weights))
 
 
-def _judged(explored: Sequence[_Exploration], passes: int) -> tuple[Tensor, Tensor]:
+def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tensor]:
     """Facts about the objects of explorations after some numbers of looks, and which are right, without crowds."""
     after = [
         each.objects[n]
@@ -157,12 +160,12 @@ def _judged(explored: Sequence[_Exploration], passes: int) -> tuple[Tensor, Tens
     return facts[right >= 0], right[right >= 0] > 0
 
 
-def _fitted(explored: Sequence[_Exploration], passes: int) -> Certainty:
+def _fitted(explored: Sequence[Exploration], passes: int) -> Certainty:
     """Fit the probability of objects, and then the number of objects that further looks show."""
     return _fit_unseen(fit_certainty(*_judged(explored, passes)), explored)
 
 
-def _fit_unseen(certainty: Certainty, explored: Sequence[_Exploration]) -> Certainty:
+def _fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certainty:
     """Fit the number of objects that further looks show, by least squares over a grid.
 
     The error is that of the logarithm of one more than the number of objects in all, so that pictures with few objects
@@ -203,15 +206,19 @@ class _Numbers(NamedTuple):
         return float(((self.held - self.mean).abs() <= 2 * error).double().mean())
 
 
-def _left_out(explored: Mapping[str, Sequence[_Exploration]], passes: int) -> dict[tuple[str, int], _Numbers]:
+def left_out(
+    explored: Mapping[str, Sequence[Exploration]],
+    fit: Callable[[Sequence[Exploration]], Certainty],
+    checked: Sequence[int] = _CHECKED,
+) -> dict[tuple[str, int], _Numbers]:
     """The numbers claimed in pictures of each kind, by kind and number of looks, fitted on the other kinds alone."""
     numbers = {}
     for kind, some in explored.items():
         others = [each for other, group in explored.items() if other != kind for each in group]
         if not others:
             continue
-        certainty = _fitted(others, passes)
-        for after in _CHECKED:
+        certainty = fit(others)
+        for after in checked:
             claims = [
                 (*claim, each.held)
                 for each in some
@@ -224,12 +231,25 @@ def _left_out(explored: Mapping[str, Sequence[_Exploration]], passes: int) -> di
     return numbers
 
 
-def _fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> float:
-    """The least spread that covers enough of the pictures, in the mean over their kinds and numbers of looks."""
-    for spread in _SPREADS:
-        if sum(each.covered(spread) for each in numbers.values()) >= _COVERED * len(numbers):
-            return spread
-    return _SPREADS[-1]
+def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list[str]]:
+    """The least spread that covers enough of the pictures, in the mean over kinds and looks; and the report."""
+    least = SPREAD if sum(len(each.mean) for each in numbers.values()) < _FEW else 0.0
+    tried = (spread for spread in _SPREADS if spread >= least)
+    needed = _COVERED * len(numbers)
+    spread = next((s for s in tried if sum(each.covered(s) for each in numbers.values()) >= needed), _SPREADS[-1])
+    rows = [["left out", "looks", "pictures", "within two errors", "with no spread"]]
+    rows += [
+        [kind, f"{after}", f"{len(each.mean)}", *(f"{each.covered(s):.2f}" for s in (spread, 0.0))]
+        for (kind, after), each in numbers.items()
+    ]
+    return spread, [
+        f"Spread of the expected number of objects of the most frequent class of a picture: {spread:.2f}. Pictures, of "
+        "those in which the looks show at least half of these objects, in which the annotated number is within two "
+        "errors, each with a certainty that was fitted on the others:",
+        "",
+        *table(rows),
+        "",
+    ]
 
 
 def spread_again(
@@ -241,7 +261,7 @@ def spread_again(
 
 def _explored(
     model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
-) -> dict[str, list[_Exploration]]:
+) -> dict[str, list[Exploration]]:
     """The explorations of pictures by their kind."""
     return {
         kind: [*_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")]
@@ -249,26 +269,15 @@ def _explored(
     }
 
 
-def _spread(model: GlimpseEvidence, explored: Mapping[str, Sequence[_Exploration]], passes: int) -> list[str]:
+def _spread(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:
     """Fit the spread on explorations; the report in Markdown."""
     assert model.certainty is not None
-    numbers = _left_out(explored, passes)
+    numbers = left_out(explored, partial(_fitted, passes=passes))
     if not numbers:
         return []
-    model.certainty = replace(model.certainty, spread=_fit_spread(numbers))
-    rows = [["kind that is left out", "looks", "pictures", "within two errors", "with no spread"]]
-    rows += [
-        [kind, f"{after}", f"{len(each.mean)}", *(f"{each.covered(s):.2f}" for s in (model.certainty.spread, 0.0))]
-        for (kind, after), each in numbers.items()
-    ]
-    return [
-        f"Spread of the expected number of objects of the most frequent class of a picture: "
-        f"{model.certainty.spread:.2f}. Pictures, of those in which the looks show at least half of these objects, in "
-        "which the annotated number is within two errors, each kind with a certainty that was fitted on the others:",
-        "",
-        *table(rows),
-        "",
-    ]
+    spread, lines = fit_spread(numbers)
+    model.certainty = replace(model.certainty, spread=spread)
+    return lines
 
 
 def certainty_again(

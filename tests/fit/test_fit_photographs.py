@@ -87,3 +87,14 @@ def test_as_many_objects_are_expected_as_are_right(fitted):
             expected += float(record.candidates.scores.sum())
             right += int((right_boxes(record.candidates, Photographs().annotation(index)) > 0).sum())
     assert expected == pytest.approx(right, abs=1.5)
+
+
+def test_the_spread_is_that_of_photographs_that_were_left_out(fitted):
+    """Squares are found or missed as a whole, so that their number needs hardly any spread."""
+    model, _, report = fitted
+    rows = [line.split("|")[1:-1] for line in report.splitlines() if line.startswith("| fold")]
+    assert len(rows) == 10
+    spread = model.photograph.certainty.spread
+    assert f"most frequent class of a picture: {spread:.2f}." in report
+    assert sum(float(row[3]) for row in rows) >= 0.8 * len(rows)
+    assert spread == 0 or sum(float(row[4]) for row in rows) < 0.8 * len(rows)

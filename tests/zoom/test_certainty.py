@@ -13,7 +13,7 @@ from semfov import Detections, EmbeddedScenes, InputError, Objects, WindowEye, Z
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.objects import unlike
-from semfov.fit.windows_certainty import _explorations, _fit_spread, _fit_unseen, _Numbers, fit_certainty
+from semfov.fit.windows_certainty import _explorations, _fit_unseen, _Numbers, fit_certainty, fit_spread
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
@@ -175,10 +175,12 @@ def test_the_spread_covers_four_of_five_pictures():
         mean = torch.full((200,), 20.0).double()
         shown = mean * (1 + most * torch.linspace(-1, 1, 200).double())
         kinds = {("mosaics", 8): _Numbers(mean, torch.zeros(200).double(), shown)}
-        assert _fit_spread(kinds) == pytest.approx(spread)
+        assert fit_spread(kinds)[0] == pytest.approx(spread)
         # A kind whose numbers are right needs less, and both count as much.
         kinds["scattered", 8] = _Numbers(mean, torch.ones(200).double(), mean)
-        assert _fit_spread(kinds) == pytest.approx(0.15 if most == 0.5 else 0.3)
+        assert fit_spread(kinds)[0] == pytest.approx(0.15 if most == 0.5 else 0.3)
+    few = _Numbers(*(each[:30] for each in kinds["scattered", 8]))
+    assert fit_spread({("scattered", 8): few})[0] == pytest.approx(SPREAD)
 
 
 def test_the_spread_is_fitted_on_the_numbers_of_records():
