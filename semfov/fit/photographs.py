@@ -128,8 +128,8 @@ def fit_photographs(
             searches.append(_WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, glances.lattice, annotation)
     numbers = left_out(explored, _fit_objects, _CHECKED)
-    certainty = _fit_objects([each for fold in explored.values() for each in fold])
-    evidence.certainty, told = certainty, []
+    told: list[str] = []
+    evidence.certainty = certainty = _fit_objects([each for fold in explored.values() for each in fold])
     if numbers:
         spread, told = fit_spread(numbers)
         evidence.certainty = replace(certainty, spread=spread)
