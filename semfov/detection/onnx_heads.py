@@ -27,18 +27,6 @@ def _cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
     return sum(columns * rows for columns, rows in (cells(canvas, stride) for stride in strides))
 
 
-def _grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, like: Tensor) -> Tensor:
-    """Column plus `offset`, row plus `offset`, and stride of every cell, `(N, 3)`, level by level and row-major."""
-    levels = []
-    for stride in strides:
-        columns, rows = cells(canvas, stride)
-        column = torch.arange(columns, device=like.device, dtype=like.dtype) + offset
-        row = torch.arange(rows, device=like.device, dtype=like.dtype) + offset
-        x, y = torch.meshgrid(column, row, indexing="xy")
-        levels.append(torch.stack([x, y, torch.full_like(x, stride)], -1).reshape(-1, 3))
-    return torch.cat(levels)
-
-
 def _decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
     """Decode the raw output of YOLOX (Ge et al. 2021); raw `(B, N, 5 + K)`, canvas `(width, height)`.
 
@@ -155,7 +143,14 @@ def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offse
     expected = _cell_count(canvas, strides)
     what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
     check(tensor.shape[1] == expected, "output of the head", what, tensor.shape[1])
-    return _grid_points(canvas, strides, offset, tensor)
+    levels = []
+    for stride in strides:
+        columns, rows = cells(canvas, stride)
+        column = torch.arange(columns, device=tensor.device, dtype=tensor.dtype) + offset
+        row = torch.arange(rows, device=tensor.device, dtype=tensor.dtype) + offset
+        x, y = torch.meshgrid(column, row, indexing="xy")
+        levels.append(torch.stack([x, y, torch.full_like(x, stride)], -1).reshape(-1, 3))
+    return torch.cat(levels)
 
 
 def _corners(boxes: Tensor) -> Tensor:
