@@ -49,7 +49,7 @@ def serve(options: AppOptions) -> int:
     """Serve the page until Ctrl-C."""
     os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # nothing is sent elsewhere
     try:
-        import gradio  # noqa: F401
+        import gradio
     except ImportError:
         raise DataError('app: expected Gradio for the page; pip install "semfov[app]"') from None
     try:
@@ -61,33 +61,18 @@ def serve(options: AppOptions) -> int:
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
-        page = _make_page(agent, options.seed)
-        address = _launched(page, options.host, options.port)
+        page = _make_page(agent, options.seed).queue(default_concurrency_limit=1)  # one look at a time
+        look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
+        _, address, _ = page.launch(
+            server_name=options.host, server_port=options.port, prevent_thread_lock=True, share=False, quiet=True,
+            show_error=True, css=_STYLE, theme=look,
+        )  # fmt: skip
         print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
         try:
             threading.Event().wait()
         finally:
             page.close()
     return 0
-
-
-def _launched(page: Any, host: str, port: int | None) -> str:
-    """Serve a page, with one look at a time; returns its address."""
-    import gradio
-
-    look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
-    page.queue(default_concurrency_limit=1)
-    _, address, _ = page.launch(
-        server_name=host,
-        server_port=port,
-        prevent_thread_lock=True,
-        share=False,
-        quiet=True,
-        show_error=True,
-        css=_STYLE,
-        theme=look,
-    )
-    return str(address)
 
 
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
@@ -122,7 +107,23 @@ class _Calls:
     def look(self, picture: Any, target: str, task: str, passes: float) -> tuple[str, str]:
         """Words about a record of the picture, and its page in a frame."""
         with _told():
-            return _look(self.agent, _given(picture), target, task, int(passes))
+            agent, picture, passes = self.agent, _given(picture), int(passes)
+            if task == "gaze":
+                prediction = agent.gaze(picture)
+                part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
+                words, page = prediction.describe(), gaze_page_html("Where people look", [part])
+            else:
+                if task == "search":
+                    record = agent.search(picture, _one(target, self.classes), passes=passes)
+                elif task == "find all":
+                    record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
+                else:
+                    record = agent.explore(picture, passes=passes)
+                data = record.page_data(picture if record.how == "windows" else None, settings=agent.eye.settings())
+                words, page = record.summary(), page_html(record.describe(), [data])
+            # A frame that shares nothing with the page around it.
+            source = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'
+            return words, f'<iframe title="The looks" {source}></iframe>'
 
     def click(self, picture: Any, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
         """The cells with that of the click, and what they show."""
@@ -214,27 +215,6 @@ def _one(target: str, classes: list[str]) -> str:
     if target not in classes:
         raise DataError(f"class: expected one to search for, got {target}")
     return target
-
-
-def _look(agent: ActivePerception, picture: Any, target: str, task: str, passes: int) -> tuple[str, str]:
-    """Words about a record of the picture, and its page in a frame."""
-    if task == "gaze":
-        prediction = agent.gaze(picture)
-        part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
-        return prediction.describe(), _framed(gaze_page_html("Where people look", [part]))
-    if task == "search":
-        record = agent.search(picture, _one(target, list(agent.classes)), passes=passes)
-    elif task == "find all":
-        record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
-    else:
-        record = agent.explore(picture, passes=passes)
-    data = record.page_data(picture if record.how == "windows" else None, settings=agent.eye.settings())
-    return record.summary(), _framed(page_html(record.describe(), [data]))
-
-
-def _framed(page: str) -> str:
-    """A page in a frame that shares nothing with the page around it."""
-    return f'<iframe title="The looks" sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"></iframe>'
 
 
 def _reduced(image: Tensor) -> Image.Image:

@@ -27,7 +27,7 @@ _PURPOSES: dict[str, type[Pretrained]] = {
 """Models that are shipped for some detectors, by what they are for."""
 
 
-def list_detectors(options: DetectorsOptions) -> int:
+def show(options: DetectorsOptions) -> int:
     """List the detectors, or the classes of one."""
     if options.name is not None:
         name = fspath(options.name)

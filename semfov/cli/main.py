@@ -6,12 +6,13 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TextIO
 
 from semfov.cli import help as texts
@@ -19,88 +20,41 @@ from semfov.version import __version__
 from semfov.words import OTHER_WORDS
 
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
+_DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
 
-_SUBCOMMANDS: dict[str, tuple[str, str]] = {
-    "search": _PICTURES,
-    "find": _PICTURES,
-    "explore": _PICTURES,
-    "live": ("source", "video file, or address"),
-    "gaze": _PICTURES,
-    "check": ("files", "files of fixations"),
-    "fit": ("model", "the detector: a name or a file, as for semfov.load_detector"),
-    "app": ("detector", "the detector: a name or a file, as for semfov.load_detector"),
-    "detectors": ("name", "detector, or folder of models"),
+_SUBCOMMANDS: dict[str, tuple[tuple[str, str], str, str]] = {
+    "search": (_PICTURES, "cli.options:SearchOptions", "cli.search:look_at"),
+    "find": (_PICTURES, "cli.options:FindOptions", "cli.search:look_at"),
+    "explore": (_PICTURES, "cli.options:ExploreOptions", "cli.search:look_at"),
+    "live": (("source", "video file, or address"), "cli.options:LiveOptions", "cli.live:look_live"),
+    "gaze": (_PICTURES, "cli.options:GazeOptions", "cli.gaze:predict_gaze"),
+    "check": (("files", "files of fixations"), "cli.options:CheckOptions", "cli.fixations:check_fixations"),
+    "fit": (("model", _DETECTOR), "fit.settings:FitDetectorConfig", "fit.detector:fit_folder"),
+    "app": (("detector", _DETECTOR), "cli.options:AppOptions", "cli.app:serve"),
+    "detectors": (("name", "detector, or folder of models"), "cli.options:DetectorsOptions", "cli.detectors:show"),
 }
-"""The positional argument of each subcommand, and its text."""
+"""The positional argument of each subcommand with its text, its options, and what it calls."""
 
 _LOOKING = "search", "find", "explore", "live"
 
 
 def _options_of(name: str) -> type[Any]:
     """The options of a subcommand, imported when they are asked for: help and mistakes need no tensors."""
-    if name == "fit":
-        from semfov.fit.settings import FitDetectorConfig
-
-        return FitDetectorConfig
-    from semfov.cli import options
-
-    by_name: dict[str, type[Any]] = {
-        "search": options.SearchOptions,
-        "find": options.FindOptions,
-        "explore": options.ExploreOptions,
-        "live": options.LiveOptions,
-        "gaze": options.GazeOptions,
-        "app": options.AppOptions,
-        "check": options.CheckOptions,
-        "detectors": options.DetectorsOptions,
-    }
-    return by_name[name]
+    options: type[Any] = resolve_name(f"semfov.{_SUBCOMMANDS[name][1]}")
+    return options
 
 
 def _run(name: str, options: Any) -> int | None:
     """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
-    stream = sys.stdout
-    if getattr(options, "quiet", False):
-        with open(os.devnull, "w", encoding="utf-8") as nothing, redirect_stdout(nothing):
-            return _subcommand(name, options, stream)
-    beside = str(getattr(options, "out", None)) == "-"
-    with redirect_stdout(sys.stderr if beside else stream):
-        return _subcommand(name, options, stream)
-
-
-def _subcommand(name: str, options: Any, stream: TextIO) -> int | None:
-    """Run a subcommand; what it needs is imported now."""
-    if name == "fit":
-        from semfov.fit.detector import fit_folder
-
-        fit_folder(options)
-        return None
-    run: Callable[[Any], int | None]
-    if name == "live":
-        from semfov.cli.live import look_live
-
-        run = look_live
-    elif name == "gaze":
-        from semfov.cli.gaze import predict_gaze
-
-        run = predict_gaze
-    elif name == "app":
-        from semfov.cli.app import serve
-
-        run = serve
-    elif name == "check":
-        from semfov.cli.fixations import check_fixations
-
-        run = check_fixations
-    elif name == "detectors":
-        from semfov.cli.detectors import list_detectors
-
-        run = list_detectors
-    else:
-        from semfov.cli.search import look_at
-
-        return look_at(options, stream)
-    return run(options)
+    stream, beside = sys.stdout, str(getattr(options, "out", None)) == "-"
+    with ExitStack() as stack:
+        nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        quiet = getattr(options, "quiet", False)
+        stack.enter_context(redirect_stdout(nowhere if quiet else sys.stderr if beside else stream))
+        run: Callable[..., int | None] = resolve_name(
+            f"semfov.{_SUBCOMMANDS[name][2]}"
+        )  # what it needs is imported now
+        return run(options, stream) if name in ("search", "find", "explore") else run(options)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -122,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     from semfov.runs.command import GOES_ON, make_parser, run_command
 
-    options, positional, program = _options_of(name), _SUBCOMMANDS[name], f"semfov {name}"
+    options, positional, program = _options_of(name), _SUBCOMMANDS[name][0], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
         usage = texts.HELP[name].partition("\nusage:")[0]
         make_parser(options, usage, positional, program).print_help()
@@ -160,13 +114,14 @@ def _unknown(name: str) -> str:
 
 def _option_names(name: str) -> list[str]:
     """Names of the options of a subcommand, without the positional one."""
-    return [field.name for field in fields(_options_of(name)) if field.name != _SUBCOMMANDS[name][0]]
+    return [field.name for field in fields(_options_of(name)) if field.name != _SUBCOMMANDS[name][0][0]]
 
 
 def _of_others(own: str, rest: Sequence[str]) -> str | None:
     """What to say about an option that other subcommands or other programs have; None if there is none."""
     names = {each: set(_option_names(each)) for each in (*_LOOKING, own)}
-    first, singular = _SUBCOMMANDS[own][0], _SUBCOMMANDS[own][0].removesuffix("s")
+    first = _SUBCOMMANDS[own][0][0]
+    singular = first.removesuffix("s")
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
         whole = (own, option) == ("fit", "detector")  # its parts are options, detector.name and others

@@ -150,7 +150,7 @@ def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
             main(["search", *words, "--print-config"])
         assert stopped.value.code == 0
         assert "give_up: 0.2" in capsys.readouterr().out
-    parser = make_parser(_options_of("search"), "", _SUBCOMMANDS["search"])
+    parser = make_parser(_options_of("search"), "", _SUBCOMMANDS["search"][0])
     assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
 
 
