@@ -20,7 +20,7 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
-from semfov.fit.windows import MosaicFit, _figures_of, judge_windows
+from semfov.fit.windows import MosaicFit, judge_windows, measures_table
 from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
 from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, RefitPart
 from semfov.io.files import inside
@@ -68,7 +68,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
         tried = choose_foresight(model, fit, _JUDGED)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        lines += [*_figures_of(measured), "", chosen, "", *table(tried), ""]
+        lines += [*measures_table(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
         lines += fit.decisions(model)
         # A verification belongs to the probability that it was fitted with.

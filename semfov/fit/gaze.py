@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -25,8 +25,6 @@ _SCORED = 40
 
 _Pictures = Sequence[Sequence[int]]
 """Pictures of each group."""
-_Done = Callable[[int, float], None]
-"""Told the number of each epoch and its mean loss."""
 
 
 @dataclass(frozen=True)
@@ -67,71 +65,85 @@ def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, 
     channels = {name: each.shape[1] for name, each in groups[0].features.maps.items()}
     centre = log_centre(groups, pictures)
     model = FixationDensity(channels, readouts=fit.readouts, units=fit.units, centre=centre)
-    with tqdm(total=fit.epochs, desc=f"map, {title}", unit="epoch", leave=False) as bar:
-        _fit_map(model, groups, pictures, fit, done=lambda epoch, loss: _tell(bar, loss))
+    _fit_map(model, groups, pictures, fit, f"map, {title}")
     maps = [maps_of(model, group, some) for group, some in zip(groups, pictures, strict=True)]
-    with tqdm(total=fit.saccade_epochs, desc=f"saccades, {title}", unit="epoch", leave=False) as bar:
-        fit_oculomotor(model, groups, maps, pictures, fit, done=lambda epoch, loss: _tell(bar, loss))
+    fit_oculomotor(model, groups, maps, pictures, fit, title=f"saccades, {title}")
     return model.requires_grad_(False)
 
 
-def _tell(bar: Any, loss: float) -> None:
-    """Show the mean log likelihood of an epoch, in bits."""
-    bar.set_postfix(bits=round(-loss / math.log(2), 3))
-    bar.update()
-
-
 def _fit_map(
-    model: FixationDensity,
-    groups: Sequence[Viewed],
-    pictures: _Pictures,
-    fit: GazeFit,
-    *,
-    done: _Done = lambda epoch, loss: None,
-) -> None:
-    """Fit map and weight of the centre bias to the fixations in some pictures of each group, every picture alike.
+    model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures, fit: GazeFit, title: str = ""
+) -> list[float]:
+    """Fit map and weight of the centre bias to the fixations in some pictures of each group; mean loss of each epoch.
 
-    Each readout has its own likelihood, and reads only a random part of the channels in each step.
+    All pictures count alike. Each readout has its own likelihood, and reads a random part of the channels in each step.
     """
     generator = torch.Generator().manual_seed(fit.seed)
     scale = _standardise(model, groups, pictures)
+    parts = model.out.shape[0]
+
+    def loss_of(group: Viewed, number: int, some: Sequence[int]) -> Tensor:
+        kept = torch.rand(parts, 1, model.read.shape[1], generator=generator) >= fit.dropout
+        mask = (kept / (1 - fit.dropout)).expand(-1, model.out.shape[1], -1).flatten(0, 1) / scale
+        values = model.readouts(group.some(some), group.size, model.read * mask)
+        values = values + model.centre_bias(group.size)
+        log = values - values.flatten(2).logsumexp(2)[..., None, None]
+        seen = group.counts[torch.as_tensor(some)]
+        return -((log * seen[:, None]).sum((2, 3)).mean(1) / seen.sum((1, 2)).clamp(min=1)).mean()
+
     weights = [model.read, model.mix, model.out]
     others = [model.shift, model.mix_shift, model.blur, model.centre_weight]
     optimiser = torch.optim.AdamW(
         [{"params": weights, "weight_decay": fit.decay}, {"params": others, "weight_decay": 0.0}], lr=fit.rate
     )
-    schedule = _schedule(optimiser, fit.rate, _steps(pictures, fit.batch) * fit.epochs, 0.1)
-    parts = model.out.shape[0]
     model.train()
-    for epoch in range(fit.epochs):
-        total, number = 0.0, 0
-        for group, some in _batches(pictures, fit.batch, generator):
-            kept = torch.rand(parts, 1, model.read.shape[1], generator=generator) >= fit.dropout
-            mask = (kept / (1 - fit.dropout)).expand(-1, model.out.shape[1], -1).flatten(0, 1) / scale
-            size = groups[group].size
-            values = model.readouts(groups[group].some(some), size, model.read * mask)
-            values = values + model.centre_bias(size)
-            log = values - values.flatten(2).logsumexp(2)[..., None, None]
-            seen = groups[group].counts[torch.as_tensor(some)]
-            likelihood = (log * seen[:, None]).sum((2, 3)).mean(1) / seen.sum((1, 2)).clamp(min=1)
-            optimiser.zero_grad()
-            (-likelihood.mean()).backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 5.0)
-            optimiser.step()
-            schedule.step()
-            total, number = total - float(likelihood.detach().mean()), number + 1
-        done(epoch, total / max(number, 1))
+    losses = _train(
+        model, optimiser, loss_of, groups, pictures, fit.batch, generator, title,
+        epochs=fit.epochs, rate=fit.rate, warm=0.1, clip=5.0,
+    )  # fmt: skip
     with torch.no_grad():
         model.read.div_(scale)
     model.eval()
+    return losses
 
 
-def _steps(pictures: _Pictures, batch: int) -> int:
-    return sum(-(-len(some) // batch) for some in pictures)
-
-
-def _schedule(optimiser: Any, rate: float, steps: int, warm: float) -> Any:
-    return torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=warm)
+def _train(
+    model: FixationDensity,
+    optimiser: torch.optim.Optimizer,
+    loss_of: Callable[[Viewed, int, Sequence[int]], Tensor | None],
+    groups: Sequence[Viewed],
+    pictures: _Pictures,
+    batch: int,
+    generator: torch.Generator,
+    title: str,
+    *,
+    epochs: int,
+    rate: float,
+    warm: float,
+    clip: float = math.inf,
+) -> list[float]:
+    """Train on random batches of pictures of one group, given with its number; returns the mean loss of each epoch."""
+    steps = sum(-(-len(some) // batch) for some in pictures) * epochs
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=warm)
+    means = []
+    with tqdm(total=epochs, desc=title, unit="epoch", leave=False, disable=not title) as bar:
+        for _ in range(epochs):
+            losses = []
+            for number, some in _batches(pictures, batch, generator):
+                loss = loss_of(groups[number], number, some)
+                if loss is None:
+                    continue
+                optimiser.zero_grad()
+                loss.backward()
+                if clip < math.inf:
+                    torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
+                optimiser.step()
+                schedule.step()
+                losses.append(float(loss.detach()))
+            means.append(sum(losses) / max(len(losses), 1))
+            bar.set_postfix(bits=round(-means[-1] / math.log(2), 3))
+            bar.update()
+    return means
 
 
 def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures) -> Tensor:
@@ -177,7 +189,7 @@ def fit_oculomotor(
     fit: GazeFit,
     *,
     rate: float = 0.03,
-    done: _Done = lambda epoch, loss: None,
+    title: str = "",
 ) -> None:
     """Fit oculomotor biases and gains to the next fixations, given the maps of these pictures.
 
@@ -185,37 +197,32 @@ def fit_oculomotor(
     """
     generator = torch.Generator().manual_seed(fit.seed)
     model.oculomotor = OculomotorBias()
-    optimiser = torch.optim.AdamW(model.oculomotor.parameters(), lr=rate, weight_decay=1e-3)
-    schedule = _schedule(optimiser, rate, _steps(pictures, fit.batch) * fit.saccade_epochs, 0.2)
     places = [{picture: row for row, picture in enumerate(some)} for some in pictures]
     events = [
         {picture: events_of(group.paths[picture], group.size, cells_of(group.size)) for picture in some}
         for group, some in zip(groups, pictures, strict=True)
     ]
-    for epoch in range(fit.saccade_epochs):
-        total, number = 0.0, 0
-        for group, some in _batches(pictures, fit.batch, generator):
-            size = groups[group].size
-            centre = model.centre_bias(size).detach()
-            losses = []
-            for picture in some:
-                chosen, corner = _drawn(events[group][picture], size, generator)
-                if not len(chosen.cell):
-                    continue
-                terms = {"map": _for_people(maps[group][places[group][picture]], chosen), "centre bias": centre[None]}
-                log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
-                rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
-                target = rows // corner[2] * log.shape[-1] + columns // corner[2]
-                losses.append(F.cross_entropy(log.flatten(1), target))
-            if not losses:
+
+    def loss_of(group: Viewed, number: int, some: Sequence[int]) -> Tensor | None:
+        size = group.size
+        centre = model.centre_bias(size).detach()
+        losses = []
+        for picture in some:
+            chosen, corner = _drawn(events[number][picture], size, generator)
+            if not len(chosen.cell):
                 continue
-            optimiser.zero_grad()
-            loss = torch.stack(losses).mean()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            total, number = total + float(loss.detach()), number + 1
-        done(epoch, total / max(number, 1))
+            terms = {"map": _for_people(maps[number][places[number][picture]], chosen), "centre bias": centre[None]}
+            log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
+            rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
+            target = rows // corner[2] * log.shape[-1] + columns // corner[2]
+            losses.append(F.cross_entropy(log.flatten(1), target))
+        return torch.stack(losses).mean() if losses else None
+
+    optimiser = torch.optim.AdamW(model.oculomotor.parameters(), lr=rate, weight_decay=1e-3)
+    _train(
+        model, optimiser, loss_of, groups, pictures, fit.batch, generator, title,
+        epochs=fit.saccade_epochs, rate=rate, warm=0.2,
+    )  # fmt: skip
 
 
 def _for_people(maps: Tensor, events: Events) -> Tensor:

@@ -154,14 +154,8 @@ def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
     return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
 
 
-def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
-    """Maps `(B, C, rows, columns)` over the whole of pictures of `(height, width)`, without detections."""
-    rows, columns = next(iter(maps.values())).shape[-2:]
-    placement = Placement((size[1], size[0]), (columns / size[1], rows / size[0]), (0, 0))
-    return FeatureMaps(maps, (columns, rows), placement, _nothing())
-
-
-def _nothing() -> Detections:
+def no_detections() -> Detections:
+    """Those of no picture."""
     return Detections(torch.zeros(0, 0, 4), torch.zeros(0, 0, 1), torch.zeros(0, 0, dtype=torch.bool))
 
 
@@ -194,7 +188,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
                 width, height, across, down, left, top, *canvas = kept["placed"].tolist()
                 placement = Placement((int(width), int(height)), (across, down), (left, top))
                 maps = {name: kept[name][None] for name in source.layers}
-                yield FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, _nothing()), people[str(name)]
+                yield FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, no_detections()), people[str(name)]
 
         groups += _grouped(seen(), data.seconds[number] if number < len(data.seconds) else 3.0, number)
     return groups
@@ -217,7 +211,7 @@ def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> li
         first = several[0][0]
         maps = {name: torch.cat([features.maps[name].half() for features, _ in several]) for name in first.maps}
         everyone = tuple(tuple(some) for _, some in several)
-        groups.append(Viewed(replace(first, maps=maps, detections=_nothing()), everyone, seconds, source))
+        groups.append(Viewed(replace(first, maps=maps, detections=no_detections()), everyone, seconds, source))
     return groups
 
 

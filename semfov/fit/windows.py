@@ -39,6 +39,7 @@ from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, split_photographs
+from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
@@ -203,15 +204,7 @@ class MosaicFit:
         searches = {
             use: Searches.join(
                 [
-                    picture_searches(
-                        model,
-                        self.pictures[kind],
-                        self.opened(kind),
-                        classes=config.sought,
-                        passes=config.passes,
-                        seed=config.seed,
-                        title=f"searching, {kind}",
-                    )
+                    picture_searches(model, self.pictures[kind], self.opened(kind), config, f"searching, {kind}")
                     for kind in kinds
                 ]
             )
@@ -307,10 +300,10 @@ def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[
     losses = torch.stack([rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
     lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
-    lines += [*_figures_of(figures), ""]
+    lines += [*measures_table(figures), ""]
     return "\n".join(lines), json.dumps(figures, indent=1)
 
 
-def _figures_of(figures: Mapping[str, float]) -> list[str]:
+def measures_table(figures: Mapping[str, float]) -> list[str]:
     """Write measures as a table in Markdown."""
-    return ["| measure | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items())]
+    return table([["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())])

@@ -58,20 +58,13 @@ class Searches(NamedTuple):
 
 @torch.inference_mode()
 def _searches_of(
-    model: GlimpseEvidence,
-    pictures: Scenes,
-    opened: Sequence[StoredGlances],
-    *,
-    classes: int,
-    passes: int,
-    seed: int,
-    title: str,
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
 ) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
     """Search every picture for some present classes and for as many absent ones, without decisions."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
-        for target in choose_classes(pictures, index, annotation, classes, 1.0, seed):
-            turns = islice(look_for(looks, model, target), passes)
+        for target in choose_classes(pictures, index, annotation, config.sought, 1.0, config.seed):
+            turns = islice(look_for(looks, model, target), config.passes)
             yield index, annotation, target, _with_facts(turns)
         looks.save()
 
@@ -87,21 +80,13 @@ def _with_facts(turns: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[Windo
 
 @torch.inference_mode()
 def picture_searches(
-    model: GlimpseEvidence,
-    pictures: Scenes,
-    opened: Sequence[StoredGlances],
-    *,
-    classes: int,
-    passes: int,
-    seed: int,
-    title: str,
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
 ) -> Searches:
-    """Run all searches of `_searches_of`, with the same arguments, and collect them."""
+    """Run all searches of `_searches_of`, and collect them."""
     rows: list[list[Tensor]] = []
-    searches = _searches_of(model, pictures, opened, classes=classes, passes=passes, seed=seed, title=title)
-    for _, annotation, target, turns in searches:
+    for _, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
         steps = [(facts.best, facts.case(turn.ahead), facts.detected, turn.ahead) for turn, facts in turns]
-        steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))
+        steps += [(*steps[-1][:3], 0.0)] * (config.passes - len(steps))
         best, case, looked, left = zip(*steps, strict=True)
         there = torch.tensor(bool((annotation.labels == target).any()))
         rows.append([torch.tensor(best), torch.stack(case), torch.tensor(looked), torch.tensor(left), there])
@@ -201,10 +186,7 @@ def _mosaic_searches(
 ) -> Iterator[_MosaicSearch]:
     """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
-    searches = _searches_of(
-        model, pictures, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
-    )
-    for index, annotation, target, turns in searches:
+    for index, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
         glances: list[Glance] = []
         states: list[WindowLook] = []
         boxes: list[Tensor | None] = []

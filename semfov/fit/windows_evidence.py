@@ -1,20 +1,19 @@
 """Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find."""
 
-import logging
 import random
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.objects import LEAST
+from semfov.fit.descent import descend
 from semfov.observation.matching import box_iou
-from semfov.runs.progress import track
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -133,18 +132,16 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
 def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
     """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes."""
     own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
-    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=1.0)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    for _ in track(range(steps), "learning what closer looks show", "step"):
-        model.train()
+
+    def loss_of(_: int) -> Tensor:
         loss = presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
         if len(later):
             loss = loss + presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+        return loss
+
+    model.train()
+    descend(own, loss_of, steps, rate, clip=None, decay=1.0, title="learning what closer looks show")
     model.eval()
 
 
@@ -166,42 +163,15 @@ def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) ->
     return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
 
 
-E = TypeVar("E")
-
-_log = logging.getLogger(__name__)
-
-
 def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
     """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window."""
+
+    def loss_of(_: int) -> Tensor:
+        chosen = random.sample(examples, min(batch, len(examples)))
+        return torch.stack([rate_loss(model, example) for example in chosen]).mean()
+
     own = [*model.rate.parameters(), model.prior, model.border]
-    _descend_examples(
-        own, lambda example: rate_loss(model, example), examples, steps, batch, "expected number of objects"
-    )
-
-
-def _descend_examples(
-    parameters: Iterable[nn.Parameter],
-    loss_of: Callable[[E], Tensor],
-    examples: Sequence[E],
-    steps: int,
-    batch: int,
-    title: str,
-    rate: float = 6e-3,
-) -> None:
-    """Minimise the mean loss of random examples."""
-    own = [*parameters]
-    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=0.1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
-    for step in track(range(steps), f"learning the {title}", "step"):
-        losses = [loss_of(example) for example in random.sample(examples, min(batch, len(examples)))]
-        loss = torch.stack(losses).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(own, 1.0)
-        optimizer.step()
-        schedule.step()
-        if step % 100 == 99:
-            _log.info("%s: step %d, loss %.4f", title, step + 1, float(loss.detach()))
+    descend(own, loss_of, steps, 6e-3, decay=0.1, title="learning the expected number of objects")
 
 
 def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
@@ -344,8 +314,11 @@ _LATER = 2
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:
     """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood."""
 
-    def loss_of(example: SurveyExample) -> Tensor:
-        closer = random.sample(example.closer, min(_LATER, len(example.closer)))
-        return torch.stack(example.losses(survey, closer)).mean()
+    def loss_of(_: int) -> Tensor:
+        losses = []
+        for example in random.sample(examples, min(batch, len(examples))):
+            closer = random.sample(example.closer, min(_LATER, len(example.closer)))
+            losses.append(torch.stack(example.losses(survey, closer)).mean())
+        return torch.stack(losses).mean()
 
-    _descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey", rate=2e-3)
+    descend(survey.parameters(), loss_of, steps, 2e-3, decay=0.1, title="learning the survey")

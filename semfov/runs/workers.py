@@ -14,7 +14,6 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
-from logging import getLogger
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
@@ -33,7 +32,7 @@ _REACH = 10.0
 _RETURN = 300.0
 """Seconds in which a scheduler that was lost must be there again."""
 
-_log = getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class _ClusterLost(Exception):
@@ -111,8 +110,6 @@ _TURNS = 8
 
 _PATIENCE = 5
 """Number of times that a cluster may be lost before its tasks count as failed."""
-
-_log = logging.getLogger(__name__)
 
 
 def available_cores() -> int:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from torch.nn import functional as F
 
 from eval.human import main as compare
+from eval.human.viewing import covering
 from semfov import Detector, InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
@@ -23,7 +24,6 @@ from semfov.fit.viewing import (
     MapSource,
     ViewingData,
     _grouped,
-    covering,
     events_of,
     features_of,
     log_centre,
@@ -81,9 +81,8 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     torch.manual_seed(0)
     fitted, held = _folds(len(group), 4, 0)
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
-    losses = []
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
-    _fit_map(model, [group], [fitted], fit, done=lambda epoch, loss: losses.append(loss))
+    losses = _fit_map(model, [group], [fitted], fit)
     assert losses[-1] < losses[0] - 1
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)
