@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 import semfov
 from benchmarks.tables import begin, command, number, page, table, write
 from benchmarks.timing import Run, Spread, interleaved
-from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, Scenery, open_scenery
+from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
+from semfov.envs.scenery import Scenery
 from semfov.gaze.acquisition.base import Task
 
 STEPS = 20

@@ -21,7 +21,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import Tensor, nn
 
-from semfov.envs import GazeSearch, Scenery, open_scenery
+from semfov.envs import GazeSearch, open_scenery
+from semfov.envs.scenery import Scenery
 
 Agent = Callable[[Any, Any], Any]
 """Chooses a cell from the planes `(C, Y, X)` of the belief and the mask `(X·Y,)` of the free cells."""

@@ -325,7 +325,7 @@ class ActivePerception(nn.Module):
             duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
             on_look: called after each look with the record so far; returning False ends the search.
             start: first cell of a fovea, by its number or as `(column, row)`, or first action of a head
-                (`semfov.head.Views`); None draws the cell at random, and looks straight ahead.
+                (`semfov.head.views.Views`); None draws the cell at random, and looks straight ahead.
             seed: seed of the generator that draws the start and breaks ties.
             boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of a photograph.
             confirm: least probability for `found`: with closer looks, that the target is at the place; otherwise, that

@@ -24,7 +24,7 @@ class LivePerception:
     """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
 
     The first frame decides (`how="auto"`): frames that are at least four times as long as the detector's input are
-    looked at by windows (`semfov.agents.WindowEpisode`), others by a fovea (`semfov.agents.FoveaEpisode`).
+    looked at by windows, others by a fovea.
 
     Args:
         fovea: the part of an agent that looks by a fovea.

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
-from semfov.agents import FoveaEpisode
+from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.episode import Forgetting

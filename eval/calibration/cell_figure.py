@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from semfov.viz.curves import legend_of
 from semfov.viz.style import line_style, make_figure, styled
 
 if TYPE_CHECKING:
@@ -54,5 +53,5 @@ def plot_cell_reliability(
     last.grid(alpha=0.3, linewidth=0.5)
     for panel in every[len(panels) + 1 :]:
         panel.remove()
-    legend_of(figure, every[0], columns=len(errors), inside=False)
+    figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(errors))
     return figure

@@ -11,7 +11,8 @@ from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
-from semfov.paths import Scanpath, trace
+from semfov.paths import Scanpath
+from semfov.paths.scanpath import trace
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_learned
 

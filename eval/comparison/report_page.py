@@ -15,7 +15,7 @@ from eval.comparison.looking import ComparedLooking
 from eval.comparison.replay import replay
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
-from semfov.paths import Stimulus
+from semfov.paths.stimulus import Stimulus
 from semfov.report.episode import Data, episode_data
 from semfov.report.looks import table_html
 from semfov.report.page import pictures_of, write_page

@@ -91,11 +91,12 @@ def _exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing
 
 def _draw_exploration_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     """Draw the success rate against gaze shifts."""
-    from semfov.viz import plot_success_rate
+    from semfov.viz import plot_curves
 
-    figure = plot_success_rate(
+    figure = plot_curves(
         {name: curve.mean for name, curve in curves.items()},
         {name: curve.over_images for name, curve in curves.items()},
+        label="cells with the right class (%)",
         title=f"Exploration, {answer}\n{sensing(run)}",
     )
     return save_figure(figure, run.config.out / f"success_rate_{answer.replace(' ', '_')}.png")

@@ -14,7 +14,7 @@ from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
 from semfov.metrics.averages import FloatArray
-from semfov.viz.curves import draw_curves, legend_of
+from semfov.viz.curves import draw_curves
 from semfov.viz.style import make_figure, save_figure, styled
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
         axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     for axes in every[len(panels) :]:
         axes.remove()
-    legend_of(figure, every[0], columns=3, inside=False)
+    figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 

@@ -27,7 +27,7 @@ from semfov.errors import DataError
 from semfov.io.files import clean, inside
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance
-from semfov.paths import Stimulus
+from semfov.paths.stimulus import Stimulus
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
@@ -113,12 +113,14 @@ def _search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, s
 
 def _draw_search_curves(run: SearchRun, curves: dict[str, Curve], expected: FloatArray) -> Path:
     """Draw the cumulative performance against gaze shifts."""
-    from semfov.viz import plot_cumulative_performance
+    from semfov.viz import plot_curves
 
-    figure = plot_cumulative_performance(
+    figure = plot_curves(
         {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
         {name: curve.over_images for name, curve in curves.items()},
+        label="targets found (%)",
         title=f"Visual search\n{sensing(run)}",
+        most=102,
     )
     return save_figure(figure, run.config.out / "cumulative_performance.png")
 

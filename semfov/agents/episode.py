@@ -62,23 +62,9 @@ class Episode(ABC, Generic[_Record]):
     `run` looks until the decision or a limit, which makes the record of a picture. In a stream each look is given its
     frame, and `moment` tells what is known after it.
 
-    Args:
-        classes: names of the classes, background first.
-        target: class 1..K that is searched for; None searches for none.
-        targets: classes 1..K whose objects are all to be found; none: of all classes.
-        limits: limits of `run`; None sets none.
-        rate: rate at which evidence fades between the frames of a stream; None for a picture.
-
     Attributes:
         passes: number of passes of the detector so far.
         ending: reason for the end; None while it goes on.
-
-    Example::
-
-        episode: Episode = FoveaEpisode(agent.fovea, agent.classes.index("cup"))
-        episode.open(image)
-        while episode.ending is None and (look := episode.look()) is not None:
-            print(look.number, look.fixation, episode.decision)
     """
 
     def __init__(
@@ -101,19 +87,7 @@ class Episode(ABC, Generic[_Record]):
 
     @abstractmethod
     def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
-        """Look once, with one pass of the detector.
-
-        Args:
-            frame: in a stream, the next frame, a picture of any common kind (`semfov.as_image`) of the size of the
-                first; None looks at the picture of the episode.
-
-        Returns:
-            The look; None if no look is left.
-
-        Raises:
-            InputError: the frame is no picture, or has another size.
-            DataError: the file of the frame cannot be read.
-        """
+        """Look once, with one pass of the detector."""
 
     @property
     @abstractmethod
@@ -130,27 +104,12 @@ class Episode(ABC, Generic[_Record]):
         """The record of the looks so far."""
 
     def moment(self) -> Moment:
-        """What is known at the present frame of a stream.
-
-        Raises:
-            InputError: the episode takes no frames.
-        """
+        """What is known at the present frame of a stream."""
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
     @torch.inference_mode()
     def step(self, frame: ImageLike, passed: float = 1.0) -> Moment:
-        """Look at the next frame of a stream (`look`), and tell what is known then.
-
-        Args:
-            frame: the frame.
-            passed: number of frames since the last look, this one included, by which evidence fades.
-
-        Returns:
-            What is known.
-
-        Raises:
-            InputError: `passed` is below 0 or no number.
-        """
+        """Look at the next frame of a stream (`look`), and tell what is known then."""
         check_number(passed, "passed", 0, 1e9)
         self.passed = passed
         self.look(frame)

@@ -35,8 +35,9 @@ from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
-from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath, Stimulus, Trace
-from semfov.paths.stimulus import in_bytes
+from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath
+from semfov.paths.scanpath import Trace
+from semfov.paths.stimulus import Stimulus, in_bytes
 from semfov.strategy import Strategy
 
 _WORTH = 0.1
@@ -148,32 +149,9 @@ class FoveaEpisode(Episode[Scanpath]):
     `Observer.fade`). With rate 0, frames of a still picture give the looks, the closer looks and the decision of a
     search of the picture up to its end.
 
-    Args:
-        agent: the part of an agent that looks by a fovea.
-        target: class 1..K to search for; None explores.
-        strategy: observer and policy; None takes those of the agent for the task.
-        limits: limits of `run`; None sets none.
-        rate: r, per frame, 0 or more; None for a picture (`open`).
-        start: first cell; None draws one at random.
-        shifts: largest number of gaze shifts; None sets no limit.
-        seed: seed of the generator that draws the start and breaks ties.
-        confirm: least probability for `found`; None takes that of the model.
-        give_up: probability below which a cell is not worth a look; None takes that of the model, or in a stream that
-            of the belief alone, which a belief that fades can reach.
-        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames.
-        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
-        viewed: where people look in the picture; the gaze then moves as theirs does (`semfov.gaze.Viewer`).
-        cells: cells to look at one after the other, in place of those that the policy chooses.
-
     Attributes:
         ends: function from a step to the number of its outcome (`semfov.decision.OUTCOMES`), 0 to go on.
         to_goal: whether the search ends on given cells, without a decision.
-
-    Example::
-
-        episode = FoveaEpisode(agent.fovea, agent.classes.index("cup"), rate=0.1)
-        for frame in frames:
-            print(episode.look(frame).fixation, episode.decision)
     """
 
     def __init__(
@@ -225,14 +203,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._concluded: Decision | None = None
 
     def open(self, image: Tensor) -> Grid:
-        """Begin with a picture, or with the first frame of a stream.
-
-        Args:
-            image: `(1, 3, H, W)`, RGB in [0, 1].
-
-        Returns:
-            The cells over it.
-        """
+        """Begin with a picture, or with the first frame of a stream."""
         self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
         start, generator = self._first
         self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target, device=torch.device("cpu"))

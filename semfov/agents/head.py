@@ -25,7 +25,8 @@ from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond,
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
-from semfov.paths import Ending, HeadPath, RecordedLook, reduced_copy
+from semfov.paths import Ending, HeadPath, RecordedLook
+from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
 
 _SIGMA = 100.0
@@ -229,31 +230,7 @@ class HeadAgent(nn.Module):
 
 
 class HeadEpisode(Episode[HeadPath]):
-    """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second.
-
-    Args:
-        agent: eye and detector, and the names of the classes.
-        observer: makes the belief over the directions of a scene, with its views.
-        gain: expected gain of a look.
-        target: class 1..K to search for; None finds all objects.
-        targets: classes 1..K whose objects are all to be found; none: of all classes.
-        worth: least expected gain of a look for which it is worth it.
-        thresholds: probabilities at which a search ends.
-        limits: limits of `run`; None sets none.
-        start: first action (`Views`); None looks straight ahead.
-        duration: time limit of the scene in seconds.
-        seed: of the generator that breaks ties.
-
-    Raises:
-        InputError: an argument is out of range.
-
-    Example::
-
-        views = agent.views(semfov.Panorama("street.jpg"))
-        observer = SceneObserver(LearnedMap(agent.map_evidence), views)
-        episode = HeadEpisode(agent, observer, ExploreGain(views, agent.map_evidence), None)
-        print(episode.look().fixation)
-    """
+    """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second."""
 
     def __init__(
         self,

@@ -21,7 +21,8 @@ from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector, loader_options
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check, check_number, check_options, check_whole
-from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath, reduced_copy
+from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath
+from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.certainty import SPREAD
@@ -268,30 +269,6 @@ class WindowEpisode(Episode[ZoomPath]):
     Objects are merged from the looks that count, and what a later look has shown as closely replaces what earlier ones
     did. With rate 0 nothing is forgotten or replaced: frames of a still picture give the looks, the closer looks and
     the objects of a search or an exploration of the picture up to its end.
-
-    Args:
-        classes: names of the classes, background first.
-        evidence: predicts from a look what closer looks will find; None for slices.
-        target: class 1..K to search for; None finds all objects.
-        targets: classes 1..K whose objects are all to be found; none: of all classes.
-        limits: limits of `run`; None sets none.
-        rate: r, per frame, 0 or more; None for a picture (`open`).
-        confirm: least probability for `found`, as for `ZoomAgent.search`.
-        give_up: probability that a look shows the target, below which no look is worth a pass.
-        closer: largest number of closer looks, in a stream in :math:`\ln 2 / r` frames; None as for `search`.
-        batch: number of windows that are chosen jointly and pass the detector together.
-        worth: an exploration ends when no look is expected to find more new objects than this.
-        least: probability, or score in a look at the whole picture, from which on objects count; None takes 0.5.
-            Without evidence it is the score in any look, and None takes 0.3.
-        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
-        eye: the eye that looks at frames; a picture is opened with its looks.
-
-    Example::
-
-        episode = agent.zoom.episode(rate=0.03)
-        for frame in frames:
-            episode.look(frame)
-            print(episode.moment().objects.boxes)
     """
 
     def __init__(
@@ -330,15 +307,7 @@ class WindowEpisode(Episode[ZoomPath]):
         self._began = perf_counter()
 
     def open(self, glances: Glances, *, told: bool = False) -> Self:
-        """Begin with a picture, or with the first frame of a stream.
-
-        Args:
-            glances: the looks at it.
-            told: whether `look` is told each window, instead of choosing it.
-
-        Returns:
-            The episode.
-        """
+        """Begin with a picture, or with the first frame of a stream."""
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]

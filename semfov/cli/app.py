@@ -26,7 +26,8 @@ from semfov.data.classes import class_index
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError, SemfovError
-from semfov.paths import GazeRecord, Scanpath, detections_in_words
+from semfov.paths import GazeRecord, Scanpath
+from semfov.paths.look import detections_in_words
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html

@@ -15,7 +15,8 @@ from semfov.data.classes import class_index
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.live import LivePerception
-from semfov.paths import Moment, detections_in_words
+from semfov.paths import Moment
+from semfov.paths.look import detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 

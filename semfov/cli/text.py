@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
-from semfov.paths import GazeRecord, Scanpath, detections_in_words
+from semfov.paths import GazeRecord, Scanpath
+from semfov.paths.look import detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.semantic import named_regions
 

@@ -11,11 +11,11 @@ try:
 except ImportError:
     raise DataError('semfov.envs needs Gymnasium: pip install "semfov[envs]"') from None
 
-from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv, ZoomExplore, ZoomSearch
+from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv
 from semfov.envs.registration import register
-from semfov.envs.scenery import Scenery, open_scenery
+from semfov.envs.scenery import open_scenery
 from semfov.envs.vector import GazeVectorEnv
-from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
+from semfov.envs.zoom_scenery import open_zoom_scenery
 
 register()
 
@@ -25,11 +25,7 @@ __all__ = [
     "GazeExplore",
     "GazeSearch",
     "GazeVectorEnv",
-    "Scenery",
     "ZoomEnv",
-    "ZoomExplore",
-    "ZoomScenery",
-    "ZoomSearch",
     "open_scenery",
     "open_zoom_scenery",
     "register",

@@ -18,10 +18,13 @@ from semfov.belief.observers.base import Look
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import Scenery
-from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks, attend
+from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks
+from semfov.episode.loop import attend
 from semfov.errors import check, check_whole
 from semfov.metrics.exploration import count_right
-from semfov.paths import Scanpath, Stimulus, trace
+from semfov.paths import Scanpath
+from semfov.paths.scanpath import trace
+from semfov.paths.stimulus import Stimulus
 from semfov.runs.search_protocol import Trial
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation

@@ -18,7 +18,8 @@ from semfov.envs.gazes import Arrays, Gazes
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.envs.windows import WindowGaze
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
-from semfov.errors import InputError, check, check_options
+from semfov.errors import InputError, check, check_options, lookup
+from semfov.gaze.acquisition.base import Task
 
 _Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
 
@@ -227,13 +228,18 @@ class GazeExplore(GazeEnv):
 
 
 class ZoomEnv(EpisodeEnv):
-    """Base of `ZoomSearch` and `ZoomExplore`.
+    """Search a large picture for an object of a class, or find all objects of it, by windows.
 
     An action is `(x, y, magnification)`, each from 0 to 1: the middle of the window as fractions of width and height,
     and the magnification from the whole picture (0) to the closest look (1), in equal steps of an octave. The eye looks
     at the nearest window of `semfov.zoom.Lattice`. The first look of an episode is the whole picture.
 
+    The reward of a step is `find` if an object of the class is found (a box with a score of 0.1 and an overlap of 0.5),
+    or in an exploration `find` times the increase of the fraction of objects that are found; minus `price`. A search
+    ends with the find, or after the largest number of looks.
+
     Args:
+        task: `search` or `exploration`.
         scenery: pictures and looks (`open_zoom_scenery`), which several environments may share; None opens one.
         price: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or all objects.
@@ -249,16 +255,16 @@ class ZoomEnv(EpisodeEnv):
 
     Example::
 
-        env = ZoomSearch(scenes="aerial/", targets=["person"], detector="yolox-nano")
+        env = ZoomEnv("search", scenes="aerial/", targets=["person"], detector="yolox-nano")
         observation, info = env.reset(seed=0)
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     """
 
-    task: ClassVar[str]
     gazes: WindowGaze
 
     def __init__(
         self,
+        task: Task,
         scenery: ZoomScenery | None = None,
         *,
         price: float | None = None,
@@ -272,8 +278,8 @@ class ZoomEnv(EpisodeEnv):
         self.scenery = scenery_or_open(scenery, open_zoom_scenery, options)
         gazes = WindowGaze(
             self.scenery,
-            self.task,
-            price=PRICES[self.task] if price is None else price,
+            task,
+            price=PRICES[lookup(task, PRICES, "task")] if price is None else price,
             find=find,
             belief=belief,
             grid=grid,
@@ -281,44 +287,7 @@ class ZoomEnv(EpisodeEnv):
         )
         super().__init__(gazes, render_mode)
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse, "grid": grid}
-        EzPickle.__init__(self, self.scenery, **rewards, render_mode=render_mode)
-
-
-class ZoomSearch(ZoomEnv):
-    """Search a large picture for an object of a class: look closer until a look shows one.
-
-    The reward of a step is `find` if an object of the class is found (a box with a score of 0.1 and an overlap of 0.5),
-    minus `price`. The episode ends with the find, or after the largest number of looks.
-
-    Args:
-        scenery: this and all other arguments are those of `ZoomEnv`.
-
-    Example::
-
-        env = ZoomSearch(mosaics=2, targets=["cat"])
-        observation, info = env.reset(seed=0)
-        print(env.scenery.classes[observation["target"]], info["passes"])
-    """
-
-    task = "search"
-
-
-class ZoomExplore(ZoomEnv):
-    """Find all objects of a large picture.
-
-    The reward of a step is `find` times the increase of the fraction of objects that are found, minus `price`.
-
-    Args:
-        scenery: this and all other arguments are those of `ZoomEnv`.
-
-    Example::
-
-        env = ZoomExplore(mosaics=2)
-        observation, info = env.reset(seed=0)
-        print(info["result"])  # fraction of the objects that the whole picture shows
-    """
-
-    task = "exploration"
+        EzPickle.__init__(self, task, self.scenery, **rewards, render_mode=render_mode)
 
 
 def scenery_or_open(

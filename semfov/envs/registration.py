@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, ZoomEnv, ZoomExplore, ZoomSearch
+from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, ZoomEnv
 from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.zoom_scenery import open_zoom_scenery
 from semfov.errors import lookup
@@ -18,9 +20,9 @@ _IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"
 _Action = Literal["cell", "window"]
 """Kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
 
-_KINDS: dict[str, dict[str, type[Any]]] = {
+_KINDS: dict[str, dict[str, Callable[..., EpisodeEnv]]] = {
     "cell": {"search": GazeSearch, "exploration": GazeExplore},
-    "window": {"search": ZoomSearch, "exploration": ZoomExplore},
+    "window": {task: partial(ZoomEnv, task) for task in ("search", "exploration")},
 }
 
 
@@ -39,8 +41,7 @@ def register() -> None:
 
 def make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
     """Make an environment; options of `GazeEnv`, or of `ZoomEnv` where actions are windows."""
-    env: EpisodeEnv = _KINDS[lookup(action, _KINDS, "action")][task](**options)
-    return env
+    return _KINDS[lookup(action, _KINDS, "action")][task](**options)
 
 
 def _make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
@@ -49,7 +50,7 @@ def _make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **optio
         return GazeVectorEnv(task, num_envs, **options)
     # Single environments with shared looks, since a belief about windows is about one picture.
     mode = AutoresetMode(options.pop("autoreset_mode", AutoresetMode.NEXT_STEP))
-    own = inspect.signature(ZoomEnv).parameters.keys() - {"scenery"}
+    own = inspect.signature(ZoomEnv).parameters.keys() - {"task", "scenery"}
     common = {name: options.pop(name) for name in list(options) if name not in own}
     scenery = common.pop("scenery", None) or open_zoom_scenery(**common)
     return SyncVectorEnv([lambda: make(task, action, scenery=scenery, **options)] * num_envs, autoreset_mode=mode)

@@ -47,10 +47,6 @@ class Scenery:
     Episodes and looks are those of the protocols of search and exploration. The looks from all cells of a scene are
     computed when an episode first enters it, and are kept on disk.
 
-    Args:
-        looking: scenes, an eye that looks at them, and one policy, whose belief the environments keep.
-        targets: classes to search for; None takes all that a scene allows.
-
     Attributes:
         eye: sensor and detector.
         protocol: the protocol of the episodes.
@@ -59,16 +55,6 @@ class Scenery:
         shape: number of rows and columns of the cells.
         count: number of scenes.
         scenes: indices of the scenes that may have episodes.
-
-    Raises:
-        InputError: there are several policies.
-        DataError: no scene has anything to look for.
-
-    Example::
-
-        scenery = open_scenery("search", count=2)
-        env = GazeSearch(scenery)
-        print(len(scenery.episodes(0)), scenery.shape, scenery.shifts)
     """
 
     opened: partial[Any] | None = None
@@ -109,14 +95,7 @@ class Scenery:
         return labels
 
     def episodes(self, scene: int) -> list[Any]:
-        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws.
-
-        Args:
-            scene: index of the scene.
-
-        Returns:
-            Episodes, which `GazeEnv.reset` takes as an option.
-        """
+        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
         return self._listed(scene)
 
     def _list(self, scene: int) -> list[Any]:
@@ -128,14 +107,7 @@ class Scenery:
         return list(explorations_of(self._data, scene, columns * rows, self.protocol))
 
     def draw(self, random: np.random.Generator) -> Any:
-        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene.
-
-        Args:
-            random: generator to draw with.
-
-        Returns:
-            The episode.
-        """
+        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene."""
         while True:
             episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])
             if episodes:
@@ -174,25 +146,11 @@ class Scenery:
         return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
 
     def annotation(self, scene: int) -> Annotation:
-        """Objects of a scene.
-
-        Args:
-            scene: index of the scene.
-
-        Returns:
-            Their boxes and classes.
-        """
+        """Objects of a scene."""
         return self._data.annotation(scene)
 
     def image(self, scene: int) -> Tensor:
-        """Pixels of a scene.
-
-        Args:
-            scene: index of the scene.
-
-        Returns:
-            `(3, H, W)`, RGB in [0, 1].
-        """
+        """Pixels of a scene, `(3, H, W)`."""
         return self._data[scene].image
 
 

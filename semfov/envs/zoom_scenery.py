@@ -29,22 +29,12 @@ _TRIES = 1000
 class ZoomScenery:
     """Large pictures and an eye that zooms, which any number of environments can share; `open_zoom_scenery` makes one.
 
-    Args:
-        looking: pictures, looks and evidence.
-        passes: largest number of looks of an episode, the first one at the whole picture included.
-        targets: classes to search for; None takes all that a picture allows.
-
     Attributes:
         pictures: the pictures.
         eye: the eye that looks at windows.
         evidence: learned evidence by magnification.
         shifts: largest number of looks of an episode after the first one.
         annotated: whether the objects in the pictures are annotated.
-
-    Example::
-
-        scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
-        envs = [ZoomSearch(scenery) for _ in range(4)]
     """
 
     opened: partial[Any] | None = None
@@ -85,17 +75,7 @@ class ZoomScenery:
         return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
 
     def targets(self, scene: int) -> list[int]:
-        """Classes that a picture may be searched for.
-
-        Args:
-            scene: index of the picture.
-
-        Returns:
-            Class indices, 1..K.
-
-        Raises:
-            InputError: the pictures have no annotations, and no targets were given.
-        """
+        """Classes that a picture may be searched for."""
         if not self.annotated:
             if self._targets is None:
                 raise InputError("targets: expected classes to search for in pictures without annotations, got none")
@@ -103,14 +83,7 @@ class ZoomScenery:
         return [each for each in self.pictures.targets(scene) if self._targets is None or each in self._targets]
 
     def episodes(self, scene: int) -> list[int]:
-        """Targets of all searches of a picture: those that the look at the whole picture does not show already.
-
-        Args:
-            scene: index of the picture.
-
-        Returns:
-            Class indices, 1..K.
-        """
+        """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
         return self._listed(scene)
 
     def _list(self, scene: int) -> list[int]:
@@ -119,19 +92,7 @@ class ZoomScenery:
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
-        """Draw a picture and a target.
-
-        Args:
-            random: generator to draw with.
-            task: `search` or `exploration`.
-            scene: index of a picture to take; None draws one.
-
-        Returns:
-            Index of the picture, and class index of the target, 0 for an exploration.
-
-        Raises:
-            DataError: no picture was found that has anything to look for.
-        """
+        """Draw a picture and a target."""
         for _ in range(_TRIES):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
             if task != "search":
@@ -144,44 +105,19 @@ class ZoomScenery:
         )
 
     def found(self, looks: Sequence[Glance], scene: int, target: int) -> bool:
-        """Whether looks have found an object of the target class: by its box, or without annotations by the score.
-
-        Args:
-            looks: looks so far.
-            scene: index of the picture.
-            target: class index.
-
-        Returns:
-            Whether it was found.
-        """
+        """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
             return any(float(glance.show[target - 1]) >= LEAST_CONFIDENCE for glance in looks)
         return bool(found_in(looks, self._of(scene, target), target).any())
 
     def share(self, looks: Sequence[Glance], scene: int) -> float:
-        """Fraction of the objects that looks have found.
-
-        Args:
-            looks: looks so far.
-            scene: index of the picture.
-
-        Returns:
-            From 0 to 1; the number of objects found where there are no annotations.
-        """
+        """Fraction of the objects that looks have found."""
         if not self.annotated:
             return float(len(merge(looks, None, score=LEAST_CONFIDENCE)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
     def boxes(self, scene: int, target: int) -> Tensor:
-        """True boxes of the objects of a class, or of all objects, as far as they are annotated.
-
-        Args:
-            scene: index of the picture.
-            target: class index; 0 takes all classes.
-
-        Returns:
-            `(M, 4)`, in pixels of the picture.
-        """
+        """True boxes of the objects of a class, or of all objects, as far as they are annotated, `(M, 4)`."""
         return (self._of(scene, target) if target else self.pictures.annotation(scene)).boxes
 
     def _of(self, scene: int, target: int) -> Annotation:
@@ -190,14 +126,7 @@ class ZoomScenery:
         return Annotation(every.boxes[of_target], every.labels[of_target], every.crowd[of_target], every.size)
 
     def image(self, scene: int) -> Tensor:
-        """Pixels of a picture.
-
-        Args:
-            scene: index of the picture.
-
-        Returns:
-            `(3, H, W)`, RGB in [0, 1].
-        """
+        """Pixels of a picture, `(3, H, W)`."""
         return self.pictures[scene].image
 
 
@@ -266,7 +195,7 @@ def open_zoom_scenery(
     Example::
 
         scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
-        env = ZoomSearch(scenery, belief=True)
+        env = ZoomEnv("search", scenery, belief=True)
     """
     arguments = {**locals()}
     check_whole(passes, "passes", 2, 100_000)

@@ -1,7 +1,7 @@
 """Episodes: the loop of active perception, where its looks come from, and the state between two looks."""
 
 from semfov.episode.looks import LiveLooks, Looks, Sight, StoredLooks
-from semfov.episode.loop import Acquire, Step, attend, rollout
+from semfov.episode.loop import Acquire, Step, rollout
 from semfov.episode.memory import Forgetting, Memory
 from semfov.episode.stopwatch import STAGES, Stopwatch
 
@@ -16,6 +16,5 @@ __all__ = [
     "Step",
     "Stopwatch",
     "StoredLooks",
-    "attend",
     "rollout",
 ]

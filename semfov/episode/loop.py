@@ -69,30 +69,7 @@ def attend(
     fixation: Tensor,
     forgetting: Forgetting | None = None,
 ) -> tuple[Sight, Memory]:
-    """Make one look in each episode and update its state. `rollout` and the environments share this step.
-
-    Args:
-        looks: the source of looks.
-        observer: turns looks into a belief.
-        memory: state of the A episodes.
-        episodes: `(A,)`, numbers of the episodes.
-        cell: `(A,)`, fixated cells.
-        fixation: `(A, 2)`, fixated points as `(x, y)` in pixels.
-        forgetting: forgetting between looks; None forgets nothing (see `rollout`).
-
-    Returns:
-        The looks, and the new state.
-
-    >>> from semfov import Detections, Grid
-    >>> from semfov.belief.observers import Semantic
-    >>> from semfov.episode import StoredLooks
-    >>> nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 2), torch.zeros(2, 0, dtype=torch.bool))
-    >>> looks, observer = StoredLooks(nothing, Grid(2, 1, (10, 10))), Semantic(2)
-    >>> memory, cell = Memory.empty(looks, observer, episodes=1), torch.tensor([1])
-    >>> sight, memory = attend(looks, observer, memory, torch.tensor([0]), cell, looks.grid.centres[cell])
-    >>> memory.visited
-    tensor([[False,  True]])
-    """
+    """Make one look in each episode and update its state. `rollout` and the environments share this step."""
     sight = looks.see(observer, episodes, cell, fixation)
     watch = Stopwatch(sight.seconds)
     belief, age = memory.belief, memory.age

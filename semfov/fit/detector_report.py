@@ -57,10 +57,11 @@ def section(text: str, rows: list[list[str]]) -> str:
 
 def curves_figure(curves: dict[str, FloatArray], task: Task) -> Any:
     """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
-    from semfov.viz import plot_cumulative_performance, plot_success_rate
+    from semfov.viz import plot_curves
 
     means = {name: curve.mean(0) for name, curve in curves.items()}
     errors = {name: standard_error(curve) for name, curve in curves.items()}
     title = f"Held-out photographs ({len(curves['raw'])})"
-    plot = plot_cumulative_performance if task == "search" else plot_success_rate
-    return plot(means, errors, title=title)
+    searched = task == "search"
+    label, most = ("targets found (%)", 102) if searched else ("cells with the right class (%)", None)
+    return plot_curves(means, errors, label=label, title=title, most=most)

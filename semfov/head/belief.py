@@ -48,13 +48,6 @@ class SceneBelief(Belief):
         examined: `(1, S)` boolean, cells that were fixated.
         looks: `(1,)`, number of looks.
         views: belief about the view from each pose; None where there was no look.
-
-    >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat
-    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
-    >>> belief.probability(1).shape, bool((belief.owner < 0).all())
-    (torch.Size([1, 130]), True)
     """
 
     values: Tensor
@@ -88,21 +81,6 @@ class SceneObserver(Observer):
     The belief about each view is that of an agent that moves its eye alone. A cell of the scene takes the belief of the
     view in which the gaze came closest to it. A cell that was never seen has the belief of a cell in which a look from
     a distance of one longer side detected nothing.
-
-    Args:
-        inner: observer of a view: `semfov.observers.Target` or `LearnedMap`.
-        views: the possible views and fixations.
-        prior: probability that a cell that was never seen holds the target; None takes that of the observer.
-
-    Raises:
-        InputError: `prior` is not between 0 and 1.
-
-    >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat
-    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> observer = SceneObserver(Target(TargetEvidence()), views, prior=0.03)
-    >>> observer.start(1, views.grid, torch.zeros(1)).looks
-    tensor([0.])
     """
 
     by_target = True

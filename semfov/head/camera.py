@@ -104,19 +104,6 @@ class CameraScene(Sphere):
 
     Pan and tilt have a motor each, which move at the same time. A camera that does not turn all the way round takes the
     long way between its limits.
-
-    Args:
-        camera: the camera.
-        color: order of the channels of its frames if they are arrays or tensors (`semfov.as_image`).
-        cell: height of the scene's cells in degrees.
-
-    Raises:
-        InputError: the camera lacks an attribute, or one is out of range.
-
-    Example::
-
-        scene = CameraScene(MyCamera(), color="bgr")
-        path = HeadAgent.recommended().search(scene, "cup")
     """
 
     still = False

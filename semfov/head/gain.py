@@ -58,7 +58,8 @@ class SearchGain(LookGain):
 
     >>> from semfov.belief.observers import Target
     >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat, SceneObserver
+    >>> from semfov.head import Flat
+    >>> from semfov.head.belief import SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
     >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
     >>> SearchGain(views)(belief, 0, [0]).shape  # 9 poses, 100 cells in each view
@@ -100,7 +101,8 @@ class ExploreGain(LookGain):
         unseen: u, expected fraction of cells that are classified correctly when they are first fixated.
 
     >>> from semfov.belief.observers import LearnedMap
-    >>> from semfov.head import Flat, SceneObserver
+    >>> from semfov.head import Flat
+    >>> from semfov.head.belief import SceneObserver
     >>> views, model = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8)), MapEvidence(components=3)
     >>> belief = SceneObserver(LearnedMap(model), views).start(1, views.grid, torch.zeros(1))
     >>> gains = ExploreGain(views, model)(belief, here=0, poses=[0, 1])
@@ -148,7 +150,8 @@ class PerSecond(AcquisitionFunction):
 
     >>> from semfov.belief.observers import Target
     >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat, SceneObserver
+    >>> from semfov.head import Flat
+    >>> from semfov.head.belief import SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
     >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
     >>> acquisition = PerSecond(SearchGain(views), Speeds(), action=0)
@@ -187,7 +190,8 @@ class Scan(AcquisitionFunction):
 
     >>> from semfov.belief.observers import Target
     >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat, SceneObserver
+    >>> from semfov.head import Flat
+    >>> from semfov.head.belief import SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
     >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
     >>> scan = Scan(SearchGain(views), order=[2, 0], dwell=1, action=0)

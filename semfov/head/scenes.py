@@ -92,15 +92,7 @@ class Panorama(Sphere):
 
 @dataclass(frozen=True)
 class Boxes:
-    """Regions of a flat scene: boxes.
-
-    Attributes:
-        boxes: `(M, 4)` in pixels of the scene.
-
-    >>> Boxes(torch.tensor([[0.0, 0, 4, 4], [6, 6, 8, 8]])).contain(torch.tensor([[2.0, 2.0]]))
-    tensor([[ True],
-            [False]])
-    """
+    """Regions of a flat scene: boxes `(M, 4)` in its pixels."""
 
     boxes: Tensor
 
@@ -113,28 +105,14 @@ class Boxes:
         return Boxes(self.boxes[index])
 
     def samples(self, count: int = 9) -> Tensor:
-        """Points on a regular grid over each box, its borders included.
-
-        Args:
-            count: number of points along each side.
-
-        Returns:
-            `(M, count², 2)`, in pixels of the scene.
-        """
+        """Points on a regular grid over each box, its borders included, `(M, count², 2)`."""
         share = torch.linspace(0, 1, count).to(self.boxes)
         y, x = torch.meshgrid(share, share, indexing="ij")
         low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
         return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
 
     def contain(self, points: Tensor) -> Tensor:
-        """Whether each box contains each of the points.
-
-        Args:
-            points: `(N, 2)`, in pixels of the scene.
-
-        Returns:
-            `(M, N)`, boolean.
-        """
+        """Whether each box contains each of the points, `(M, N)`."""
         low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
         return ((points >= low) & (points <= high)).all(-1)
 

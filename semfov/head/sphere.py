@@ -30,22 +30,6 @@ class Sphere(World):
 
     A pose is pan (yaw), tilt (pitch) and horizontal field of view in degrees. Points are unit directions, so D is 3.
     The scene's picture is an equirectangular panorama.
-
-    Args:
-        picture: `(width, height)` of the panorama in pixels, with an even width.
-        size: `(w, h)` of a view in pixels.
-        pan: limits of pan in degrees, left and right; (-180, 180) turns all the way round.
-        tilt: limits of tilt in degrees, down and up.
-        fields: fields of view in degrees, narrowest first.
-        speeds: of eye and head.
-        cell: height of the scene's cells in degrees.
-
-    Raises:
-        InputError: an argument is out of range.
-
-    >>> rows = Sphere((360, 180), (40, 30), pan=(-60, 60), tilt=(0, 20)).poses(60.0)
-    >>> [pose.tolist() for pose in rows[0]]
-    [[-60.0, 10.0, 60.0], [-30.0, 10.0, 60.0], [0.0, 10.0, 60.0], [30.0, 10.0, 60.0], [60.0, 10.0, 60.0]]
     """
 
     closed = True

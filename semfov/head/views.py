@@ -23,11 +23,6 @@ class Views:
     one cell of a grid, `action = pose * 100 + cell`. So the loop that moves an eye over a picture also moves eye and
     head.
 
-    Args:
-        world: the scene.
-        fields: fields of view in degrees, narrowest first; None takes those of the scene.
-        fovea: width σ of the fovea in units of a view's longer side.
-
     Attributes:
         poses: `(P, 3)`, poses of the head.
         tiling: for each field of view, rows of the numbers of poses whose views tile the scene.
@@ -37,14 +32,6 @@ class Views:
         gaze_cell: `(A,)`, cell of the scene that contains this point.
         visible: for each pose, `(V,)`, the cells of the scene that its view shows.
         points: for each pose, `(V, 2)`, the pixels of its view that show the middles of these cells.
-
-    Raises:
-        InputError: `fields` is empty or not ascending, or `fovea` is not positive.
-
-    >>> from semfov.head import Flat
-    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> len(views), len(views.grid), views.tiling
-    (9, 900, [[[0, 2], [6, 8]]])
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
@@ -97,33 +84,18 @@ class Views:
         return reachable
 
     def places(self, pose: int) -> Tensor:
-        """Positions in a view of the scene's cells that it shows, as coordinates for `grid_sample`.
-
-        Args:
-            pose: number of the pose.
-
-        Returns:
-            `(V, 2)`, from -1 to 1 over the view.
-        """
+        """Positions in a view of the scene's cells that it shows, as coordinates for `grid_sample`, `(V, 2)`."""
         return 2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
-        """Interpolate values of a view's cells at the scene's cells that the view shows.
-
-        Args:
-            values: `(C, cells)`, values of the view's cells.
-            pose: number of the pose.
-
-        Returns:
-            `(C, V)`, by bilinear interpolation.
-        """
+        """Interpolate values `(C, cells)` of a view's cells at the scene's cells that it shows, `(C, V)`."""
         image = values.unflatten(-1, (CELL_POINTS, CELL_POINTS))[None]
         place = self.places(pose)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
     @cached_property
     def distances(self) -> list[Tensor]:
-        r"""For each pose, distance `(cells, V)` from each cell of its view to the scene's cells that it shows.
+        """For each pose, distance `(cells, V)` from each cell of its view to the scene's cells that it shows.
 
         The unit is the longer side of the narrowest view. With σ the width of the fovea, the acuity at a distance d
         falls as :math:`1 / (1 + d / σ)`. The acuity of a wider view is lower everywhere by the ratio r of the fields. A
@@ -137,25 +109,11 @@ class Views:
         return result
 
     def acuity(self, distance: Tensor) -> Tensor:
-        """Relative acuity of the fovea, 1 / (1 + d / σ).
-
-        Args:
-            distance: `(...)`, d in units of the narrowest view's longer side (`distances`).
-
-        Returns:
-            `(...)`, from 0 to 1; 0 where the distance is infinite, for cells that were never seen.
-        """
+        """Relative acuity of the fovea, 1 / (1 + d / σ), at distances d `(...)`; 0 for cells that were never seen."""
         return 1 / (1 + distance / self.fovea)
 
     def action_of(self, point: Tensor) -> tuple[int, Tensor]:
-        """Pose and pixel of a point of the strip.
-
-        Args:
-            point: `(2,)`, in pixels of the strip.
-
-        Returns:
-            The number of the pose, and the pixel `(2,)` of its view.
-        """
+        """Number of the pose and pixel `(2,)` of its view, of a point of the strip."""
         high = self.world.size[1]
         pose = int((float(point[1]) + 0.5) // high)
         return pose, point - point.new_tensor([0, pose * high])
@@ -167,15 +125,7 @@ class Views:
         return [self.world.shift(centres[:, None], centres[None], field) for field in self.fields]
 
     def durations(self, action: int, speeds: Speeds) -> Tensor:
-        """Time from one action to each other one, the look there included.
-
-        Args:
-            action: the present action.
-            speeds: of eye and head.
-
-        Returns:
-            `(A,)`, seconds.
-        """
+        """Time from one action to each other one, the look there included, `(A,)` in seconds."""
         pose, cell = divmod(action, self.cells)
         here = self.poses[pose]
         head = self.world.turn(here.expand_as(self.poses), self.poses)

@@ -55,12 +55,6 @@ class World(ABC):
         area: `(S,)`, relative areas of the cells, 1 on average.
         closed: whether the left and the right border of the picture meet.
         still: whether two views from one pose are equal, as those of a picture are.
-
-    >>> import torch
-    >>> from semfov.head import Flat
-    >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
-    >>> isinstance(world, World), [len(row) for row in world.poses(40.0)]
-    (True, [3, 3, 3])
     """
 
     scene: Grid
@@ -74,149 +68,52 @@ class World(ABC):
 
     @abstractmethod
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Look from a pose.
-
-        Args:
-            pose: `(3,)`, of the head.
-
-        Returns:
-            `(3, h, w)`, RGB in [0, 1]; and the pose `(3,)` from which it was taken, `pose` itself where the head is
-            exact.
-        """
+        """The picture from a pose `(3,)`, `(3, h, w)` in [0, 1], and the pose where it was taken."""
 
     def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
-        """Render the view in a direction.
-
-        Args:
-            direction: pan and tilt in degrees, to the right and up.
-            field: field of view across, in degrees.
-
-        Returns:
-            `(3, h, w)`, RGB in [0, 1].
-        """
+        """The view `(3, h, w)` in a direction, pan to the right and tilt up in degrees, of a field of view across."""
         return self.view(torch.tensor([*direction, field]))[0]
 
     @abstractmethod
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points of the scene into the view from a pose.
-
-        Args:
-            points: `(N, D)`, points of the scene.
-            pose: `(3,)`, of the head.
-
-        Returns:
-            Pixels of the view `(N, 2)`, and whether they are inside it `(N,)`.
-        """
+        """Pixels `(N, 2)` of the view from a pose at points `(N, D)`, and whether they are inside it `(N,)`."""
 
     @abstractmethod
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Points of the scene that pixels of the view from a pose show.
-
-        Args:
-            points: `(N, 2)`, pixels of the view.
-            pose: `(3,)`, of the head.
-
-        Returns:
-            `(N, D)`, points of the scene.
-        """
+        """Points `(N, D)` of the scene that pixels `(N, 2)` of the view from a pose show."""
 
     @abstractmethod
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cells of the scene that contain points.
-
-        Args:
-            points: `(N, D)`, points of the scene.
-
-        Returns:
-            `(N,)`, numbers of the cells.
-        """
+        """Cells `(N,)` of the scene that contain points `(N, D)`."""
 
     @abstractmethod
     def pixels_of(self, points: Tensor) -> Tensor:
-        """Positions of points in the scene's picture.
-
-        Args:
-            points: `(N, D)`, points of the scene.
-
-        Returns:
-            `(N, 2)`, in pixels of the picture.
-        """
+        """Positions `(N, 2)` of points `(N, D)` in the scene's picture."""
 
     @abstractmethod
     def angles_of(self, points: Tensor) -> Tensor:
-        """Directions of points of the scene, as a head would turn to them.
-
-        Args:
-            points: `(N, D)`, points of the scene.
-
-        Returns:
-            `(N, 2)`, pan to the right and tilt up, in degrees.
-        """
+        """Directions of points `(N, D)`, as a head would turn to them: pan right and tilt up `(N, 2)`."""
 
     @abstractmethod
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angles by which the head turns between poses.
-
-        Args:
-            one: `(..., 3)`, first poses.
-            other: `(..., 3)`, second poses.
-
-        Returns:
-            `(...)`, in degrees.
-        """
+        """Angles `(...)` in degrees by which the head turns between poses `(..., 3)`."""
 
     @abstractmethod
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angles by which the eye turns between pixels of a view.
-
-        Args:
-            one: `(..., 2)`, first pixels.
-            other: `(..., 2)`, second pixels.
-            field: field of view in degrees.
-
-        Returns:
-            `(...)`, in degrees.
-        """
+        """Angles `(...)` in degrees by which the eye turns between pixels `(..., 2)` of a view."""
 
     @abstractmethod
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene.
-
-        Args:
-            field: field of view in degrees.
-
-        Returns:
-            Rows of poses `(3,)`.
-        """
+        """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene."""
 
     @abstractmethod
     def places(self, boxes: Tensor, pose: Tensor) -> Places:
-        """Regions of the scene that boxes in the view from a pose cover.
-
-        Args:
-            boxes: `(M, 4)`, in pixels of the view.
-            pose: `(3,)`, of the head.
-
-        Returns:
-            One region for each box.
-        """
+        """Regions of the scene that boxes `(M, 4)` in the view from a pose cover."""
 
     @abstractmethod
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Smallest boxes of the scene's picture around boxes in the view from a pose.
-
-        Args:
-            boxes: `(M, 4)`, in pixels of the view.
-            pose: `(3,)`, of the head.
-
-        Returns:
-            `(M, 4)`, in pixels of the picture. A box across the seam of a panorama ends beyond its right border.
-        """
+        """Smallest boxes `(M, 4)` of the scene's picture around those of a view; a seam does not cut them."""
 
     @abstractmethod
     def image(self) -> Tensor | LargePicture | None:
-        """The picture of the whole scene, as far as it is known, for drawing.
-
-        Returns:
-            An opened picture, or `(3, H, W)`, RGB in [0, 1]; None where the scene has its geometry alone.
-        """
+        """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""

@@ -4,10 +4,9 @@ from semfov.paths.base import GazeRecord, Record
 from semfov.paths.endings import Ending
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
-from semfov.paths.look import RecordedLook, detections_in_words
+from semfov.paths.look import RecordedLook
 from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
-from semfov.paths.scanpath import Scanpath, Trace, trace
-from semfov.paths.stimulus import Stimulus, reduced_copy, sensor_in_words
+from semfov.paths.scanpath import Scanpath
 from semfov.paths.windows import ZoomPath
 
 __all__ = [
@@ -20,12 +19,6 @@ __all__ = [
     "Moment",
     "Record",
     "Scanpath",
-    "Stimulus",
-    "Trace",
     "WindowMoment",
     "ZoomPath",
-    "detections_in_words",
-    "sensor_in_words",
-    "reduced_copy",
-    "trace",
 ]

@@ -48,7 +48,7 @@ class Record(Conversion):
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
         least: score from which on objects count, in windows their probability or score (`threshold_in_words`).
-        photograph: `(3, h, w)`, bytes, the reduced picture (`semfov.paths.reduced_copy`); None if it was not kept.
+        photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
         source: file of the picture; None if it does not come from a file.
         shown: the `white` and the `bands` that were shown of the file; None for neither.
 
@@ -378,7 +378,7 @@ class Record(Conversion):
         return write_page(Path(path), f"semfov: {self.describe()}", [self.page_data(**options)])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
-        """Collect the data of the record for a page (`semfov.report.zoom_data`, for a scanpath `episode_data`).
+        """Collect the data of the record for a page (`semfov.report.zoom.zoom_data`, for a scanpath `episode_data`).
 
         Args:
             picture: the picture in full size; None takes the one that the record keeps.

@@ -104,22 +104,7 @@ def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]
 
 
 def detections_in_words(detections: Detections, classes: Sequence[str], most: int = 3, score: float = 0.0) -> str:
-    """Name the most confident detections of a look.
-
-    Args:
-        detections: detections of one image, the most confident first.
-        classes: names of the classes, background first.
-        most: largest number of detections that are named.
-        score: least confidence of the detections that count.
-
-    Returns:
-        The text.
-
-    >>> import torch
-    >>> cups = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.1, 0.9], [0.4, 0.6]]]), torch.ones(1, 2).bool())
-    >>> detections_in_words(cups, ("background", "cup"), most=1), detections_in_words(cups, ("", "cup"), score=0.95)
-    ('cup 0.90 and 1 more', 'nothing')
-    """
+    """Name the most confident detections of a look."""
     columns = (detections.labels, detections.confidence, detections.mask)
     looks = zip(*(column.flatten().tolist() for column in columns), strict=True)
     sure = [f"{classes[label]} {confidence:.2f}" for label, confidence, real in looks if real and confidence >= score]

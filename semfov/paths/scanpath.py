@@ -235,7 +235,7 @@ class Scanpath(GazeRecord):
             yield LookView(view, self.size, look.detections.boxes[0], look.fixation)
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
-        """Data of the scanpath for a page (`semfov.report.episode_data`)."""
+        """Data of the scanpath for a page (`semfov.report.episode.episode_data`)."""
         from semfov.report.episode import episode_data
 
         image = self.image if picture is None else as_image(picture)
@@ -298,26 +298,7 @@ class Scanpath(GazeRecord):
 
 
 class Trace:
-    """Keeps the steps of one episode, and makes scanpaths of them at any time.
-
-    Args:
-        grid: the cells.
-        classes: names of the classes, background first.
-        target: class 1..K that is searched for; None for exploration.
-        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
-            about all classes itself.
-        least: score from which on objects count.
-
-    Attributes:
-        steps: the steps, in order.
-
-    Example::
-
-        trace = Trace(grid, ("background", "cup"), target=1, beside=None)
-        for step in rollout(looks, observer, acquisition, start, choice, most=10):
-            trace.add(step)
-        scanpath = trace.scanpath()
-    """
+    """Keeps the steps of one episode, and makes scanpaths of them at any time."""
 
     def __init__(
         self,
@@ -334,22 +315,11 @@ class Trace:
         self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def add(self, step: Step) -> None:
-        """Keep a step.
-
-        Args:
-            step: the next step of the episode.
-        """
+        """Keep a step."""
         self.steps.append(step)
 
     def scanpath(self, **outcome: Any) -> Scanpath:
-        """Make the scanpath of the steps so far. Its map of all classes is made when it is read.
-
-        Args:
-            outcome: other attributes of the scanpath, such as its decision.
-
-        Returns:
-            The scanpath.
-        """
+        """Make the scanpath of the steps so far. Its map of all classes is made when it is read."""
         steps, target = self.steps, self.target
         fields = {
             "grid": self.grid,
@@ -384,24 +354,7 @@ class Trace:
 def trace(
     steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
 ) -> Scanpath:
-    """Make the scanpath of one episode (`Trace`).
-
-    Args:
-        steps: steps of one episode, from `semfov.episode.rollout`.
-        grid: the cells.
-        classes: names of the classes, background first.
-        target: class 1..K that is searched for; None for exploration.
-        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
-            about all classes itself.
-
-    Returns:
-        The scanpath, without a decision.
-
-    Example::
-
-        steps = rollout(looks, observer, acquisition, start, choice, most=10)
-        scanpath = trace(steps, grid, ("background", "cup"), target=1, beside=None)
-    """
+    """Make the scanpath of one episode (`Trace`)."""
     episode = Trace(grid, classes, target, beside)
     for step in steps:
         episode.add(step)

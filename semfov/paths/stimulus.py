@@ -34,11 +34,6 @@ class Stimulus:
         placement: scale and position of the photograph on the canvas.
         settings: settings of sensor and detector (`Eye.settings`).
         sensor: sensor of the eye; None makes one from the settings.
-
-    Example::
-
-        stimulus = Stimulus.of(eye, image)
-        sharp_left, sharp_right = stimulus.views(torch.tensor([[100.0, 240.0], [500.0, 240.0]]))
     """
 
     photograph: Tensor
@@ -49,18 +44,7 @@ class Stimulus:
 
     @classmethod
     def of(cls, eye: Eye, image: Tensor) -> Self:
-        """Make the stimulus of an image for an eye.
-
-        Args:
-            eye: sensor and detector.
-            image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
-
-        Returns:
-            The stimulus.
-
-        Raises:
-            InputError: the shape of the image is wrong.
-        """
+        """Make the stimulus of an image for an eye."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
@@ -69,18 +53,7 @@ class Stimulus:
 
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
-        """Make the stimulus from the content of a file, and check that its parts fit each other.
-
-        Args:
-            tensors: tensors of the file; those of the stimulus are `photograph` and `canvas`.
-            record: JSON values of the file; those of the stimulus are `placement` and `settings`.
-
-        Returns:
-            The stimulus; None if none was saved.
-
-        Raises:
-            InputError: a part is missing, or the photograph does not fit on the canvas.
-        """
+        """Make the stimulus from the content of a file, and check that its parts fit each other."""
         pictures = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
         values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
         if "canvas" not in tensors and not values:
@@ -108,15 +81,6 @@ class Stimulus:
         """Foveated views of the photograph, as the detector received them, without the border of the canvas.
 
         They equal the result of `Eye.pictures` up to the rounding to bytes.
-
-        Args:
-            fixations: `(n, 2)`, as `(x, y)` in pixels of the image.
-
-        Returns:
-            One view `(3, h, w)` in [0, 1] for each fixation.
-
-        Raises:
-            InputError: the shape is wrong; or the stimulus comes from a file, and its sensor is not one of the library.
         """
         check_shape(fixations, "fixations", None, 2)
         settings = self.settings["sensor"]
@@ -135,19 +99,7 @@ class Stimulus:
 
 
 def sensor_in_words(sensor: Mapping[str, Any]) -> str:
-    """Describe a sensor in words.
-
-    Args:
-        sensor: the settings of the sensor, from `Eye.settings`.
-
-    Returns:
-        The description.
-
-    >>> sensor_in_words({"sigma": 100.0, "reference": 640.0, "growth": 2.0})
-    'fovea of 100 px in 640, growth 2'
-    >>> sensor_in_words({"kind": "log-polar", "fovea": 40.0, "reference": 640.0})
-    'log-polar, fovea 40, reference 640'
-    """
+    """Describe a sensor in words."""
     if "sigma" not in sensor or "growth" not in sensor:
         settings = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
         return ", ".join([str(sensor.get("kind", "sensor")), *settings])
@@ -155,17 +107,7 @@ def sensor_in_words(sensor: Mapping[str, Any]) -> str:
 
 
 def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
-    """Reduce a picture to the bytes that a record keeps for its drawings.
-
-    Args:
-        picture: an opened picture of any size, or `(3, h, w)`, RGB in [0, 1].
-
-    Returns:
-        `(3, h, w)` uint8, with a longer side of at most `LONGEST` pixels.
-
-    >>> reduced_copy(torch.rand(3, 960, 2560)).shape
-    torch.Size([3, 480, 1280])
-    """
+    """Reduce a picture to the bytes that a record keeps for its drawings, `(3, h, w)`."""
     width, height = (picture.shape[-1], picture.shape[-2]) if isinstance(picture, Tensor) else picture.size
     scale = min(1.0, LONGEST / max(width, height))
     wide, high = max(1, round(width * scale)), max(1, round(height * scale))

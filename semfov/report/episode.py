@@ -14,7 +14,8 @@ from torch import Tensor
 
 from semfov.detection.objects import FAINTEST
 from semfov.detection.placement import resize
-from semfov.paths import Scanpath, sensor_in_words
+from semfov.paths import Scanpath
+from semfov.paths.stimulus import sensor_in_words
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import cell_entropy
@@ -56,29 +57,7 @@ def episode_data(
     width: int = 416,
     quality: int = 75,
 ) -> Data:
-    """Collect the data of an episode for a page, as JSON values.
-
-    Args:
-        scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1]; None shows no photograph.
-        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None shows no views.
-        name: name of the episode.
-        settings: settings of detector and sensor (`Eye.settings()`); None takes those that the scanpath kept.
-        boxes: `(M, 4)`, true boxes of the target.
-        classes: number of probability maps to keep beside background, of the classes most probable anywhere; None keeps
-            all.
-        width: width of the views in pixels; the photograph is half as wide again.
-        quality: of the JPEG files.
-
-    Returns:
-        The data, for `page_html` and `write_page`; pictures are data URIs.
-
-    Example::
-
-        path = agent.search(image, "cup")
-        data = episode_data(path, path.image, path.views(), name="kitchen.jpg")
-        write_page(Path("kitchen.html"), "Search for a cup", [data])
-    """
+    """Collect the data of an episode for a page, as JSON values."""
     grid = scanpath.grid
     size = grid.extent.tolist()
     timed = len(scanpath.seconds) > 0

@@ -41,37 +41,6 @@ def zoom_data(
 
     Each look is shown at the resolution at which the detector received it, or that of the picture if it is coarser.
     Detections with a score below 0.1 are left out.
-
-    Args:
-        path: the search or exploration.
-        picture: the picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`. It
-            may be reduced; None takes the one that the record kept.
-        name: name of the picture.
-        settings: settings of the eye (`WindowEye.settings()`), for the name of the detector; None leaves the name out.
-        boxes: `(M, 4)`, true boxes of the target, which are drawn dashed.
-        width: largest width in pixels of the whole picture on the page.
-        quality: of the JPEG files.
-
-    Returns:
-        The data, for `page_html` and `write_page`.
-
-    Raises:
-        InputError: the picture does not have the proportions of the record's, none is there, or there are no looks.
-
-    >>> import torch
-    >>> from semfov.paths import ZoomPath
-    >>> from semfov.zoom import Lattice
-    >>> from semfov.detection import Detections, Objects
-    >>> from semfov.zoom.glances import Glance, on_lattice
-    >>> lattice, nothing = Lattice.over((1600, 1200), (400, 400)), torch.zeros(0)
-    >>> look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
-    >>> path = ZoomPath(
-    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
-    ...     candidates=Objects.none(), ending="passes",
-    ... )
-    >>> data = zoom_data(path, torch.rand(3, 1200, 1600), name="kitchen.jpg")
-    >>> data["sensor"], data["decision"]
-    ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup from score 0.3. The only pass was used.')
     """
     source = open_large(photograph_of(path, None) if picture is None else picture)
     wide, high = path.size

@@ -4,29 +4,22 @@ from typing import TYPE_CHECKING, Any
 
 from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation, foveate
-from semfov.sensor.glimpse import Glimpse, glimpse
+from semfov.sensor.glimpse import glimpse
 from semfov.sensor.log_polar import LogPolar, from_log_polar, log_polar
 from semfov.sensor.multi_scale import MultiScaleFovea
-from semfov.sensor.named import SENSORS, NamedSensor, named_sensor, sensor_of
-from semfov.sensor.perspective import Perspective, perspective
-from semfov.sensor.pyramid import Bands, gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
-from semfov.sensor.sphere import Camera, Regions
+from semfov.sensor.named import SENSORS, named_sensor, sensor_of
+from semfov.sensor.perspective import perspective
+from semfov.sensor.pyramid import gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
 
 if TYPE_CHECKING:
     from semfov.sensor.augmentation import RandomFoveation
 
 __all__ = [
     "SENSORS",
-    "Bands",
-    "Camera",
     "Foveation",
-    "Glimpse",
     "LogPolar",
     "MultiScaleFovea",
-    "NamedSensor",
-    "Perspective",
     "RandomFoveation",
-    "Regions",
     "Sensor",
     "foveate",
     "from_log_polar",

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
-from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 
 _Padding = Literal["zeros", "border", "fill"]
@@ -110,49 +109,6 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     side = torch.minimum((context * (high - low).amax()).clamp(min=least * max(picture)), whole)
     start = torch.minimum(((low + high - side) / 2).clamp(min=0), whole - side)
     return torch.cat([start, start + side])
-
-
-class Glimpse(StatedModule):
-    """A sensor that shows a window of the picture at a magnification, the module form of `glimpse`.
-
-    Args:
-        size: `(width, height)` of the canvas, the detector's input.
-        padding_mode: values outside the picture: `zeros`, `border` or `fill`.
-        fill_value: value outside the picture with `padding_mode="fill"`.
-
-    >>> sensor = Glimpse((32, 32))
-    >>> sensor(torch.rand(1, 3, 64, 96), torch.tensor([[[20.0, 20.0]]]), torch.tensor([[0.5]])).shape
-    torch.Size([1, 1, 3, 32, 32])
-    """
-
-    _told = ("size", "padding_mode", "fill_value")
-
-    def __init__(
-        self, size: tuple[int, int], *, padding_mode: _Padding = "fill", fill_value: float = 114 / 255
-    ) -> None:
-        super().__init__()
-        check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
-        self.size = size
-        self.padding_mode: _Padding = lookup(padding_mode, get_args(_Padding), "padding mode")
-        self.fill_value = fill_value
-
-    def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
-        """Compute views of images at points and magnifications.
-
-        Args:
-            image: `(B, C, H, W)`.
-            points: centres of the windows `(B, G, 2)`, `(x, y)` in picture pixels.
-            magnification: canvas pixels for each picture pixel, `(B, G)`.
-
-        Returns:
-            Views `(B, G, C, h, w)`.
-        """
-        boxes = windows_at(points, magnification, self.size)
-        return glimpse(image, boxes, self.size, padding_mode=self.padding_mode, fill_value=self.fill_value)
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        return f"size={self.size}, padding_mode={self.padding_mode!r}, fill_value={self.fill_value:g}"
 
 
 def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding, value: float) -> Tensor:

@@ -22,9 +22,6 @@ class NamedSensor:
         settings: all settings of the class.
         published: whether the sensor is one of the paper's, for which observation models that are fitted by maximum
             likelihood are shipped.
-
-    >>> SENSORS["log-polar"].make.__name__, SENSORS["log-polar"].changed({"fovea": 40.0})
-    ('LogPolar', {'fovea': 40.0, 'spacing': 1.0, 'pooling': 1.0})
     """
 
     make: type[Sensor]
@@ -32,17 +29,7 @@ class NamedSensor:
     published: bool = False
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """List the settings with some of them replaced.
-
-        Args:
-            changes: new values by name.
-
-        Returns:
-            All settings.
-
-        Raises:
-            InputError: the sensor has no setting of such a name.
-        """
+        """List the settings with some of them replaced."""
         for name in changes:
             names = ", ".join(self.make.names)
             check(name in self.make.names, "sensor", f"settings of a {self.make.__name__} ({names})", name)

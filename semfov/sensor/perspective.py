@@ -8,7 +8,6 @@ from torch.nn import functional as F
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape, values_known
-from semfov.io.state import StatedModule
 from semfov.sensor.base import stacked_views
 from semfov.sensor.sphere import Camera, panorama_points
 
@@ -108,38 +107,3 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     place = as_positions(place, source)
     view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
     return (F.avg_pool2d(view, times) if times > 1 else view)[0].to(source.dtype)
-
-
-class Perspective(StatedModule):
-    """A camera in a panorama, the module form of `perspective`.
-
-    Args:
-        size: `(width, height)` of the views.
-        antialias: smooth where a view shrinks the panorama.
-
-    >>> Perspective((40, 30))(torch.rand(1, 3, 64, 128), torch.tensor([[30.0, 10.0, 60.0]])).shape
-    torch.Size([1, 3, 30, 40])
-    """
-
-    _told = ("size", "antialias")
-
-    def __init__(self, size: tuple[int, int], *, antialias: bool = True) -> None:
-        super().__init__()
-        check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
-        self.size, self.antialias = size, antialias
-
-    def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
-        """Compute views of panoramas.
-
-        Args:
-            panorama: `(B, C, H, W)`.
-            pose: yaw, pitch and horizontal field of view in degrees, `(B, G, 3)`, or `(B, 3)` for one view of each.
-
-        Returns:
-            Views `(B, G, C, h, w)`, or `(B, C, h, w)`.
-        """
-        return perspective(panorama, pose, self.size, antialias=self.antialias)
-
-    def extra_repr(self) -> str:
-        """The settings as text."""
-        return f"size={self.size}, antialias={self.antialias}"

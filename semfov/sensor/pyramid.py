@@ -31,12 +31,6 @@ class Bands:
         details: bands `L_0..L_{K-1}`, `(B, C, h_k, w_k)`, finest first.
         base: the coarsest level `G_K`.
         convention: convention of the pyramid, which determines the positions of a band's pixels in the image.
-
-    >>> bands = laplacian_pyramid(torch.rand(1, 3, 64, 48), 2)
-    >>> bands.shape, len(bands.details)
-    ((64, 48), 2)
-    >>> bands.places(1, -1)[:3]
-    tensor([0.5000, 2.5000, 4.5000])
     """
 
     details: tuple[Tensor, ...]
@@ -50,15 +44,7 @@ class Bands:
         return height, width
 
     def places(self, k: int, axis: int) -> Tensor:
-        """Positions of a band's pixels in the image.
-
-        Args:
-            k: number of the band; 0 is the finest.
-            axis: -2 for positions along y, -1 for positions along x.
-
-        Returns:
-            Positions `(n,)` in image pixels.
-        """
+        """Positions of a band's pixels in the image, `(n,)`."""
         band = self.details[k]
         return as_positions(pixel_positions(band.shape[axis], self.shape[axis], k, self.convention), band)
 

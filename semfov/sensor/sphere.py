@@ -53,14 +53,6 @@ class Camera:
     is
 
     .. math:: d = R \, \left(\frac{u + ½ - w/2}{f}, \frac{v + ½ - h/2}{f}, 1\right)
-
-    Args:
-        pose: `(..., 3)`, yaw, pitch and horizontal field of view in degrees.
-        size: `(w, h)` of the image in pixels.
-
-    >>> camera = Camera(torch.tensor([90.0, 0.0, 90.0]), (101, 101))
-    >>> camera.directions(torch.tensor([[50.0, 50.0]])).round().int().tolist()
-    [[1, 0, 0]]
     """
 
     pose: Tensor
@@ -87,14 +79,7 @@ class Camera:
         return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
     def directions(self, points: Tensor) -> Tensor:
-        """Compute the directions of pixels of the camera's image.
-
-        Args:
-            points: pixels `(..., N, 2)` or `(N, 2)`, pixel centres at integers.
-
-        Returns:
-            Unit vectors `(..., N, 3)`.
-        """
+        """Compute the directions of pixels of the camera's image."""
         check_shape(points, "points", None, 2)
         middle = points.new_tensor(self.size) / 2 - 0.5
         flat = (points - middle) / self.focal[..., None, None]
@@ -102,15 +87,7 @@ class Camera:
         return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
 
     def points(self, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the pixels of directions in the camera's image, and whether they are inside it.
-
-        Args:
-            directions: vectors `(..., N, 3)` or `(N, 3)` of any length.
-
-        Returns:
-            Pixels `(..., N, 2)`, infinite for directions behind the camera, and `(..., N)` boolean: whether a direction
-            is in front of the camera and inside its image.
-        """
+        """Compute the pixels of directions in the camera's image, and whether they are inside it, `(..., N, 2)`."""
         check_shape(directions, "directions", None, 3)
         rays = _turn(self.rotation.mT, directions)
         ahead = rays[..., 2] > 0
@@ -133,13 +110,6 @@ class Regions:
     Attributes:
         camera: cameras of M poses.
         boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
-
-    >>> camera = Camera(torch.tensor([[0.0, 0.0, 90.0]]), (100, 100))
-    >>> region = Regions(camera, torch.tensor([[25.0, 25.0, 75.0, 75.0]]))
-    >>> region.contain(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])).tolist()
-    [[True, False]]
-    >>> region.panorama_boxes((360, 180)).round().int().tolist()
-    [[153, 63, 207, 117]]
     """
 
     camera: Camera
@@ -154,27 +124,13 @@ class Regions:
         return Regions(Camera(self.camera.pose[index], self.camera.size), self.boxes[index])
 
     def contain(self, directions: Tensor) -> Tensor:
-        """Tell which directions lie in each region.
-
-        Args:
-            directions: vectors `(N, 3)` of any length.
-
-        Returns:
-            `(M, N)` boolean.
-        """
+        """Tell which directions lie in each region, `(M, N)`."""
         points, _ = self.camera.points(directions)
         low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
         return ((points >= low) & (points <= high)).all(-1)
 
     def samples(self, count: int = 9) -> Tensor:
-        """Sample a grid of directions in each region, its borders included.
-
-        Args:
-            count: number of directions along each side of the grid.
-
-        Returns:
-            Unit vectors `(M, count², 3)`.
-        """
+        """Sample a grid of directions in each region, its borders included."""
         share = torch.linspace(0, 1, count).to(self.boxes)
         y, x = torch.meshgrid(share, share, indexing="ij")
         at = torch.stack([x, y], -1).flatten(0, 1)
@@ -182,14 +138,7 @@ class Regions:
         return self.camera.directions(low + at * (high - low) - 0.5)
 
     def outlines(self, count: int = 33) -> Tensor:
-        """Sample directions along the closed border of each region.
-
-        Args:
-            count: number of directions along each of the four edges.
-
-        Returns:
-            Unit vectors `(M, 4 · count, 3)`.
-        """
+        """Sample directions along the closed border of each region."""
         share = torch.linspace(0, 1, count).to(self.boxes)
         zero, one = torch.zeros_like(share), torch.ones_like(share)
         sides = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
@@ -198,18 +147,11 @@ class Regions:
         return self.camera.directions(low + at * (high - low) - 0.5)
 
     def panorama_boxes(self, size: tuple[int, int], count: int = 257) -> Tensor:
-        """Compute the smallest boxes around the regions in an equirectangular panorama.
+        """Compute the smallest boxes around the regions in an equirectangular panorama, `(M, 4)`.
 
         The edges of a region are curves in the panorama; their extremes are taken among `count` points of each edge. A
         box that crosses the seam begins inside the panorama and ends beyond its right border. A box that holds a pole
         is as wide as the panorama.
-
-        Args:
-            size: `(width, height)` of the panorama.
-            count: number of points along each edge.
-
-        Returns:
-            Boxes `(M, 4)`, `(x1, y1, x2, y2)` in panorama pixels, edges between pixels.
         """
         points = panorama_points(self.outlines(count), size)
         x, y = points.unbind(-1)

@@ -5,32 +5,28 @@ last value of a cell. To draw in an existing figure, give its axes as `ax=` or `
 """
 
 from semfov.viz.animation import animate
-from semfov.viz.belief import class_posterior, plot_belief, plot_belief_bars, plot_belief_strip
-from semfov.viz.curves import plot_cumulative_performance, plot_success_rate
+from semfov.viz.belief import plot_belief, plot_belief_bars, plot_belief_strip
+from semfov.viz.curves import plot_curves
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.fixation import plot_fixation
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.scanpath import plot_episode, plot_foveated_strip, plot_scanpath
-from semfov.viz.semantic import cell_entropy, named_regions, plot_semantic_map
+from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure
 
 __all__ = [
     "COLOURS",
     "CONFIDENT",
     "animate",
-    "cell_entropy",
-    "class_posterior",
-    "named_regions",
     "plot_belief",
     "plot_belief_bars",
     "plot_belief_strip",
-    "plot_cumulative_performance",
+    "plot_curves",
     "plot_episode",
     "plot_fixation",
     "plot_foveated_strip",
     "plot_reliability",
     "plot_scanpath",
     "plot_semantic_map",
-    "plot_success_rate",
     "save_figure",
 ]

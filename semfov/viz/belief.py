@@ -20,27 +20,7 @@ if TYPE_CHECKING:
 
 
 def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
-    """Probability of a class in every cell after each look.
-
-    Args:
-        scanpath: the episode.
-        target: index of the class; None takes the class that was searched for, with the belief of the search.
-
-    Returns:
-        `(n, X·Y)`, on the CPU.
-
-    Raises:
-        InputError: no class is given and nothing was searched for, or there is no such class.
-
-    >>> import torch
-    >>> from semfov import Grid
-    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.9, 0.1]]])
-    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=cells, fixations=grid.centres[cells],
-    ...                 detections=(), probabilities=p, values=values)
-    >>> class_posterior(path)
-    tensor([[0.5000, 0.1000]])
-    """
+    """Probability of a class in every cell after each look, `(n, X·Y)`."""
     index = scanpath.target if target is None else target
     if index is None:
         raise InputError("target: expected a class index, as nothing was searched for, got None")

@@ -22,17 +22,25 @@ _REST = "0.6"
 
 
 @styled
-def plot_cumulative_performance(
-    curves: _Curves, errors: _Curves | None = None, *, title: str = "", ax: Axes | None = None
+def plot_curves(
+    curves: _Curves,
+    errors: _Curves | None = None,
+    *,
+    label: str,
+    title: str = "",
+    most: float | None = None,
+    ax: Axes | None = None,
 ) -> Figure:
-    """Plot the fraction of targets found after each gaze shift, one curve a policy, with bands of one standard error.
+    """Plot a share after each gaze shift, one curve for each policy, with bands of one standard error.
 
     Of more than seven curves the legend names the highest ones and those of random gaze; the others are grey.
 
     Args:
-        curves: for each policy its cumulative performance after 0, 1, 2, … gaze shifts, in [0, 1].
+        curves: for each policy its share after 0, 1, 2, … gaze shifts, in [0, 1], such as that of the targets found.
         errors: standard errors of the same shape.
+        label: what the share is of, in per cent.
         title: title of the figure.
+        most: end of the scale, which then begins at 0; None takes that of the curves.
         ax: axes to draw in; None makes a figure.
 
     Returns:
@@ -41,55 +49,31 @@ def plot_cumulative_performance(
     Raises:
         InputError: there is no curve.
 
-    >>> figure = plot_cumulative_performance({"random": np.linspace(0, 0.8, 31)})
+    >>> figure = plot_curves({"random": np.linspace(0, 0.8, 31)}, label="targets found (%)", most=102)
     """
-    figure, axes = _plot_curves(curves, errors, title, "targets found (%)", ax)
-    axes.set_ylim(0, 102)
+    check(len(curves) > 0, "curves", "at least one curve", 0)
+    figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
+    draw_curves(axes, curves, errors, named=highlighted(curves))
+    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
+    lines, names = axes.get_legend_handles_labels()
+    if len(curves) > len(COLOURS):
+        # The grey curves were drawn first, below the others, but come last in the legend.
+        lines, names = [*lines[1:], lines[0]], [*names[1:], names[0]]
+    axes.legend(lines, names, loc="lower right", framealpha=0.9)
+    if most is not None:
+        axes.set_ylim(0, most)
     return figure
 
 
-@styled
-def plot_success_rate(
-    curves: _Curves, errors: _Curves | None = None, *, title: str = "", ax: Axes | None = None
-) -> Figure:
-    """Plot the fraction of cells with objects whose class is correct after each gaze shift, one curve for each policy.
-
-    Of more than seven curves the legend names the highest ones and those of random gaze; the others are grey.
-
-    Args:
-        curves: for each policy its success rate after 0, 1, 2, … gaze shifts, in [0, 1].
-        errors: standard errors of the same shape.
-        title: title of the figure.
-        ax: axes to draw in; None makes a figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: there is no curve.
-
-    >>> figure = plot_success_rate({"random": np.linspace(0.1, 0.5, 21)}, title="exploration")
-    """
-    return _plot_curves(curves, errors, title, "cells with the right class (%)", ax)[0]
-
-
 def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
-    """The curves that a legend names: the highest on average, and random gaze as the reference.
-
-    >>> highlighted({"random": np.zeros(2), "a": np.ones(2), "b": np.full(2, 0.5)}, most=2)
-    ['random', 'a']
-    """
+    """The curves that a legend names: the highest on average, and random gaze as the reference."""
     order = sorted(curves, key=lambda name: (not name.startswith("random"), -float(np.nanmean(curves[name]))))
     chosen = order[:most]
     return [name for name in curves if name in chosen]
 
 
 def others_named(count: int) -> str:
-    """The legend's single entry for all curves that it does not name.
-
-    >>> others_named(9)
-    '9 others'
-    """
+    """The legend's single entry for all curves that it does not name."""
     return f"{count} other{'s' if count != 1 else ''}"
 
 
@@ -113,27 +97,3 @@ def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequ
     axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3, linewidth=0.5)
-
-
-def legend_of(figure: Figure, axes: Axes, *, columns: int, inside: bool) -> None:
-    """Draw the legend of axes inside them, or below their figure."""
-    lines, names = axes.get_legend_handles_labels()
-    if inside:
-        axes.legend(lines, names)
-    else:
-        figure.legend(lines, names, loc="outside lower center", ncols=columns)
-
-
-def _plot_curves(
-    curves: _Curves, errors: _Curves | None, title: str, label: str, ax: Axes | None
-) -> tuple[Figure, Axes]:
-    check(len(curves) > 0, "curves", "at least one curve", 0)
-    figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
-    draw_curves(axes, curves, errors, named=highlighted(curves))
-    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
-    lines, names = axes.get_legend_handles_labels()
-    if len(curves) > len(COLOURS):
-        # The grey curves were drawn first, below the others, but come last in the legend.
-        lines, names = [*lines[1:], lines[0]], [*names[1:], names[0]]
-    axes.legend(lines, names, loc="lower right", framealpha=0.9)
-    return figure, axes

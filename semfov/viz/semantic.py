@@ -34,24 +34,11 @@ _NAME_POINTS = 7
 
 
 def cell_entropy(scanpath: Scanpath) -> Tensor:
-    r"""Entropy of the class of every cell after each look.
+    r"""Entropy of the class of every cell after each look, `(n, X·Y)`.
 
     .. math:: H = -\sum_k p_k \log_2 p_k
 
     The marginal probabilities of a learned map are first scaled to sum to 1.
-
-    Args:
-        scanpath: the episode.
-
-    Returns:
-        `(n, X·Y)`, in bits, on the CPU.
-
-    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.0, 1.0]]])
-    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=None, cells=cells,
-    ...                 fixations=grid.centres[cells], detections=(), probabilities=p, values=values)
-    >>> cell_entropy(path)
-    tensor([[1., 0.]])
     """
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
@@ -157,20 +144,6 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
 
     A cell has an object if its most probable object class is more probable than background, and more probable than 3
     over the number of classes, or than 0.5 where that is less.
-
-    Args:
-        scanpath: the episode.
-        fixation: number of the fixation; -1 is the last.
-
-    Returns:
-        For each region its class, its cells, and its highest probability; the largest regions first.
-
-    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.1, 0.9], [0.2, 0.8]]])
-    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=None, cells=cells,
-    ...                 fixations=grid.centres[cells], detections=(), probabilities=p, values=values)
-    >>> [(name, region, round(p, 2)) for name, region, p in named_regions(path)]
-    [('cup', [0, 1], 0.9)]
     """
     grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)

@@ -1,6 +1,7 @@
 """Environments with large pictures: the checker, the choices of the zooming agent, and found objects."""
 
 import pickle
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from semfov import InputError
-from semfov.envs import ZoomExplore, ZoomSearch, open_zoom_scenery
+from semfov.envs import ZoomEnv, open_zoom_scenery
 from semfov.envs.registration import _IDS
 from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
@@ -21,7 +22,7 @@ from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
 from tests.envs.agents import WindowAgent
 
-KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
+KINDS = {task: partial(ZoomEnv, task) for task in ("search", "exploration")}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
 
 
@@ -53,7 +54,7 @@ def test_an_action_selects_the_nearest_window_and_converts_back(size, place, num
 @pytest.mark.parametrize("task", KINDS)
 def test_environments_pass_the_checker_of_gymnasium(cache, task):
     env = gymnasium.make(_IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
-    assert isinstance(env.unwrapped, KINDS[task])
+    assert isinstance(env.unwrapped, ZoomEnv)
     check_env(env.unwrapped)
 
 
@@ -61,7 +62,7 @@ def test_environments_pass_the_checker_of_gymnasium(cache, task):
 @pytest.mark.slow
 def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
     """Window by window, until an object is found by its box."""
-    env = ZoomSearch(zoom_scenery)
+    env = ZoomEnv("search", zoom_scenery)
     agent, lengths = WindowAgent(env), set()
     targets = zoom_scenery.episodes(0)
     assert targets
@@ -85,7 +86,7 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
 @pytest.mark.weights
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
-    env = ZoomExplore(zoom_scenery, price=0.5, find=10.0)
+    env = ZoomEnv("exploration", zoom_scenery, price=0.5, find=10.0)
     agent = WindowAgent(env)
     _, info = env.reset(seed=0)
     before, total, truncated = info["result"], 0.0, False
@@ -103,7 +104,7 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
 @pytest.mark.weights
 @pytest.mark.slow
 def test_observations_and_infos_follow_the_windows(zoom_scenery):
-    env = ZoomExplore(zoom_scenery, **EVERYTHING)
+    env = ZoomEnv("exploration", zoom_scenery, **EVERYTHING)
     observation, info = env.reset(seed=0)
     lattice = env.gazes.glances.lattice
     assert lattice.levels >= 3
@@ -134,7 +135,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
     Image.fromarray(picture[:900, :1100]).save(tmp_path / "b.png")
     scenery = open_zoom_scenery(tmp_path, passes=5, targets=["cat", "person"], cache=cache)
     assert not scenery.annotated
-    env = ZoomSearch(scenery)
+    env = ZoomEnv("search", scenery)
     for seed in range(3):
         env.reset(seed=seed)
         env.action_space.seed(seed)
@@ -145,7 +146,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
         shown = [float(glance.show[env.gazes.episodes[0].target - 1]) for glance in env.gazes.looking.glances]
         assert max(shown[:-1], default=0) < 0.3
         assert terminated == (shown[-1] >= 0.3)
-    explore = ZoomExplore(scenery)
+    explore = ZoomEnv("exploration", scenery)
     _, info = explore.reset(seed=0)
     assert info["result"] == int(info["result"])
 
@@ -156,14 +157,14 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
     assert infos["action_mask"].shape == (2, scenery.windows)
 
     with pytest.raises(InputError, match="targets: expected classes to search for"):
-        ZoomSearch(open_zoom_scenery(tmp_path, cache=cache)).reset(seed=0)
+        ZoomEnv("search", open_zoom_scenery(tmp_path, cache=cache)).reset(seed=0)
 
 
 @pytest.mark.weights
 @pytest.mark.slow
 def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch):
     """A second environment with the same pictures needs no detector for looks that the first has made."""
-    env = ZoomExplore(zoom_scenery)
+    env = ZoomEnv("exploration", zoom_scenery)
     env.reset(seed=0)
     env.close()
     again = open_zoom_scenery(mosaics=1, tiles=(3, 2), passes=6, cache=cache)
@@ -177,7 +178,7 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
 
 
 def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_scenery):
-    env = ZoomSearch(zoom_scenery)
+    env = ZoomEnv("search", zoom_scenery)
     for action in ([0.5, 0.2, 0], np.float32([0.5, 0.2, 0]), np.array([0.5, 0.2, 0]), np.array([0, 0, 1])):
         assert env.action_space.contains(np.asarray(action))
         env.reset(seed=0)

@@ -9,9 +9,11 @@ from eval.head.run import _rests_on
 from semfov import InputError, Panorama, rollout
 from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.choice import Given
-from semfov.head import ExploreGain, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, PerSecond, Scan, SearchGain, Speeds
+from semfov.head.belief import SceneObserver
 from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT
+from semfov.head.views import Views
 
 
 @pytest.fixture

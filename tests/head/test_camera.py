@@ -11,19 +11,12 @@ from examples.pan_tilt import SimulatedCamera
 from semfov import ActivePerception, DataError, Eye, Flat, Foveation, HeadAgent, InputError, Panorama
 from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.policies import Policy
-from semfov.head import (
-    CameraFrame,
-    CameraScene,
-    PanTiltCamera,
-    PerSecond,
-    SearchGain,
-    Speeds,
-    Sphere,
-    Views,
-    open_scene,
-)
+from semfov.head import CameraFrame, PanTiltCamera, PerSecond, SearchGain, Speeds, open_scene
 from semfov.head.belief import SceneObserver
+from semfov.head.camera import CameraScene
 from semfov.head.gain import OUT
+from semfov.head.sphere import Sphere
+from semfov.head.views import Views
 from semfov.paths import HeadPath
 from tests.small import Coloured, rand
 

@@ -6,7 +6,9 @@ import torch
 
 from semfov import Eye, Foveation, HeadAgent
 from semfov.belief.observers import LearnedMap, Target
-from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SearchGain, Speeds
+from semfov.head.belief import SceneObserver
+from semfov.head.views import Views
 from tests.base_tester import BaseTester
 from tests.small import Blobs, detections, evidence, look, mapping, rand
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from semfov.errors import InputError
-from semfov.head import Flat, Panorama, Views
+from semfov.head import Flat, Panorama
+from semfov.head.views import Views
 from semfov.sensor import glimpse, perspective
 
 

@@ -9,7 +9,7 @@ from safetensors.torch import save as save_tensors
 
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, InputError, MapEvidence, TargetEvidence
 from semfov.io.state import without_settings
-from semfov.sensor import Glimpse, LogPolar, MultiScaleFovea, Perspective
+from semfov.sensor import LogPolar, MultiScaleFovea
 from tests.small import Blobs, Coloured, agent
 
 PAIRS = {
@@ -20,8 +20,6 @@ PAIRS = {
     "convention": (lambda convention: Foveation(20.0, convention=convention), "kornia", "opencv"),
     "fovea": (LogPolar, 10.0, 20.0),
     "side": (MultiScaleFovea, 32, 64),
-    "size of glimpses": (Glimpse, (32, 32), (32, 48)),
-    "size of views": (Perspective, (40, 30), (30, 40)),
     "reference": (lambda reference: Eye(Foveation(9.0), Blobs(), reference=reference), 640.0, 64.0),
     "classes of a detector": (lambda names: Coloured(names), ("red", "blue"), ("blue", "red")),
     "a part of an agent": (lambda names: agent(Coloured(names)), ("red", "blue"), ("blue", "red")),

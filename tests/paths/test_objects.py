@@ -9,7 +9,8 @@ import torch
 
 from semfov import Detections, Grid, Objects
 from semfov.decision import CloseUp, Decision
-from semfov.head import Flat, Panorama, Views
+from semfov.head import Flat, Panorama
+from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice

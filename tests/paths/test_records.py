@@ -18,10 +18,12 @@ from semfov import DataError, Detections, DirichletBelief, Grid, InputError, Sca
 from semfov.data.large import open_large
 from semfov.decision import CloseUp, Decision
 from semfov.detection import Objects, Placement
-from semfov.head import Flat, Panorama, Views
+from semfov.head import Flat, Panorama
+from semfov.head.views import Views
 from semfov.io.storage import read, write_file
-from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, Stimulus, WindowMoment, ZoomPath, reduced_copy
+from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, WindowMoment, ZoomPath
 from semfov.paths.endings import FIXATIONS, WINDOWS
+from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice

@@ -13,8 +13,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import Candidates, Detector, Placement
 from semfov.errors import DataError
 from semfov.io.storage import read, write_file
-from semfov.paths import Stimulus
-from semfov.paths.stimulus import LONGEST
+from semfov.paths.stimulus import LONGEST, Stimulus
 from tests.paths.test_records import same
 
 

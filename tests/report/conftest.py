@@ -13,7 +13,8 @@ from eval.search.run import SearchConfig
 from semfov import Detections, Grid, Objects, Scanpath
 from semfov.decision import Decision
 from semfov.paths import ZoomPath
-from semfov.report import write_page, zoom_data
+from semfov.report import write_page
+from semfov.report.zoom import zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, on_lattice

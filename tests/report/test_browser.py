@@ -11,7 +11,9 @@ from itertools import combinations
 
 import pytest
 
-from semfov.report import episode_data, write_page, zoom_data
+from semfov.report import write_page
+from semfov.report.episode import episode_data
+from semfov.report.zoom import zoom_data
 from semfov.viz.style import overlay_colours
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")

@@ -10,8 +10,7 @@ import torch
 
 from semfov import Grid
 from semfov.detection import Placement
-from semfov.paths import Stimulus
-from semfov.paths.stimulus import in_bytes
+from semfov.paths.stimulus import Stimulus, in_bytes
 from semfov.report import notebook
 from tests import small
 from tests.report.pages import data_of

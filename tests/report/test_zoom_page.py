@@ -12,8 +12,9 @@ from PIL import Image
 
 from semfov import InputError, Objects
 from semfov.decision import CloseUp, Decision
-from semfov.report import episode_data, page_html, zoom_data
-from semfov.report.zoom import _MOST_DETECTIONS
+from semfov.report import page_html
+from semfov.report.episode import episode_data
+from semfov.report.zoom import _MOST_DETECTIONS, zoom_data
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from torch.nn import functional as F
 
 from semfov.errors import InputError
-from semfov.sensor.glimpse import Glimpse, glimpse, window_around, windows_at
+from semfov.sensor.glimpse import glimpse, window_around, windows_at
 from semfov.zoom.lattice import _ladder
 
 
@@ -85,8 +85,11 @@ def test_gradients_in_image_position_and_magnification():
     image = picture(12, 14, 1).requires_grad_()
     points = torch.tensor([[[5.13, 4.37], [8.71, 6.29]]], dtype=torch.float64, requires_grad=True)
     magnification = torch.tensor([[0.73, 1.61]], dtype=torch.float64, requires_grad=True)
-    sensor = Glimpse((6, 5), fill_value=0.3)
-    assert torch.autograd.gradcheck(sensor, (image, points, magnification))
+
+    def look(image, points, magnification):
+        return glimpse(image, windows_at(points, magnification, (6, 5)), (6, 5), fill_value=0.3)
+
+    assert torch.autograd.gradcheck(look, (image, points, magnification))
 
 
 def test_windows_and_ladder_of_magnifications():

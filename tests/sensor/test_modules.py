@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.errors import InputError
-from semfov.sensor import Foveation, Glimpse, LogPolar, MultiScaleFovea, Perspective, RandomFoveation
+from semfov.sensor import Foveation, LogPolar, MultiScaleFovea, RandomFoveation
 from tests.base_tester import GraphTester, TensorTester
 from tests.small import close, draw, rand
 
@@ -85,27 +85,6 @@ def test_bad_input(sensor, prepare):
     ):
         with pytest.raises(InputError, match=message):
             sensor(*arguments)
-
-
-class TestPerspective(TensorTester):
-    batched = (0, 1)
-
-    def make(self):
-        return Perspective((20, 16))
-
-    def inputs(self):
-        poses = torch.tensor([[30.0, 10.0, 60.0], [170.0, -80.0, 90.0]])
-        return rand(2, 3, 32, 64), poses[:, None]
-
-
-class TestGlimpse(TensorTester):
-    batched = (0, 1, 2)
-
-    def make(self):
-        return Glimpse((32, 24))
-
-    def inputs(self):
-        return rand(2, 3, 48, 64), GAZES[:, None], torch.tensor([[0.5], [1.0]])
 
 
 class TestRandomFoveation(TensorTester):

@@ -14,8 +14,8 @@ from semfov.cli.main import main as command
 from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.sensor import SENSORS, LogPolar, NamedSensor, Sensor, named_sensor, sensor_of
-from semfov.sensor.named import SensorName
+from semfov.sensor import SENSORS, LogPolar, Sensor, named_sensor, sensor_of
+from semfov.sensor.named import NamedSensor, SensorName
 from tests.colours import write_home
 from tests.small import once, run_settings
 from train.fit_fom import main as fit_fom

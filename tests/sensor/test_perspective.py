@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
 from semfov.errors import InputError
-from semfov.sensor.perspective import Perspective, even_rows, perspective
+from semfov.sensor.perspective import even_rows, perspective
 from semfov.sensor.sphere import Camera, panorama_directions
 
 
@@ -106,10 +106,10 @@ def test_rows_are_averaged_as_by_a_brute_force():
             torch.testing.assert_close(found[:, row, column], mean, atol=1e-3, rtol=0)
 
 
-def test_the_module_accepts_several_views_and_panoramas_of_even_width():
+def test_several_views_of_panoramas_of_even_width():
     panorama = torch.rand(2, 3, 16, 32)
     poses = torch.tensor([[0.0, 0, 60], [90, 30, 40]]).expand(2, 2, 3)
-    views = Perspective((8, 6))(panorama, poses)
+    views = perspective(panorama, poses, (8, 6))
     assert views.shape == (2, 2, 3, 6, 8)
     torch.testing.assert_close(views[1, 1], perspective(panorama[1:], poses[1:, 1], (8, 6))[0])
     with pytest.raises(InputError, match="panorama: expected an even number of columns"):

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from semfov.errors import InputError
-from semfov.sensor import Glimpse, Perspective, glimpse, perspective
+from semfov.sensor import glimpse, perspective
+from semfov.sensor.glimpse import windows_at
 from tests.small import rand
 
 # Inside, larger than the picture, partly outside, far outside, small and enlarged, and with edges between pixels.
@@ -30,14 +31,24 @@ def test_glimpses_do_not_depend_on_the_way_they_are_computed(padding):
         torch.testing.assert_close(slope, expected, atol=2e-3, rtol=1e-3)
 
 
+class Glimpses(torch.nn.Module):
+    def forward(self, image, points, magnification):
+        return glimpse(image, windows_at(points, magnification, (16, 12)), (16, 12))
+
+
+class Views(torch.nn.Module):
+    def forward(self, panorama, pose):
+        return perspective(panorama, pose, (12, 8), antialias=False)
+
+
 def test_an_exported_sensor_takes_other_points():
-    sensor = Glimpse((16, 12))
+    sensor = Glimpses()
     image, points, magnification = rand(1, 3, 30, 40), torch.tensor([[[20.0, 15.0]]]), torch.tensor([[0.5]])
     graph = torch.export.export(sensor, (image, points, magnification)).module()
     for at, by in ((points, magnification), (torch.tensor([[[3.0, 29.0]]]), torch.tensor([[1.7]]))):
         torch.testing.assert_close(graph(image, at, by), sensor(image, at, by), atol=2e-6, rtol=0)
     panorama, pose = rand(1, 3, 16, 32), torch.tensor([[[30.0, 10.0, 60.0]]])
-    views = Perspective((12, 8), antialias=False)
+    views = Views()
     graph = torch.export.export(views, (panorama, pose)).module()
     other = torch.tensor([[[-170.0, 40.0, 90.0]]])
     torch.testing.assert_close(graph(panorama, other), views(panorama, other))
@@ -46,8 +57,8 @@ def test_an_exported_sensor_takes_other_points():
 def test_shapes_are_known_without_values():
     image, panorama = torch.empty(2, 3, 30, 40, device="meta"), torch.empty(2, 3, 16, 32, device="meta")
     points, by = torch.empty(2, 5, 2, device="meta"), torch.empty(2, 5, device="meta")
-    assert Glimpse((16, 12))(image, points, by).shape == (2, 5, 3, 12, 16)
-    assert Perspective((12, 8), antialias=False)(panorama, torch.empty(2, 3, device="meta")).shape == (2, 3, 8, 12)
+    assert Glimpses()(image, points, by).shape == (2, 5, 3, 12, 16)
+    assert Views()(panorama, torch.empty(2, 3, device="meta")).shape == (2, 3, 8, 12)
 
 
 def test_views_in_vmap():

@@ -17,13 +17,12 @@ from semfov.viz import (
     plot_belief,
     plot_belief_bars,
     plot_belief_strip,
-    plot_cumulative_performance,
+    plot_curves,
     plot_episode,
     plot_fixation,
     plot_foveated_strip,
     plot_reliability,
     plot_scanpath,
-    plot_success_rate,
 )
 
 
@@ -42,7 +41,7 @@ def draw(figure):
 
 def test_plot_shows_curves_and_error_bands():
     curves = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
-    figure = draw(plot_cumulative_performance(curves, {"random": np.full(31, 0.02)}))
+    figure = draw(plot_curves(curves, {"random": np.full(31, 0.02)}, label="found (%)"))
     axes = figure.axes[0]
     assert [line.get_label() for line in axes.lines] == list(curves)
     np.testing.assert_allclose(axes.lines[1].get_ydata(), 100 * curves["predictive"])
@@ -51,7 +50,7 @@ def test_plot_shows_curves_and_error_bands():
 
 def test_the_legend_names_all_of_few_curves_and_the_highest_of_many():
     curves = {"random": np.zeros(21)} | {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
-    (axes,) = draw(plot_success_rate(curves, title="exploration")).axes
+    (axes,) = draw(plot_curves(curves, label="right (%)", title="exploration")).axes
     named = [text.get_text() for text in axes.get_legend().get_texts()]
     assert named == ["random", *(f"policy {number}" for number in range(10, 16)), "10 others"]
     shown = {line.get_label(): (line.get_color(), line.get_linestyle()) for line in axes.lines}
@@ -60,7 +59,7 @@ def test_the_legend_names_all_of_few_curves_and_the_highest_of_many():
     assert [entry.get_color() for entry in axes.get_legend().legend_handles] == [shown[name][0] for name in named]
     for count in [1, 7]:
         curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(count)}
-        (axes,) = draw(plot_success_rate(curves)).axes
+        (axes,) = draw(plot_curves(curves, label="right (%)")).axes
         assert [text.get_text() for text in axes.get_legend().get_texts()] == list(curves)
         assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == count
 
@@ -102,8 +101,7 @@ def test_belief_is_laid_over_a_grey_photograph(scanpath, image):
 
 def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
     from semfov.detection import Placement
-    from semfov.paths import Stimulus
-    from semfov.paths.stimulus import in_bytes
+    from semfov.paths.stimulus import Stimulus, in_bytes
 
     sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
     placement = Placement((80, 60), (1.0, 1.0), (0, 0))
@@ -220,7 +218,7 @@ def test_figures_do_not_depend_on_matplotlib_settings():
 
     curves = {"random": np.linspace(0, 1, 5)}
     with mpl.rc_context({"font.size": 30, "xtick.labelsize": 40, "axes.titlesize": 50}):
-        axes = draw(plot_cumulative_performance(curves, title="t")).axes[0]
+        axes = draw(plot_curves(curves, label="found (%)", title="t")).axes[0]
         sizes = axes.title.get_size(), axes.xaxis.label.get_size(), axes.get_xticklabels()[0].get_size()
     assert sizes == (9, 9, 8)
 

@@ -24,14 +24,13 @@ def calls(scanpath):
         "plot_belief": ((scanpath,), {"image": image}, "ax"),
         "plot_belief_bars": ((scanpath,), {}, 3),
         "plot_belief_strip": ((scanpath,), {"image": image}, 3),
-        "plot_cumulative_performance": ((CURVES,), {}, "ax"),
+        "plot_curves": ((CURVES,), {"label": "targets found (%)"}, "ax"),
         "plot_episode": ((scanpath, image, views), {}, "figure"),
         "plot_fixation": ((scanpath, 1, image, image), {}, 3),
         "plot_foveated_strip": ((scanpath, views), {}, 3),
         "plot_reliability": (({"one": (torch.cat([p, 1 - p], 1), torch.zeros(500, dtype=torch.long))},), {}, 2),
         "plot_scanpath": ((scanpath, image), {}, "ax"),
         "plot_semantic_map": ((scanpath,), {"image": image}, 2),
-        "plot_success_rate": ((CURVES,), {}, "ax"),
     }
 
 
@@ -86,7 +85,7 @@ def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):
 
 
 def test_an_svg_contains_its_text_as_outlines(scanpath, tmp_path):
-    figure = viz.plot_cumulative_performance(CURVES)
+    figure = viz.plot_curves(CURVES, label="targets found (%)")
     root = ET.parse(viz.save_figure(figure, tmp_path / "a.svg")).getroot()
     tags = [element.tag.rpartition("}")[2] for element in root.iter()]
     assert tags.count("path") > 20
@@ -97,7 +96,7 @@ def test_an_svg_contains_its_text_as_outlines(scanpath, tmp_path):
 
 
 def test_a_png_has_the_requested_resolution(tmp_path):
-    figure = viz.plot_cumulative_performance(CURVES)
+    figure = viz.plot_curves(CURVES, label="targets found (%)")
     with Image.open(viz.save_figure(figure, tmp_path / "a.png", dpi=50)) as picture:
         assert picture.size == (310, 200)
 
@@ -106,10 +105,10 @@ def test_a_failed_write_leaves_existing_files_unchanged(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(b"before")
     with pytest.raises(ValueError, match="nonsense"):
-        viz.save_figure(viz.plot_cumulative_performance(CURVES), path.with_suffix(".nonsense"))
+        viz.save_figure(viz.plot_curves(CURVES, label="targets found (%)"), path.with_suffix(".nonsense"))
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(DataError, match="cannot write"):
-        viz.save_figure(viz.plot_cumulative_performance(CURVES), tmp_path / "file" / "a.png")
+        viz.save_figure(viz.plot_curves(CURVES, label="targets found (%)"), tmp_path / "file" / "a.png")
     assert {file.name for file in tmp_path.iterdir()} == {"a.png", "file"}
     assert path.read_bytes() == b"before"
 

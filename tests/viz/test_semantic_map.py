@@ -11,8 +11,8 @@ import torch
 
 from semfov import Grid
 from semfov.cli.text import _regions_lines
-from semfov.viz import cell_entropy, plot_semantic_map
-from semfov.viz.semantic import _regions, borders, named_regions
+from semfov.viz import plot_semantic_map
+from semfov.viz.semantic import _regions, borders, cell_entropy, named_regions
 from tests import small
 
 CLASSES = ("background", "cat", "cup", "dog")

@@ -127,9 +127,11 @@ def people_report(
         write_table(path, searches)
         written.append(path)
     for number, (title, rows) in enumerate(tables.items(), start=1):
-        from semfov.viz import plot_cumulative_performance
+        from semfov.viz import plot_curves
 
-        figure = plot_cumulative_performance({name: each.curve for name, each in rows.items()}, title=title)
+        figure = plot_curves(
+            {name: each.curve for name, each in rows.items()}, title=title, label="targets found (%)", most=102
+        )
         written.append(save_figure(figure, out / f"performance_{number}.png"))
     announce(summary, written)
 
