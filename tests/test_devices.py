@@ -24,7 +24,7 @@ from docs.api import entries
 from semfov.agents.episode import on_cpu
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
-from semfov.episode import Step, StoredLooks, rollout
+from semfov.episode import StoredLooks
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
 from tests import small
@@ -36,11 +36,9 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
 GEOMETRY = "holds the geometry of a scene, which is on the CPU; of a head, the eye alone is on the GPU (`HeadAgent`)"
 LEFT_OUT = {
-    "SceneObserver": GEOMETRY,
     "SearchGain": GEOMETRY,
     "ExploreGain": GEOMETRY,
     "PerSecond": GEOMETRY,
-    "Scan": GEOMETRY,
     "fit_discriminative": "needs gradients, for which PyTorch asks the GPU's driver",
     "AreaUnderRoc": "is moved by torchmetrics",
     "Reliability": "is moved by torchmetrics",
@@ -48,7 +46,7 @@ LEFT_OUT = {
 }
 """Public modules and functions that are not run on the pretended GPU, and why."""
 
-ON_CPU = {"cell_entropy", "class_posterior", "merge_boxes", "open_scene", "reduced_copy"}
+ON_CPU = {"merge_boxes", "open_scene"}
 """Functions whose results are on the CPU: of records and of scenes."""
 
 
@@ -134,16 +132,6 @@ class OnGpu:
         return result
 
 
-class Steps:
-    """The steps of an episode, which begins when they are asked for."""
-
-    def __init__(self, *episode: Any) -> None:
-        self.episode = episode
-
-    def __iter__(self) -> Iterator[Step]:
-        return rollout(*self.episode, most=3)
-
-
 def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
     """Arguments and options of functions that have no example with tensors that runs."""
     path = small.scanpath(small.GRID, torch.tensor([0, 6, 11]), target=2)
@@ -155,10 +143,8 @@ def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
         "animate": ((path, folder / "film.gif"), {"image": image, "views": [image] * 3}),
         "as_image": ((image,), {}),
         "compare_scanpath": ((path, [person, person]), {}),
-        "episode_data": ((path, image, [image] * 3), {"name": "a.jpg"}),
         "merge_boxes": ((torch.tensor([[4.0, 4, 9, 9]]), torch.rand(1), torch.ones(1, dtype=torch.long)), {}),
         "rollout": (episode, {"most": 3}),
-        "trace": ((Steps(*episode), small.GRID, ("background", "cat", "cup"), 1, None), {}),
     }
 
 

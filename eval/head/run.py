@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from eval.head.scan import Scan
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
@@ -23,7 +24,7 @@ from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around
-from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, Scan, SearchGain
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Boxes, Flat, Panorama
 from semfov.head.speeds import Speeds

@@ -127,16 +127,6 @@ class FoveaAgent:
         return replace(episode.run(), target=None, targets=targets)
 
 
-def _first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
-    """The first cell of an episode, and the generator that breaks its ties."""
-    check_whole(seed, "seed", 0, 2**63 - 1)
-    generator = torch.Generator().manual_seed(int(seed))
-    if start is None:
-        return int(torch.randint(cells, (1,), generator=generator)), generator
-    check_whole(start, "start", 0, cells - 1)
-    return int(start), generator
-
-
 class FoveaEpisode(Episode[Scanpath]):
     r"""Looks of a fovea, with one gaze shift or one closer look for each pass of the detector.
 
@@ -196,7 +186,12 @@ class FoveaEpisode(Episode[Scanpath]):
             start, shifts = cells[0], len(cells) - 1
         self._cells = None if cells is None else torch.tensor([[*cells]])
         self._most = sys.maxsize if shifts is None else shifts + 1
-        self._first = _first_cell(cell_at(start, agent.cells), seed, columns * rows)
+        check_whole(seed, "seed", 0, 2**63 - 1)
+        self._generator, first = torch.Generator().manual_seed(int(seed)), cell_at(start, agent.cells)
+        if first is None:
+            first = int(torch.randint(columns * rows, (1,), generator=self._generator))
+        check_whole(first, "start", 0, columns * rows - 1)
+        self._start = int(first)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None
         self._outcome, self._faded, self._frame = 0, 0.0, 0.0
@@ -205,14 +200,13 @@ class FoveaEpisode(Episode[Scanpath]):
     def open(self, image: Tensor) -> Grid:
         """Begin with a picture, or with the first frame of a stream."""
         self._image, grid = image, Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
-        start, generator = self._first
         self._looks = LiveLooks(self.eye, self.eye.open(image), grid, self.target, device=torch.device("cpu"))
-        first, viewed = torch.tensor([start]), self.viewed
-        choice: Choice = Greedy(drawn_by(generator, len(grid), self._looks.like))
+        first, viewed = torch.tensor([self._start]), self.viewed
+        choice: Choice = Greedy(drawn_by(self._generator, len(grid), self._looks.like))
         if self._cells is not None:
             choice = Given(self._cells)
         elif viewed is not None:
-            choice = Viewer(viewed.model, viewed.terms, grid, first, generator)
+            choice = Viewer(viewed.model, viewed.terms, grid, first, self._generator)
         self._steps: Iterator[Step] = rollout(
             self._looks,
             self.strategy.observer,

@@ -217,7 +217,12 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
     """`fuse` without checks, for likelihoods from `scale_covering`."""
     update, covered, soft = RULES[rule], footprint > 0, footprint.is_floating_point()
     if not values_known(beta, scaled, footprint):
-        return _fuse_one_by_one(beta, scaled, footprint, update)
+        for number in range(scaled.shape[1]):
+            likelihood, covers = scaled[:, number, None], footprint[:, number, :, None]
+            if soft:
+                likelihood = likelihood.pow(covers.to(scaled))
+            beta = torch.where(covers > 0, update(beta, likelihood), beta)
+        return beta.clone()
     batch, cells, components = beta.shape
     image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
@@ -240,13 +245,3 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
 def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
     """Likelihoods of the detections that cover a cell, scaled; those of the others, such as padding, become 1."""
     return scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))
-
-
-def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: _Rule) -> Tensor:
-    """`fuse` as one graph, given scaled likelihoods."""
-    for number in range(evidence.shape[1]):
-        likelihood, covers = evidence[:, number, None], footprint[:, number, :, None]
-        if covers.is_floating_point():
-            likelihood = likelihood.pow(covers.to(evidence))
-        beta = torch.where(covers > 0, update(beta, likelihood), beta)
-    return beta.clone()

@@ -47,23 +47,20 @@ class _SceneLooks(Looks):
     def enter(self, episodes: Tensor, scenes: Sequence[int], targets: Tensor | None) -> None:
         """Move episodes to other scenes; episodes `(n,)`, targets `(n,)`."""
         for scene in scenes:
-            if scene not in self._scenes:
-                self._add(scene)
+            if scene in self._scenes:
+                continue
+            stored = self._open(scene)
+            if not self._scenes:
+                self.grid, self.like = stored.grid, stored.like
+            before = sum(each.rows(self._observer) for each in self._scenes.values())
+            self._starts[scene] = before, len(self._scenes) * len(self.grid)
+            self._scenes[scene], self._table, self._every_look = stored, None, None
         rows = []
         for number, scene in enumerate(scenes):
             target = None if targets is None else targets[number]
             rows.append(self._starts[scene][0] + int(self._scenes[scene].first_row(self._observer, target)))
         self._row[episodes] = torch.tensor(rows)
         self._place[episodes] = torch.tensor([self._starts[scene][1] for scene in scenes])
-
-    def _add(self, scene: int) -> None:
-        stored = self._open(scene)
-        if not self._scenes:
-            self.grid, self.like = stored.grid, stored.like
-        places = len(self._scenes) * len(self.grid)
-        rows = sum(each.rows(self._observer) for each in self._scenes.values())
-        self._scenes[scene], self._starts[scene] = stored, (rows, places)
-        self._table = self._every_look = None
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Read the looks at the cells from the table; the fixations are the centres of the cells."""

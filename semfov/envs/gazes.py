@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
 from semfov.envs.scenery import Scenery
 from semfov.envs.zoom_scenery import ZoomScenery
 from semfov.errors import check, check_number, check_whole
@@ -123,7 +122,15 @@ class Gazes(ABC):
             "scene": np.array([self.episodes[row].scene for row in rows.tolist()]),
         }
         if detections:
-            entries["detections"] = _detection_arrays(self.detections(rows), self.scenery.eye.detector)
+            # Padded to the largest number that the detector gives: Gymnasium requires infos of constant shape.
+            seen = self.detections(rows)
+            limit, count = max(self.scenery.eye.detector.selection.limit, seen.mask.shape[1]), seen.mask.shape[1]
+            entries["detections"] = {
+                name: np.zeros((len(rows), limit, *each.shape[2:]), bool if name == "mask" else np.float32)
+                for name, each in (("boxes", seen.boxes), ("scores", seen.scores), ("mask", seen.mask))
+            }
+            for name, array in entries["detections"].items():
+                array[:, :count] = getattr(seen, name).numpy()
         return entries
 
     @torch.inference_mode()
@@ -171,19 +178,3 @@ class Gazes(ABC):
     @abstractmethod
     def _view(self, row: int) -> Tensor:
         """The image that the eye sees in a row, `(1, 3, h, w)`."""
-
-
-def _detection_arrays(detections: Detections, detector: Detector) -> Arrays:
-    """Detections as arrays of one shape, padded to the largest number L that the detector gives; → `(n, L, 4)`.
-
-    Gymnasium's own vectorised environments require infos of constant shape.
-    """
-    number, count = detections.mask.shape
-    limit, components = max(detector.selection.limit, count), detections.scores.shape[-1]
-    boxes = np.zeros((number, limit, 4), np.float32)
-    scores = np.zeros((number, limit, components), np.float32)
-    mask = np.zeros((number, limit), bool)
-    boxes[:, :count] = detections.boxes.numpy()
-    scores[:, :count] = detections.scores.numpy()
-    mask[:, :count] = detections.mask.numpy()
-    return {"boxes": boxes, "scores": scores, "mask": mask}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache, partial
@@ -16,7 +17,7 @@ from semfov.belief.grid import check_cells
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scenes
+from semfov.data.scene import Scenes
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, check, check_whole
 from semfov.gaze.acquisition.base import Task
@@ -53,6 +54,11 @@ class Scenery:
         policy: name of the policy in tables.
         observer: turns looks into belief.
         shape: number of rows and columns of the cells.
+        classes: names of the classes, background first.
+        shifts: largest number of gaze shifts of an episode.
+        pixels: number of pixels that the detector takes in for a look.
+        episodes: all episodes of a scene, which `GazeEnv.reset` takes as an option.
+        annotation, grid, answers: of a scene: its objects, its cells, and their correct classes `(X·Y, K+1)`.
         count: number of scenes.
         scenes: indices of the scenes that may have episodes.
     """
@@ -64,15 +70,17 @@ class Scenery:
         self._looking, self._data, self.count = looking, looking.scenes, len(looking.scenes)
         self.policy = next(iter(looking.policies))
         belief, self.protocol = looking.config.belief, looking.config.protocol
-        self.eye, self.shape = looking.eye, (belief.rows, belief.columns)
+        self.eye, self.shape, self.shifts = looking.eye, (belief.rows, belief.columns), self.protocol.shifts
+        self.classes, self.annotation = ("background", *self._data.classes), self._data.annotation
+        self.pixels = math.prod(self.eye.detector.input_size)
         self.observer: Observer = looking.strategies[self.policy].observer
         names = self.classes[1:]
         self._targets = None if targets is None else {class_index(target, names, "targets") for target in targets}
         self.scenes = [scene for scene in range(self.count) if self._targets_of(scene)]
         # Results are kept for as long as an environment uses this scenery.
-        self._listed = cache(self._list)
+        self.episodes = cache(self._list)
         self.grid = cache(looking.grid)
-        self.answers = cache(self._answers)
+        self.answers = cache(lambda scene: answers_of(self.annotation(scene), self.grid(scene), len(self.classes)))
         self.open = cache(self._open)
         self.together = cache(self._together)
         self.view = lru_cache(_VIEWS)(lambda scene: self.eye.open(self.image(scene)[None]))
@@ -94,11 +102,8 @@ class Scenery:
         labels: list[int] = self.annotation(scene).labels.tolist()
         return labels
 
-    def episodes(self, scene: int) -> list[Any]:
-        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
-        return self._listed(scene)
-
     def _list(self, scene: int) -> list[Any]:
+        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
         rows, columns = self.shape
         if self._looking.task == "search":
             return list(episodes_of(self._data, scene, columns, rows, self.protocol, self._targets_of(scene)))
@@ -113,22 +118,6 @@ class Scenery:
             if episodes:
                 return episodes[random.integers(len(episodes))]
 
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first."""
-        return ("background", *self._data.classes)
-
-    @property
-    def shifts(self) -> int:
-        """Largest number of gaze shifts of an episode."""
-        return self.protocol.shifts
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels that the detector takes in for a look."""
-        wide, high = self.eye.detector.input_size
-        return wide * high
-
     def _together(self) -> Observer:
         """The observer that computes all episodes of a batch at once: faster, but its rounding depends on the batch."""
         if not isinstance(self.observer, Target | LearnedMap):
@@ -140,14 +129,6 @@ class Scenery:
         cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
-
-    def _answers(self, scene: int) -> Tensor:
-        """Correct classes of each cell of a scene, `(X·Y, K+1)`."""
-        return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
-
-    def annotation(self, scene: int) -> Annotation:
-        """Objects of a scene."""
-        return self._data.annotation(scene)
 
     def image(self, scene: int) -> Tensor:
         """Pixels of a scene, `(3, H, W)`."""

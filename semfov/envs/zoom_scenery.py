@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -35,6 +36,9 @@ class ZoomScenery:
         evidence: learned evidence by magnification.
         shifts: largest number of looks of an episode after the first one.
         annotated: whether the objects in the pictures are annotated.
+        classes: names of the classes, background first.
+        pixels: number of pixels that the detector takes in for a look.
+        episodes: targets of all searches of a picture.
     """
 
     opened: partial[Any] | None = None
@@ -42,27 +46,17 @@ class ZoomScenery:
     def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
         self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
         self.annotated = not isinstance(self.pictures, Pictures)
-        names = self.eye.detector.classes
+        names, self.pixels = self.eye.detector.classes, math.prod(self.eye.detector.input_size)
+        self.classes = ("background", *names)
         self._targets = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
         # Looks are kept for as long as an environment uses this scenery.
         self.glances = cache(looking.glances)
-        self._listed = cache(self._list)
+        self.episodes = cache(self._list)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy opens the same pictures again."""
         check(self.opened is not None, "scenery", "one that open_zoom_scenery has opened, to be copied", "another")
         return self.opened, ()
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first."""
-        return ("background", *self.eye.detector.classes)
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels that the detector takes in for a look."""
-        wide, high = self.eye.detector.input_size
-        return wide * high
 
     @cached_property
     def windows(self) -> int:
@@ -82,11 +76,8 @@ class ZoomScenery:
             return self._targets
         return [each for each in self.pictures.targets(scene) if self._targets is None or each in self._targets]
 
-    def episodes(self, scene: int) -> list[int]:
-        """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
-        return self._listed(scene)
-
     def _list(self, scene: int) -> list[int]:
+        """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
         glances = self.glances(scene)
         first = glances.see([overview(glances.lattice)])[0]
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]

@@ -108,10 +108,6 @@ class Policy(nn.Module):
                 raise InputError(f"policy {self.name!r}: expected {needed}, got none")
         return self.function(**arguments)
 
-    def extra_repr(self) -> str:
-        """The name."""
-        return self.name
-
 
 def policy_names(task: Task) -> list[str]:
     """Names of the acquisition functions for a task, in the order of registration.

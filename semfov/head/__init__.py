@@ -1,7 +1,7 @@
 """A head that turns: scenes larger than the eye's field of view, seen through one window at a time."""
 
 from semfov.head.camera import CameraFrame, PanTiltCamera, open_scene
-from semfov.head.gain import ExploreGain, PerSecond, Scan, SearchGain
+from semfov.head.gain import ExploreGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
@@ -14,7 +14,6 @@ __all__ = [
     "Panorama",
     "Panoramas",
     "PerSecond",
-    "Scan",
     "SearchGain",
     "Speeds",
     "open_scene",

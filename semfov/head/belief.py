@@ -101,8 +101,10 @@ class SceneObserver(Observer):
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
         """Evidence of a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
-        pose, point = self.views.action_of(fixation[0])
-        inner = self.inner.weigh(detections, point[None], self.views.view_grid, target)
+        high = self.views.world.size[1]
+        pose = int((float(fixation[0, 1]) + 0.5) // high)
+        point = fixation - fixation.new_tensor([0, pose * high])
+        inner = self.inner.weigh(detections, point, self.views.view_grid, target)
         action = self.views.grid.cell_of(fixation)
         return _SceneLook(pose, inner, self.views.gaze_cell[action])
 

@@ -88,17 +88,6 @@ class PanTiltCamera(Protocol):
         """
 
 
-def _check_degrees(pan: tuple[float, float], tilt: tuple[float, float]) -> None:
-    """Raise `InputError` for limits that are so narrow that they are radians, or ONVIF's numbers from -1 to 1."""
-    for name, limits in (("pan", pan), ("tilt", tilt)):
-        check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
-    sides = [abs(float(side)) for side in (*pan, *tilt)]
-    if 0 < max(sides) <= 2 * math.pi:
-        whole = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
-        unit = whole if max(sides) <= 1 else "radians; use math.degrees"
-        raise InputError(f"pan: expected limits in degrees, got {pan} with tilt {tilt}, which look like {unit}")
-
-
 class CameraScene(Sphere):
     """The scene around a camera that turns.
 
@@ -116,7 +105,14 @@ class CameraScene(Sphere):
         remedy = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
         check(not missing, "camera", f"a camera with {', '.join(names)}", remedy)
         fields = check_fields(camera.fields)
-        _check_degrees(camera.pan, camera.tilt)
+        for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
+            check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
+        sides = [abs(float(side)) for side in (*camera.pan, *camera.tilt)]
+        if 0 < max(sides) <= 2 * math.pi:
+            whole = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
+            unit = whole if max(sides) <= 1 else "radians; use math.degrees"
+            got = f"{camera.pan} with tilt {camera.tilt}, which look like {unit}"
+            raise InputError(f"pan: expected limits in degrees, got {got}")
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2),

@@ -12,7 +12,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers.base import own
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
-from semfov.head.speeds import Speeds
+from semfov.head.speeds import STILL, Speeds
 from semfov.head.views import CELL_POINTS, Views
 
 FORESIGHT = 0.5
@@ -175,45 +175,6 @@ class PerSecond(AcquisitionFunction):
         if self.speeds is not None:
             values = values / views.durations(self.action, self.speeds)
             here = views.poses[self.action // views.cells]
-            allowed &= self.speeds.worthwhile(views.world.turn(here.expand_as(views.poses), views.poses))
+            turn = views.world.turn(here.expand_as(views.poses), views.poses)
+            allowed &= (turn <= STILL) | (turn >= self.speeds.dead_zone)
         return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]
-
-
-class Scan(AcquisitionFunction):
-    """A head that goes through its poses in a given order, again and again; the eye follows the gain in each view.
-
-    Args:
-        gain: expected gain of a look.
-        order: numbers of poses; with a single one the eye moves alone.
-        dwell: number of looks from each pose.
-        action: the present action (`Views`).
-
-    >>> from semfov.belief.observers import Target
-    >>> from semfov.belief.target_evidence import TargetEvidence
-    >>> from semfov.head import Flat
-    >>> from semfov.head.belief import SceneObserver
-    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
-    >>> scan = Scan(SearchGain(views), order=[2, 0], dwell=1, action=0)
-    >>> int(scan(belief, torch.zeros(1, 900, dtype=torch.bool)).argmax()) // views.cells
-    2
-    """
-
-    def __init__(self, gain: LookGain, order: Sequence[int], dwell: int, action: int) -> None:
-        super().__init__()
-        self.gain, self.order, self.dwell, self.action = gain, order, dwell, action
-
-    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(1, A)`; `OUT` for all poses but the next one."""
-        belief, cells = own(belief, SceneBelief, "belief"), self.gain.views.cells
-        turn = int(belief.looks) // self.dwell
-        for _ in self.order:
-            pose = self.order[turn % len(self.order)]
-            rows = slice(pose * cells, (pose + 1) * cells)
-            if not bool(visited[0, rows].all()):
-                break
-            turn += 1
-        gains = self.gain(belief, self.action // cells, [pose])
-        values = torch.full_like(gains, OUT)
-        values[rows] = gains[rows]
-        return values[None]

@@ -14,8 +14,8 @@ from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
-from semfov.head.sphere import BLANK, Sphere
-from semfov.head.world import FIELDS, World, check_fields
+from semfov.head.sphere import Sphere
+from semfov.head.world import BLANK, FIELDS, World, check_fields
 from semfov.sensor.perspective import even_rows, go_around, sample
 
 _VIEW = (416, 312)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from semfov.errors import check_number
 
-_STILL = 1e-3  # degrees; smaller angles are rounding errors of 0
+STILL = 1e-3  # degrees; smaller angles are rounding errors of 0
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Speeds:
         Returns:
             `(...)`, seconds; 0 where the eye stays.
         """
-        return torch.where(angle > _STILL, self.eye_start + self.eye * angle, 0.0)
+        return torch.where(angle > STILL, self.eye_start + self.eye * angle, 0.0)
 
     def turn(self, angle: Tensor) -> Tensor:
         """Duration of turns of the head.
@@ -74,7 +74,7 @@ class Speeds:
         Returns:
             `(...)`, seconds; 0 where the head stays.
         """
-        angle = torch.where(angle > _STILL, angle, 0.0)
+        angle = torch.where(angle > STILL, angle, 0.0)
         fast = self.head**2 / self.acceleration
         short = 2 * (angle / self.acceleration).sqrt()
         return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
@@ -91,16 +91,5 @@ class Speeds:
             `(...)`, seconds.
         """
         slowest = torch.maximum(self.saccade(eye), self.turn(head))
-        moves = (head > _STILL) | (octaves.abs() > _STILL)
+        moves = (head > STILL) | (octaves.abs() > STILL)
         return self.look + torch.maximum(slowest, self.zoom * octaves.abs()) + self.settle * moves
-
-    def worthwhile(self, head: Tensor) -> Tensor:
-        """Which turns of the head are made: those that are not within the dead zone.
-
-        Args:
-            head: `(...)`, angles in degrees.
-
-        Returns:
-            `(...)` boolean; true also where the head stays.
-        """
-        return (head <= _STILL) | (head >= self.dead_zone)

@@ -6,16 +6,13 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.windowed import LargePicture
-from semfov.errors import InputError, check
+from semfov.errors import check
 from semfov.head.speeds import Speeds
 from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, Regions, panorama_directions, panorama_points
 
 AROUND = (-180.0, 180.0)
 """Limits of pan of a head that turns all the way round."""
-
-BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
 
 
 def _angle_between(one: Tensor, other: Tensor) -> Tensor:
@@ -61,14 +58,6 @@ class Sphere(World):
     def around(self) -> bool:
         """Whether the head turns all the way round."""
         return self.pan[1] - self.pan[0] >= 360
-
-    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Raise an error, because directions alone show nothing."""
-        raise InputError(BLANK)
-
-    def image(self) -> Tensor | LargePicture | None:
-        """Nothing, because directions alone show nothing."""
-        return None
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels at which directions are seen."""

@@ -28,6 +28,7 @@ class Views:
         tiling: for each field of view, rows of the numbers of poses whose views tile the scene.
         grid: the strip.
         view_grid: the cells of one view.
+        cells: number of cells of a view.
         gaze: `(A, D)`, point of the scene that each action fixates.
         gaze_cell: `(A,)`, cell of the scene that contains this point.
         visible: for each pose, `(V,)`, the cells of the scene that its view shows.
@@ -48,7 +49,7 @@ class Views:
             self.tiling.append([row[::2] for row in numbers[::2]])
         self.poses = torch.stack(poses)
         wide, high = world.size
-        self.view_grid = Grid(CELL_POINTS, CELL_POINTS, (wide, high))
+        self.view_grid, self.cells = Grid(CELL_POINTS, CELL_POINTS, (wide, high)), CELL_POINTS**2
         self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.cell_of(self.gaze)
@@ -62,11 +63,6 @@ class Views:
     def __len__(self) -> int:
         """Number of poses."""
         return len(self.poses)
-
-    @property
-    def cells(self) -> int:
-        """Number of cells of a view."""
-        return len(self.view_grid)
 
     @cached_property
     def ahead(self) -> int:
@@ -83,14 +79,10 @@ class Views:
         reachable[torch.cat(self.visible)] = True
         return reachable
 
-    def places(self, pose: int) -> Tensor:
-        """Positions in a view of the scene's cells that it shows, as coordinates for `grid_sample`, `(V, 2)`."""
-        return 2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1
-
     def spread(self, values: Tensor, pose: int) -> Tensor:
         """Interpolate values `(C, cells)` of a view's cells at the scene's cells that it shows, `(C, V)`."""
         image = values.unflatten(-1, (CELL_POINTS, CELL_POINTS))[None]
-        place = self.places(pose)[None, None].to(values)
+        place = (2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
     @cached_property
@@ -111,12 +103,6 @@ class Views:
     def acuity(self, distance: Tensor) -> Tensor:
         """Relative acuity of the fovea, 1 / (1 + d / σ), at distances d `(...)`; 0 for cells that were never seen."""
         return 1 / (1 + distance / self.fovea)
-
-    def action_of(self, point: Tensor) -> tuple[int, Tensor]:
-        """Number of the pose and pixel `(2,)` of its view, of a point of the strip."""
-        high = self.world.size[1]
-        pose = int((float(point[1]) + 0.5) // high)
-        return pose, point - point.new_tensor([0, pose * high])
 
     @cached_property
     def _shifts(self) -> list[Tensor]:

@@ -9,12 +9,14 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.windowed import LargePicture
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.io.schema import is_number
 
 FIELDS = (60.0,)
 """Default fields of view in degrees."""
+
+BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
 
 
 class Places(Protocol):
@@ -66,9 +68,9 @@ class World(ABC):
     closed: bool = False
     still: bool = True
 
-    @abstractmethod
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """The picture from a pose `(3,)`, `(3, h, w)` in [0, 1], and the pose where it was taken."""
+        raise InputError(BLANK)
 
     def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
         """The view `(3, h, w)` in a direction, pan to the right and tilt up in degrees, of a field of view across."""
@@ -114,6 +116,6 @@ class World(ABC):
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
         """Smallest boxes `(M, 4)` of the scene's picture around those of a view; a seam does not cut them."""
 
-    @abstractmethod
     def image(self) -> Tensor | LargePicture | None:
         """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""
+        return None

@@ -282,7 +282,14 @@ class HeadPath(GazeRecord):
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        views = Views(_world(record["world"]), record["fields"], fovea=record["fovea"])
+        settings = record["world"]
+        made, names = _WORLDS[settings["kind"]]
+        for name in names:
+            check(name in settings, f"world.{name}", "a value", "nothing")
+        given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+        options: dict[str, Any] = {name: given[name] for name in names[2:]}
+        world = made(given["picture"], given["size"], **options)
+        views = Views(world, record["fields"], fovea=record["fovea"])
         actions, cells = tensors["actions"], len(views.world.scene)
         check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
         maps, decision = tensors["maps"], shared["decision"]
@@ -302,13 +309,3 @@ def _settings(world: World) -> dict[str, Any]:
             return {"kind": kind, **{name: getattr(world, name) for name in names}}
     expected = "a scene that files can describe, Panorama, Flat or that of a camera"
     raise InputError(f"views: expected {expected}, got {type(world).__name__}")
-
-
-def _world(settings: Mapping[str, Any]) -> World:
-    """A scene with this geometry, without its picture."""
-    made, names = _WORLDS[settings["kind"]]
-    for name in names:
-        check(name in settings, f"world.{name}", "a value", "nothing")
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-    options: dict[str, Any] = {name: values[name] for name in names[2:]}
-    return made(values["picture"], values["size"], **options)

@@ -32,9 +32,14 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
     head = "" if headed else f'<noscript><dl class="facts">{facts}</dl></noscript>'
     looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
     what = "view" if data["turns"] else "window"
+    names = " checked" if data["count"] <= _NAMED else ""
+    switches = (
+        f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {what.title()}s</label> '
+        f'<label><input type="checkbox" class="names-shown"{names}> Names</label></span>'
+    )
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
-        f'<div class="panes"><figure class="overview"><figcaption>{_legend(data)}{_switches(data)}</figcaption>'
+        f'<div class="panes"><figure class="overview"><figcaption>{_legend(data)}{switches}</figcaption>'
         f'{_picture(data, place)}</figure><section class="found-objects" aria-labelledby="{place}-objects">'
         f'<h4 id="{place}-objects">Objects</h4>{_objects(data, place)}</section></div>'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
@@ -55,16 +60,6 @@ def _legend(data: Data) -> str:
     if data["truth"]:
         swatches.append('<li><i class="of-truth"></i> true box</li>')
     return f'<ul class="key">{"".join(swatches)}</ul>'
-
-
-def _switches(data: Data) -> str:
-    """Boxes to tick: whether windows and names are drawn."""
-    names = " checked" if data["count"] <= _NAMED else ""
-    what = "Views" if data["turns"] else "Windows"
-    return (
-        f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {what}</label> '
-        f'<label><input type="checkbox" class="names-shown"{names}> Names</label></span>'
-    )
 
 
 def _picture(data: Data, place: str) -> str:

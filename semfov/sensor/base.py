@@ -29,6 +29,7 @@ class Sensor(StatedModule, ABC):
     Attributes:
         kind: kind of sensor, which `settings` lists as `kind` (of all but `Foveation`).
         names: names of the settings, each of them an argument of the class.
+        crops: number of views of a fixation, each of which the detector sees as a picture of its own.
 
     >>> class Half(Sensor):
     ...     def open(self, canvas, scale):
@@ -47,6 +48,7 @@ class Sensor(StatedModule, ABC):
 
     kind: ClassVar[str] = "sensor"
     names: ClassVar[tuple[str, ...]] = ()
+    crops: int = 1
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,11 +85,6 @@ class Sensor(StatedModule, ABC):
             Views `(F, 3, h, w)` for the detector; `(F·L, 3, h, w)` of a sensor with L crops, those of a fixation
             together, the finest first.
         """
-
-    @property
-    def crops(self) -> int:
-        """Number of views of a fixation, each of which the detector sees as a picture of its own."""
-        return 1
 
     def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int] | None:
         """Tell the size of the canvas that the sensor takes.

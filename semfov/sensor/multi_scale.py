@@ -55,12 +55,8 @@ class MultiScaleFovea(Sensor):
         for name, value, most in (("side", side, 4096), ("scales", scales, 16)):
             whole = int(value) if float(value).is_integer() else value
             check_whole(whole, name, 1, most)
-        self.side, self.scales = int(side), int(scales)
-
-    @property
-    def crops(self) -> int:
-        """Number of pictures that the detector sees in a look, L."""
-        return self.scales
+        self.side = int(side)
+        self.scales = self.crops = int(scales)
 
     def means(self, image: Tensor) -> _Planes:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.

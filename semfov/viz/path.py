@@ -64,12 +64,9 @@ def _free(region: LabelBox, numbers: list[tuple[float, float]], room: float) -> 
     x1, y1, x2, y2 = region
     left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
     places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
-
-    def far(place: tuple[float, float]) -> float:
-        # Distances beyond the width of a number count the same, so that the first free corner is taken.
-        return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in numbers)])
-
-    return max(places, key=far)
+    # Distances beyond the width of a number count the same, so that the first free corner is taken.
+    far = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in numbers)]) for u, v in places]
+    return places[far.index(max(far))]
 
 
 class GazePath:

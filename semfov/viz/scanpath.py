@@ -36,20 +36,6 @@ _MOST_BOXES = 6
 """Largest number of detections of a look that are drawn."""
 
 
-def _object_entries(record: Record) -> list[LegendEntry]:
-    """Entries of a legend for the objects of a record, and for its closer looks that confirmed none."""
-    sure = record.confirmed
-    name = record.target_name or "objects"
-    count, others = int(sure.sum()), int((~sure).sum())
-    entries = [(FOUND, "-", f"confirmed: {name} ({count})")] if count else []
-    if others:
-        rest = "not confirmed: " if count or record.decision is not None else ""
-        entries.append((TARGET, "-", f"{rest}{name} from {record.threshold_in_words} ({others})"))
-    if record.refuted:
-        entries.append((FOUND, ":", "not confirmed by a closer look"))
-    return entries
-
-
 @styled
 def plot_scanpath(
     scanpath: Record | Fixations,
@@ -101,7 +87,15 @@ def plot_scanpath(
     draw_place(axes, scanpath, image, boxes)
     axes.set_title(scanpath.describe(), parse_math=False)
     outlined = any(scanpath.outline(look) is not None for look in scanpath)
-    entries = [*annotation_entries(scanpath, boxes), *(_object_entries(scanpath) if objects else [])]
+    entries, sure = annotation_entries(scanpath, boxes), scanpath.confirmed
+    name, count, others = scanpath.target_name or "objects", int(sure.sum()), int((~sure).sum())
+    if objects and count:
+        entries.append((FOUND, "-", f"confirmed: {name} ({count})"))
+    if objects and others:
+        rest = "not confirmed: " if count or scanpath.decision is not None else ""
+        entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
+    if objects and scanpath.refuted:
+        entries.append((FOUND, ":", "not confirmed by a closer look"))
     draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
     lay_out(figure)
     path = LookPath(axes, scanpath)

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from eval.head.run import _rests_on
+from eval.head.scan import Scan
 from semfov import InputError, Panorama, rollout
 from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.choice import Given
-from semfov.head import ExploreGain, PerSecond, Scan, SearchGain, Speeds
+from semfov.head import ExploreGain, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT

@@ -6,7 +6,7 @@ import torch
 
 from semfov import Eye, Foveation, HeadAgent
 from semfov.belief.observers import LearnedMap, Target
-from semfov.head import ExploreGain, Panorama, PerSecond, Scan, SearchGain, Speeds
+from semfov.head import ExploreGain, Panorama, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.views import Views
 from tests.base_tester import BaseTester
@@ -70,11 +70,6 @@ class TestPerSecond(SceneTester):
     def call(module, scores, boxes):
         belief = SceneTester.seen(SceneObserver(Target(evidence()), views()), scores, boxes)
         return module(belief, torch.zeros(1, len(views().grid), dtype=torch.bool))
-
-
-class TestScan(TestPerSecond):
-    def make(self):
-        return Scan(SearchGain(views()), [1, 0], 1, 55)
 
 
 class TestHeadAgent(BaseTester):

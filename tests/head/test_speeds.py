@@ -5,8 +5,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov import TargetEvidence
+from semfov.belief.observers import Target
 from semfov.errors import InputError
-from semfov.head import Speeds
+from semfov.head import Flat, PerSecond, SearchGain, Speeds
+from semfov.head.belief import SceneObserver
+from semfov.head.gain import OUT
+from semfov.head.views import Views
 
 
 @given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
@@ -41,9 +46,14 @@ def test_durations_of_movements_follow_the_main_sequence_and_settling():
 
 
 def test_turns_within_the_dead_zone_are_not_made():
-    angles = torch.tensor([0.0, 1.0, 4.9, 5.0, 90.0])
-    assert Speeds(dead_zone=5.0).worthwhile(angles).tolist() == [True, False, False, True, True]
-    assert Speeds().worthwhile(angles).all()
+    views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    every = range(len(views))
+    for dead_zone in (0.0, 15.0, 25.0):
+        gain = PerSecond(SearchGain(views), Speeds(dead_zone=dead_zone), 55, every)
+        made = (gain(belief, torch.zeros(1, len(views.grid), dtype=torch.bool))[0] > OUT).unflatten(0, (-1, 100)).any(1)
+        turns = (views.poses[:, :2] - views.poses[0, :2]).norm(dim=-1)
+        assert made.tolist() == [turn == 0 or turn >= dead_zone for turn in turns.tolist()]
 
 
 @pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])

@@ -55,10 +55,6 @@ class CloserLook(AcquisitionFunction):
         gain = (self.seen.to(objects) - acuity(closest, self.fovea)[..., None]).clamp(min=0)
         return (gain * unknown[..., None]).sum(-2)
 
-    def extra_repr(self) -> str:
-        """The width of the fovea."""
-        return f"fovea={self.fovea:g}"
-
 
 def acuity(distance: Tensor, fovea: float) -> Tensor:
     """Relative acuity `exp(-max(d / r - 1, 0))` at distances d for a fovea of width r, in one unit."""

@@ -116,10 +116,6 @@ class CorrectLocalisation(_SignalSearch):
         """The integral, computed for one fixation at a time."""
         return torch.stack([_correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
 
-    def extra_repr(self) -> str:
-        """The number of nodes."""
-        return f"nodes={self.nodes}"
-
 
 def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
     """`CorrectLocalisation` for one fixation, from the prior of the place and d' `(..., X·Y)` → `(...)`."""

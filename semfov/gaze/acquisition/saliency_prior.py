@@ -54,7 +54,3 @@ class SaliencyPrior(AcquisitionFunction):
         check_shape(self.log_prior, "saliency", value.shape[-1])
         least = torch.finfo(value.dtype).tiny
         return one_by_one(lambda row: row.clamp(min=least).log(), value) + self.weight * self.log_prior.to(value)
-
-    def extra_repr(self) -> str:
-        """The weight of the saliency."""
-        return f"weight={self.weight:g}"

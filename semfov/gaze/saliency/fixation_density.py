@@ -199,7 +199,11 @@ class FixationDensity(Pretrained):
         Raises:
             InputError: a feature map is missing or has another number of channels, or there is no such term.
         """
-        size = _size_of(features) if size is None else size
+        if size is None:
+            if isinstance(features, FeatureMaps):
+                size = features.placement.size[1], features.placement.size[0]
+            else:
+                size = max((int(each.shape[-2]), int(each.shape[-1])) for each in features.values())
         terms = self.terms(features, size, scanpath)
         for name in without:
             check(name in ("map", "centre bias", "oculomotor biases"), "without", "terms of the model", repr(name))
@@ -408,13 +412,6 @@ def cells_of(size: tuple[int, int]) -> tuple[int, int]:
     """Rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
     return max(1, round(_CELLS * size[0] / longer)), max(1, round(_CELLS * size[1] / longer))
-
-
-def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
-    """`(height, width)` of the pictures, or of the finest of maps that cover them."""
-    if isinstance(features, FeatureMaps):
-        return features.placement.size[1], features.placement.size[0]
-    return max((int(each.shape[-2]), int(each.shape[-1])) for each in features.values())
 
 
 def _placed(

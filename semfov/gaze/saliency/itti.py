@@ -39,8 +39,9 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     return pyramid
 
 
-def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
-    r"""Even and odd Gabor filters without response to a uniform image; → `(2n, 9, 9)`.
+@constant
+def _gabor_kernels(orientations: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    r"""Even and odd Gabor filters without response to a uniform image, as weights of a convolution `(2n, 1, 9, 9)`.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
@@ -55,13 +56,7 @@ def _gabor_kernels(orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
     wave = 2 * pi / _PERIOD * (x * angles.cos()[:, None, None] + y * angles.sin()[:, None, None])
     kernels = torch.stack([wave.cos(), -wave.sin()], 1).flatten(0, 1) * envelope
     kernels = kernels - kernels.mean((-2, -1), keepdim=True)
-    return kernels / kernels.abs().sum((-2, -1), keepdim=True)
-
-
-@constant
-def _filters(orientations: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The Gabor filters as weights of a convolution, `(2n, 1, 9, 9)`."""
-    return _gabor_kernels(orientations).to(device, dtype)[:, None]
+    return (kernels / kernels.abs().sum((-2, -1), keepdim=True)).to(device, dtype)[:, None]
 
 
 def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
@@ -70,16 +65,10 @@ def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIE
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
     check_shape(intensity, "intensity", None, 1, None, None)
-    kernels = _filters(tuple(orientations), intensity.dtype, intensity.device)
+    kernels = _gabor_kernels(tuple(orientations), intensity.dtype, intensity.device)
     reach = _TAPS // 2
     answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels)
     return answers.abs().unflatten(1, (-1, 2)).sum(2)
-
-
-def _across_scales(centre: Tensor, surround: Tensor) -> Tensor:
-    """Difference of two scales, `|centre - surround|`, after bilinear enlargement of the coarser to the finer."""
-    size = (centre.shape[-2], centre.shape[-1])
-    return (centre - F.interpolate(surround, size, mode="bilinear", align_corners=False)).abs()
 
 
 def _promote(maps: Tensor) -> Tensor:
@@ -130,7 +119,9 @@ def _conspicuity(image: Tensor) -> Tensor:
     for centre in _CENTRES:
         here = features[centre - min(_CENTRES)]
         around = [features[centre - min(_CENTRES) + delta] for delta in _DELTAS]
-        maps = _promote(torch.stack([_across_scales(here, surround) for surround in around], 1)).sum(1)
+        size = here.shape[-2], here.shape[-1]
+        wide = [F.interpolate(each, size, mode="bilinear", align_corners=False) for each in around]
+        maps = _promote(torch.stack([(here - surround).abs() for surround in wide], 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
         total = total + _dyadic_pyramid(maps, max(_CENTRES) - centre)[-1]
     intensity, colour, orientation = total.split([1, 2, len(_ORIENTATIONS)], 1)
@@ -193,7 +184,3 @@ class IttiKoch(nn.Module):
             `(B, H, W)`.
         """
         return itti_koch_saliency(as_batch(image), normalise=self.normalise)
-
-    def extra_repr(self) -> str:
-        """Whether maps are normalised."""
-        return f"normalise={self.normalise}"

@@ -61,18 +61,16 @@ def double_opponency(image: Tensor) -> Tensor:
     least = intensity.amax((-2, -1), keepdim=True) / 10
     # So many rows at once that they stay in the processor's cache.
     some = max(1, _PIXELS // max(1, len(image) * image.shape[-1])) if values_known(image) else image.shape[-2]
-    rows = zip(image.split(some, 2), intensity.split(some, 1), strict=True)
-    return torch.cat([_opponencies(part, bright, bright > least) for part, bright in rows], 2)
-
-
-def _opponencies(image: Tensor, intensity: Tensor, visible: Tensor) -> Tensor:
-    """The three channels, given the intensity `(B, H, W)` and where it is large enough."""
-    gain = visible / torch.where(visible, intensity, 1.0)
-    red, green, blue = (image * gain[:, None]).unbind(1)
-    mean = (red + green) / 2
-    reds, greens = F.relu(red - (green + blue) / 2), F.relu(green - (red + blue) / 2)
-    blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
-    return torch.stack([intensity, reds - greens, blues - yellows], 1)
+    parts = []
+    for part, bright in zip(image.split(some, 2), intensity.split(some, 1), strict=True):
+        visible = bright > least
+        gain = visible / torch.where(visible, bright, 1.0)
+        red, green, blue = (part * gain[:, None]).unbind(1)
+        mean = (red + green) / 2
+        reds, greens = F.relu(red - (green + blue) / 2), F.relu(green - (red + blue) / 2)
+        blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
+        parts.append(torch.stack([bright, reds - greens, blues - yellows], 1))
+    return torch.cat(parts, 2)
 
 
 def anchor(channels: Tensor) -> Tensor:

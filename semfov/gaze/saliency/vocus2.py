@@ -62,15 +62,6 @@ def _twin_pyramids(
     return pyramids
 
 
-def _on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
-    """Contrasts of bright on dark and of dark on bright.
-
-    >>> _on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
-    (tensor([0., 2.]), tensor([2., 0.]))
-    """
-    return F.relu(centre - surround), F.relu(surround - centre)
-
-
 _Fusion = Literal["mean", "max"]
 
 
@@ -220,7 +211,8 @@ def _contrasts(twin: _Twin, fusion: _Fusion) -> Tensor:
     if fusion == "mean":
         # One of the two contrasts is 0, so their mean is half the difference. The mean over channels is taken as well.
         return (twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2
-    return torch.cat(_on_off_contrasts(*twin), 1)
+    difference = twin.centre - twin.surround
+    return torch.cat([F.relu(difference), F.relu(-difference)], 1)
 
 
 def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:
