@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from functools import cache
+from math import ceil, floor
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -268,16 +269,18 @@ class FixationDensity(Pretrained):
         for (name, channels), weight in zip(self.layers.items(), weights, strict=True):
             if name not in maps:
                 raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
-            each = maps[name].to(weight)
-            check_shape(each, f"features[{name!r}]", None, channels, None, None)
-            shape = (int(each.shape[-2]), int(each.shape[-1]))
-            value = F.conv2d(each, weight[..., None, None])
+            check_shape(maps[name], f"features[{name!r}]", None, channels, None, None)
+            shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
+            (top, bottom), (left, right) = map(_needed, _placed(features, shape), shape)
+            value = F.conv2d(maps[name][..., top:bottom, left:right].to(weight), weight[..., None, None])
             joined[shape] = joined[shape] + value if shape in joined else value
         hidden = self.shift[:, None, None]
         for shape, value in joined.items():
             for axis, (start, end) in enumerate(_placed(features, shape)):
                 if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
+                    first, last = _needed((start, end), shape[axis])
                     line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
+                    line = line[:, first:last]
                     value = value @ line.mT if axis else line @ value
             hidden = hidden + value
         units = self.mix.shape[-1]
@@ -427,6 +430,11 @@ def _placed(
         start = placement.offset[side] / pixels
         edges.append((start, start + placement.size[side] * placement.scale[side] / pixels))
     return edges[0], edges[1]
+
+
+def _needed(edges: tuple[float, float], length: int) -> tuple[int, int]:
+    """First and last pixel, of a line of `length`, of those between two edges and one more at each end."""
+    return max(floor(edges[0] - 0.5), 0), min(ceil(edges[1] + 0.5), length)
 
 
 @constant
