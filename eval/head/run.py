@@ -26,10 +26,10 @@ from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
-from semfov.head.scenes import Boxes, Flat, Panorama
+from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
-from semfov.head.world import Places, World
+from semfov.head.world import World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
@@ -38,6 +38,7 @@ from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks
+from semfov.sensor.sphere import Boxes
 
 OURS = "semfov"
 """Name of the method that the others are compared with."""
@@ -138,7 +139,7 @@ class HeadRun(SceneRun):
             return Panorama(image, speeds=speeds)
         return Flat(image, speeds=speeds, degree=image.shape[-1] / _MOSAIC)
 
-    def places(self, index: int) -> Places:
+    def places(self, index: int) -> Boxes:
         """The places of the scene's objects."""
         scenes = self.scenes
         return scenes.regions(index) if isinstance(scenes, Panoramas) else Boxes(scenes.annotation(index).boxes)
@@ -281,7 +282,7 @@ def _tiling_order(views: Views, pose: int) -> list[int]:
     return snake[at:] + snake[:at]
 
 
-def _scene_answers(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
+def _scene_answers(views: Views, places: Boxes, labels: Tensor, classes: int) -> Tensor:
     """Which classes are right for each cell of the scene, those of the objects that overlap it.
 
     A cell and an object overlap if the object contains the cell's centre, or the cell contains one of the points
@@ -310,7 +311,7 @@ class _Anywhere(AcquisitionFunction):
         return torch.zeros(1, len(self.views.grid))
 
 
-def _rests_on(views: Views, action: int, places: Places) -> Tensor:
+def _rests_on(views: Views, action: int, places: Boxes) -> Tensor:
     """Which objects overlap the cell that an action fixates.
 
     A cell and an object overlap if one contains a point of the other. 9 × 9 points spread over each are tested.

@@ -269,7 +269,7 @@ class FoveaEpisode(Episode[Scanpath]):
             self._recent.popleft()
         self.passes += 1
         if self.forgetting is None:
-            self._trace.add(step)
+            self._trace.steps.append(step)
         if self._verifier is not None:
             self._verifier.see(step)
         elif self.ends is not None:

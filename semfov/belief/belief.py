@@ -174,22 +174,6 @@ class DirichletBelief(Belief):
             check_parameters(self.beta)
             object.__setattr__(self, "closest", torch.full_like(self.beta[..., 0], torch.inf))
 
-    @classmethod
-    def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "DirichletBelief":
-        """Make the belief before the first look, with the same parameter for every class.
-
-        Args:
-            batch: B, number of episodes.
-            cells: X·Y, number of cells.
-            components: K + 1, number of classes with background.
-            prior: the parameter, positive.
-            like: a tensor; the belief takes its dtype and device.
-
-        Returns:
-            The belief.
-        """
-        return cls(like.new_full((batch, cells, components), prior))
-
     @property
     def probabilities(self) -> Tensor:
         r"""Posterior of every class, :math:`p_k = \beta_k / \sum_j \beta_j`, `(B, X·Y, K+1)`."""

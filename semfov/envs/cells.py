@@ -23,7 +23,7 @@ from semfov.episode.loop import attend
 from semfov.errors import check, check_whole
 from semfov.metrics.exploration import count_right
 from semfov.paths import Scanpath
-from semfov.paths.scanpath import trace
+from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus
 from semfov.runs.search_protocol import Trial
 from semfov.viz.animation import render
@@ -173,7 +173,7 @@ class CellGazes(Gazes):
         # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
         beside: Observer | None = Semantic(len(classes)) if searching else None
         with torch.inference_mode():
-            return trace(self._steps, grid, classes, episode.cue if searching else None, beside)
+            return Trace(grid, classes, episode.cue if searching else None, beside, steps=self._steps).scanpath()
 
     @torch.inference_mode()
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:

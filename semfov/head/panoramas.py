@@ -133,7 +133,7 @@ class Panoramas:
         image = F.interpolate(image, shape, mode="bilinear", antialias=True)
 
         (frame,) = (
-            Regions(Camera(camera.pose[None], _SLOT), torch.tensor([patch.box])).panorama_boxes(self.size).tolist()
+            Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT)).panorama_boxes(self.size).tolist()
         )
         columns = torch.arange(math.floor(frame[0]), math.ceil(frame[2])) % self.size[0]
         rows = torch.arange(math.floor(frame[1]), min(math.ceil(frame[3]), self.size[1]))
@@ -162,7 +162,7 @@ class Panoramas:
             scale = annotation.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
             boxes.append(annotation.boxes * scale + annotation.boxes.new_tensor([x1, y1] * 2))
             poses.append(torch.tensor([patch.pose]).expand(len(annotation.boxes), 3))
-        return Regions(Camera(torch.cat(poses), _SLOT), torch.cat(boxes))
+        return Regions(torch.cat(boxes), Camera(torch.cat(poses), _SLOT))
 
     def annotation(self, index: int) -> Annotation:
         """The objects of a panorama, without composing its pixels.

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from semfov.head.speeds import Speeds
 from semfov.head.sphere import Sphere
 from semfov.head.world import BLANK, FIELDS, World, check_fields
 from semfov.sensor.perspective import even_rows, go_around, sample
+from semfov.sensor.sphere import Boxes
 
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
@@ -88,33 +88,6 @@ class Panorama(Sphere):
     def image(self) -> Tensor | None:
         """The panorama."""
         return None if self._source is None else self._source[:, 1:-1, 1:-1]
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """Regions of a flat scene: boxes `(M, 4)` in its pixels."""
-
-    boxes: Tensor
-
-    def __len__(self) -> int:
-        """Number of boxes."""
-        return len(self.boxes)
-
-    def __getitem__(self, index: Tensor) -> "Boxes":
-        """The selected boxes."""
-        return Boxes(self.boxes[index])
-
-    def samples(self, count: int = 9) -> Tensor:
-        """Points on a regular grid over each box, its borders included, `(M, count², 2)`."""
-        share = torch.linspace(0, 1, count).to(self.boxes)
-        y, x = torch.meshgrid(share, share, indexing="ij")
-        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
-        return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
-
-    def contain(self, points: Tensor) -> Tensor:
-        """Whether each box contains each of the points, `(M, N)`."""
-        low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
-        return ((points >= low) & (points <= high)).all(-1)
 
 
 class Flat(World):

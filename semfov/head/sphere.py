@@ -111,7 +111,7 @@ class Sphere(World):
 
     def places(self, boxes: Tensor, pose: Tensor) -> Regions:
         """Regions of the sphere."""
-        return Regions(Camera(pose.expand(len(boxes), 3), self.size), boxes)
+        return Regions(boxes, Camera(pose.expand(len(boxes), 3), self.size))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
         """Smallest boxes around the regions in the panorama."""

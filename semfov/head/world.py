@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -12,26 +11,12 @@ from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.io.schema import is_number
+from semfov.sensor.sphere import Boxes
 
 FIELDS = (60.0,)
 """Default fields of view in degrees."""
 
 BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
-
-
-class Places(Protocol):
-    """Regions that objects cover in a scene."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: Tensor) -> "Places":
-        """The selected regions."""
-
-    def samples(self, count: int = 9) -> Tensor:
-        """Points spread over each region, its borders included, `(M, count², D)`."""
-
-    def contain(self, points: Tensor, /) -> Tensor:
-        """Whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
 
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
@@ -109,7 +94,7 @@ class World(ABC):
         """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene."""
 
     @abstractmethod
-    def places(self, boxes: Tensor, pose: Tensor) -> Places:
+    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         """Regions of the scene that boxes `(M, 4)` in the view from a pose cover."""
 
     @abstractmethod

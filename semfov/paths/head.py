@@ -21,7 +21,7 @@ from semfov.head.camera import CameraScene
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.sphere import Sphere
 from semfov.head.views import Views
-from semfov.head.world import Places, World
+from semfov.head.world import World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import GazeRecord
 from semfov.paths.conversion import COLUMNS
@@ -29,7 +29,7 @@ from semfov.paths.files import POSITIVE, Format, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
-from semfov.sensor.sphere import panorama_directions
+from semfov.sensor.sphere import Boxes, panorama_directions
 
 _BORDER = 2.0
 """A box this near to a border of its view, in pixels of the view, counts as cut by it."""
@@ -178,7 +178,7 @@ class HeadPath(GazeRecord):
         pan, tilt = self.views.world.angles_of(self.gaze(look)[None])[0].tolist()
         return pan, tilt
 
-    def places(self, look: int, score: float = 0.1) -> tuple[Places, Tensor, Tensor]:
+    def places(self, look: int, score: float = 0.1) -> tuple[Boxes, Tensor, Tensor]:
         """Objects detected in a look, in coordinates of the scene.
 
         Args:

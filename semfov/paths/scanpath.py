@@ -307,16 +307,13 @@ class Trace:
         target: int | None,
         beside: Observer | None,
         least: float = LEAST,
+        steps: Iterable[Step] = (),
     ) -> None:
         self.grid, self.classes, self.target, self.beside, self.least = grid, classes, target, beside, least
-        self.steps: list[Step] = []
+        self.steps = [*steps]
         self._maps: list[Tensor] = []
         self._belief: Belief | None = None
         self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-
-    def add(self, step: Step) -> None:
-        """Keep a step."""
-        self.steps.append(step)
 
     def scanpath(self, **outcome: Any) -> Scanpath:
         """Make the scanpath of the steps so far. Its map of all classes is made when it is read."""
@@ -349,13 +346,3 @@ class Trace:
                     self._belief = self.beside(before, step.detections, step.fixation, self.grid)
                 self._maps.append((self._belief or step.belief).class_probabilities()[0])
             return torch.stack(self._maps[:looks])
-
-
-def trace(
-    steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
-) -> Scanpath:
-    """Make the scanpath of one episode (`Trace`)."""
-    episode = Trace(grid, classes, target, beside)
-    for step in steps:
-        episode.add(step)
-    return episode.scanpath()

@@ -3,7 +3,8 @@
 Directions are unit vectors `(x, y, z)` in OpenCV's frame: x to the right, y down, z ahead. Angles are in degrees.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -104,38 +105,54 @@ def _turn(rotation: Tensor, rays: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Regions:
-    """The regions of the sphere that boxes in camera images cover, exact also at the poles and across the seam.
+class Boxes:
+    """Regions of a flat scene: boxes `(M, 4)` in its pixels, edges between pixels."""
 
-    Attributes:
-        camera: cameras of M poses.
-        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
-    """
-
-    camera: Camera
     boxes: Tensor
 
     def __len__(self) -> int:
         """Number of regions."""
         return len(self.boxes)
 
-    def __getitem__(self, index: Tensor | slice) -> "Regions":
-        """Return some of the regions."""
-        return Regions(Camera(self.camera.pose[index], self.camera.size), self.boxes[index])
+    def __getitem__(self, index: Tensor | slice) -> Self:
+        """The selected regions."""
+        return replace(self, boxes=self.boxes[index])
 
-    def contain(self, directions: Tensor) -> Tensor:
-        """Tell which directions lie in each region, `(M, N)`."""
-        points, _ = self.camera.points(directions)
+    def samples(self, count: int = 9) -> Tensor:
+        """Points on a regular grid over each region, its borders included, `(M, count², D)`."""
+        share = torch.linspace(0, 1, count).to(self.boxes)
+        y, x = torch.meshgrid(share, share, indexing="ij")
+        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
+        return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
+
+    def contain(self, points: Tensor) -> Tensor:
+        """Whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
         low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
         return ((points >= low) & (points <= high)).all(-1)
 
+
+@dataclass(frozen=True)
+class Regions(Boxes):
+    """The regions of the sphere that boxes in camera images cover, exact also at the poles and across the seam.
+
+    Attributes:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
+        camera: cameras of M poses.
+    """
+
+    camera: Camera
+
+    def __getitem__(self, index: Tensor | slice) -> Self:
+        """The selected regions."""
+        return replace(self, boxes=self.boxes[index], camera=Camera(self.camera.pose[index], self.camera.size))
+
+    def contain(self, points: Tensor) -> Tensor:
+        """Whether each region contains each of the directions `(N, 3)`, `(M, N)` boolean."""
+        return super().contain(self.camera.points(points)[0])
+
     def samples(self, count: int = 9) -> Tensor:
-        """Sample a grid of directions in each region, its borders included."""
-        share = torch.linspace(0, 1, count).to(self.boxes)
-        y, x = torch.meshgrid(share, share, indexing="ij")
-        at = torch.stack([x, y], -1).flatten(0, 1)
-        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
-        return self.camera.directions(low + at * (high - low) - 0.5)
+        """Directions on a grid over each region, its borders included, `(M, count², 3)`."""
+        return self.camera.directions(super().samples(count))
 
     def outlines(self, count: int = 33) -> Tensor:
         """Sample directions along the closed border of each region."""

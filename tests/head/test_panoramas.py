@@ -67,7 +67,7 @@ def test_no_two_photographs_overlap(scenes):
     from semfov.sensor.sphere import Camera, Regions
 
     patches = Panoramas(scenes, width=256, count=1).patches(0)
-    slots = Regions(Camera(torch.tensor([p.pose for p in patches]), (640, 480)), torch.tensor([p.box for p in patches]))
+    slots = Regions(torch.tensor([p.box for p in patches]), Camera(torch.tensor([p.pose for p in patches]), (640, 480)))
     held = slots.contain(slots.samples(21).flatten(0, 1)).view(len(patches), len(patches), -1)
     for number in range(len(patches)):
         others = torch.cat([held[number, :number], held[number, number + 1 :]])

@@ -78,7 +78,7 @@ def test_angles_between_directions_equal_scipy(one, other):
 def test_regions_contain_their_samples_and_no_points_outside():
     pose = torch.tensor([[179.0, 85.0, 60.0], [0.0, 0.0, 60.0]])
     boxes = torch.tensor([[10.0, 5, 30, 20], [0, 0, 41, 31]])
-    regions = Regions(Camera(pose, (41, 31)), boxes)
+    regions = Regions(boxes, Camera(pose, (41, 31)))
     samples = regions.samples(5)
     for number in range(2):
         inner = samples[number].unflatten(0, (5, 5))[1:-1, 1:-1].flatten(0, 1)
@@ -94,7 +94,7 @@ def test_boxes_in_a_panorama_fit_the_region_tightly(yaw, pitch):
     """Checked with all panorama pixels in the region, without its outline (a corner can lie between pixels)."""
     size = 360, 180
     pose = torch.tensor([[yaw, pitch, 70.0]], dtype=torch.float64)
-    regions = Regions(Camera(pose, (40, 30)), torch.tensor([[4.0, 3, 33, 27]], dtype=torch.float64))
+    regions = Regions(torch.tensor([[4.0, 3, 33, 27]], dtype=torch.float64), Camera(pose, (40, 30)))
     y, x = torch.meshgrid(torch.arange(180.0), torch.arange(360.0), indexing="ij")
     pixels = torch.stack([x, y], -1).flatten(0, 1).double()
     inside = regions.contain(panorama_directions(pixels, size))[0]

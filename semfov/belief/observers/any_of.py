@@ -18,7 +18,7 @@ TargetLike = str | int | Sequence[str | int] | Mapping[str, float] | Mapping[int
 
 
 @dataclass(frozen=True)
-class AnyLook(Look):
+class _AnyLook(Look):
     """Looks of the inner observer: one for each class, or a single one about all classes."""
 
     inner: tuple[Look, ...]
@@ -101,9 +101,9 @@ class AnyOf(Observer):
         inner = tuple(self.observer.start(batch, grid, like) for _ in self._targets)
         return AnyBelief(inner, self.weights, inner[0].closest)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> AnyLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _AnyLook:
         """Evidence for each class; `target` is ignored."""
-        return AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
+        return _AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> AnyBelief:
         """Fade the beliefs of the inner observer."""
@@ -114,7 +114,7 @@ class AnyOf(Observer):
         return self._each(belief, look, self.observer.update)
 
     def _each(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> AnyBelief:
-        belief, look = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
+        belief, look = own(belief, AnyBelief, "belief"), own(look, _AnyLook, "look")
         inner = tuple(change(each, of) for each, of in zip(belief.inner, look.inner, strict=True))
         return replace(belief, inner=inner, closest=inner[0].closest)
 

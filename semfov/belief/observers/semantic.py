@@ -104,7 +104,7 @@ class Semantic(Observer):
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
         """The prior in every cell."""
-        return DirichletBelief.uniform(batch, len(grid), self.components, self.prior, like)
+        return DirichletBelief(like.new_full((batch, len(grid), self.components), self.prior))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SemanticLook:
         """Likelihoods of the detections (`likelihoods`), the same for every target."""

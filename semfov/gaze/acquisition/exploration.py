@@ -92,7 +92,7 @@ class BayesianSurprise(Lookahead):
 
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Divergence of the predicted posterior from the present one."""
-        return divergence(outlook)
+        return _divergence(outlook)
 
 
 class NegativeEntropy(Lookahead):
@@ -123,7 +123,7 @@ class NegativeEntropy(Lookahead):
         """Decrease of the entropy."""
         surprise = torch.xlogy(outlook.mean, outlook.mean)[..., None, :]
         # H(p) - H(p') = KL(p' || p) + Σ (p' - p) ln p
-        return divergence(outlook) + (outlook.growth * surprise).sum(-1)
+        return _divergence(outlook) + (outlook.growth * surprise).sum(-1)
 
 
 class TwoPeaks(Lookahead):
@@ -191,7 +191,7 @@ class UpperConfidenceBound(Lookahead):
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Increase of the bound."""
         after, before = (
-            peak + self.kappa * deviation(peak, total)
+            peak + self.kappa * _deviation(peak, total)
             for peak, total in (
                 (outlook.next_mean.amax(-1), outlook.next_total),
                 (outlook.mean.amax(-1), outlook.total),
@@ -237,10 +237,10 @@ class ProbabilityOfImprovement(Lookahead):
         """Probability of improvement."""
         peak = outlook.next_mean.amax(-1)
         gain = peak - outlook.mean.amax(-1)[..., None] - self.margin
-        return torch.special.ndtr(gain / deviation(peak, outlook.next_total))
+        return torch.special.ndtr(gain / _deviation(peak, outlook.next_total))
 
 
-def divergence(outlook: Outlook) -> Tensor:
+def _divergence(outlook: Outlook) -> Tensor:
     r"""Divergence of the predicted means from the present ones, in nats, `(..., X·Y, N)`.
 
     It is computed as :math:`\sum_k p_k ((1 + e_k) \ln(1 + e_k) - e_k)` with :math:`e_k = p'_k / p_k - 1`. No term of
@@ -258,7 +258,7 @@ def _lead(mean: Tensor) -> Tensor:
     return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)
 
 
-def deviation(peak: Tensor, total: Tensor) -> Tensor:
+def _deviation(peak: Tensor, total: Tensor) -> Tensor:
     """Standard deviation of a class probability under a Dirichlet, from its mean and the sum of the parameters."""
     variance = peak * (1 - peak) / (total + 1)
     return variance.clamp(min=torch.finfo(variance.dtype).tiny).sqrt()
