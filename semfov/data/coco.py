@@ -1,7 +1,4 @@
-"""Data sets in COCO's format as scenes for visual search; every entry of their files is checked before it is used.
-
-Run as a program, it fetches the official files: `python -m semfov.data.coco val2017 --root DIR`.
-"""
+"""Data sets in COCO's format as scenes for visual search; every entry of their files is checked before it is used."""
 
 import contextlib
 import hashlib
@@ -69,9 +66,7 @@ def _read(path: str | PathLike[str], name: str) -> bytes:
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
-        raise DataError(
-            f"{name}: no such file; check data.annotations, or fetch COCO with python -m semfov.data.coco"
-        ) from None
+        raise DataError(f"{name}: no such file; check data.annotations") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{name}: cannot be read ({error})") from None
 
@@ -436,13 +431,6 @@ def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
             missing.append(path)
     if missing:
         raise DataError(
-            f"image {missing[0]}: no such file ({len(missing)} of {len(files)} are missing); "
-            f"check data.root, or fetch COCO with python -m semfov.data.coco"
+            f"image {missing[0]}: no such file ({len(missing)} of {len(files)} are missing); check data.root"
         )
     return sizes
-
-
-if __name__ == "__main__":
-    from semfov.data.download import main
-
-    raise SystemExit(main())

@@ -296,16 +296,6 @@ def test_development_photographs(shared):
     assert (len(scenes), pairs) == (300, 1079)
 
 
-def test_the_program_gives_no_warnings(fresh):
-    code = (
-        "import runpy, sys, warnings\n"
-        "sys.argv = ['coco', '--help']\n"
-        "warnings.simplefilter('error', RuntimeWarning)\n"
-        "runpy.run_module('semfov.data.coco', run_name='__main__')"
-    )
-    assert "val2017" in fresh(code)
-
-
 @pytest.mark.parametrize(
     ("boxes", "seems"),
     [

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from semfov import DataError, load_detector
-from semfov.data.download import _ANNOTATIONS, _SPLITS
 from semfov.detection.weights import WEIGHTS, _Address, _SourceDistribution
+from train.coco import _ANNOTATIONS, _SPLITS
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [

@@ -12,9 +12,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from semfov.data import download
-from semfov.data.download import _SPLITS, _Archive, _download_coco, _fetch_archive, _fetch_split, _unpack_members, main
 from semfov.errors import DataError, InputError
+from train import coco
+from train.coco import _SPLITS, _Archive, _download_coco, _fetch_archive, _fetch_split, _unpack_members, main
 
 NAMES = [f"{n:012d}.jpg" for n in (139, 285, 632)]
 
@@ -175,7 +175,7 @@ def test_without_a_network_the_error_suggests_copying_the_archive(tmp_path, unre
 
 
 def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(download, "_unpack_members", lambda *_: 1 / 0)
+    monkeypatch.setattr(coco, "_unpack_members", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         get(tmp_path, server.address)
     assert tree(tmp_path) == [".download/annotations_trainval2017.zip"]
@@ -240,14 +240,14 @@ def test_archives_that_are_unsafe_damaged_or_empty_are_refused(tmp_path, content
 
 def test_too_little_free_space_is_an_error_before_the_download(server, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(download.shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    monkeypatch.setattr(coco.shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(DataError, match="free space"):
         get(tmp_path, server.address)
 
 
 def test_the_program_downloads_and_reports_errors(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(_SPLITS, "val2017", IMAGES)
-    monkeypatch.setattr(download, "_ANNOTATIONS", ANNOTATIONS)
+    monkeypatch.setattr(coco, "_ANNOTATIONS", ANNOTATIONS)
     assert main(["val2017", "--root", str(tmp_path), "--address", server.address]) == 0
     assert f"data.root: {tmp_path / 'val2017'}" in capsys.readouterr().out
     assert tree(tmp_path) == WHOLE
@@ -259,7 +259,7 @@ def test_an_interrupted_program_says_how_to_resume(tmp_path, monkeypatch, capsys
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(download, "_fetch_split", interrupt)
+    monkeypatch.setattr(coco, "_fetch_split", interrupt)
     assert main(["val2017", "--root", str(tmp_path)]) == 130
     assert "same command to resume" in capsys.readouterr().err
 

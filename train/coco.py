@@ -1,4 +1,4 @@
-"""Fetching the official COCO files: resumable, verified and unpacked file by file."""
+"""Fetch the official COCO files, resumable, verified and unpacked: `python -m train.coco val2017 --root DIR`."""
 
 import argparse
 import contextlib
@@ -154,9 +154,9 @@ def _unpack_members(file: Path, root: Path, members: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `python -m semfov.data.coco`."""
+    """Run `python -m train.coco`."""
     parser = argparse.ArgumentParser(
-        prog="python -m semfov.data.coco",
+        prog="python -m train.coco",
         description="Fetch the official COCO 2017 photographs and their boxes. An interrupted run is resumed by "
         "the same command; files that are already complete are not fetched again.",
         epilog="Without a network, copy the zip files from another machine into DIR and run the same command.",
@@ -249,3 +249,7 @@ def _is_complete(root: Path, split: str, instances: str) -> bool:
         return False
     except (ValueError, KeyError, TypeError):  # not the official file, so it will be replaced by the official one
         return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())
