@@ -16,13 +16,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.comparison.saliency import SALIENCY_CLASSES
+from eval.human.folds import Maps, StudiedFold, viewed_by
 from eval.page.origin import END, PLACE
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Maps, Scores, joined
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Scores, joined
 from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look, no_detections
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
@@ -83,15 +84,15 @@ def compare_viewing(config: ViewingConfig) -> None:
     for name, source in made.items():
         opened = source()
         groups, store = cache(partial(look, config, opened)), FoldStore(config.out, {**opened.what, "data": data})
-        folds = [Fold(groups, number, config.folds) for number in numbers]
         own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
-        rows[name] = joined([store.scores(name, fold, own) for fold in _bar(folds, name)])
+        folds = [Fold(groups, number, config.folds, own) for number in numbers]
+        rows[name] = joined([store.scores(name, fold) for fold in _bar(folds, name)])
         if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
             alone = replace(fit, saccade_epochs=0)
             if len(config.fixations) > 1:
-                lone = [Fold(groups, number, config.folds, only=0) for number in numbers]
-                scores = [store.scores(f"{name} first data set", fold, alone) for fold in _bar(lone, "first data set")]
+                lone = [StudiedFold(groups, number, config.folds, alone, only=0) for number in numbers]
+                scores = [store.scores(f"{name} first data set", fold) for fold in _bar(lone, "first data set")]
                 splits[f"{name}: the first data set alone"] = joined(scores)
             splits[f"{name}: half of the people, scored by the others"] = _by_people(
                 store, name, groups, alone, config.folds
@@ -101,8 +102,8 @@ def compare_viewing(config: ViewingConfig) -> None:
     plain, store = cache(lambda: [_without_maps(group) for group in groups()]), FoldStore(config.out, {"data": data})
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
-        folds = [Fold(plain, number, config.folds) for number in numbers]
-        rows[name] = joined([store.scores(name, fold, fit, maps) for fold in _bar(folds, name)])
+        folds = [StudiedFold(plain, number, config.folds, fit, maps=maps) for number in numbers]
+        rows[name] = joined([store.scores(name, fold) for fold in _bar(folds, name)])
     tables = {
         "viewing": viewing_table(rows),
         "viewing terms": terms_table(rows),
@@ -159,14 +160,14 @@ def _by_people(store: FoldStore, name: str, groups: Groups, fit: GazeFit, count:
 
     def half(part: int) -> list[Viewed]:
         order = [sorted({p.subject for some in group.people for p in some}, key=_in_order) for group in groups()]
-        return [group.by(every[part % 2 :: 2]) for group, every in zip(groups(), order, strict=True)]
+        return [viewed_by(group, every[part % 2 :: 2]) for group, every in zip(groups(), order, strict=True)]
 
     file = f"{name} half of the people"
-    folds = [Fold(cache(partial(half, number)), number, count) for number in range(count)]
-    judges = [partial(half, number + 1) for number in range(count)]
-    return joined(
-        [store.scores(file, fold, fit, judges=by) for fold, by in zip(_bar(folds, file), judges, strict=True)]
-    )
+    folds = [
+        StudiedFold(cache(partial(half, number)), number, count, fit, judges=partial(half, number + 1))
+        for number in range(count)
+    ]
+    return joined([store.scores(file, fold) for fold in _bar(folds, file)])
 
 
 def _in_order(subject: str) -> tuple[int, str]:
@@ -244,7 +245,7 @@ def _sequences(
 
         def measured(picture: int = picture) -> dict[str, Tensor]:
             fold = folds[picture % config.folds]  # the one that holds it out
-            model = store.model(name, fold, config.fit)
+            model = store.model(name, fold)
             places = [(group, place) for group in fold.groups if group.source == 0 for place in range(len(group))]
             group, place = places[picture]
             terms = {"map": maps_of(model, group, [place])[0], CENTRE: model.centre_bias(group.size)[None]}

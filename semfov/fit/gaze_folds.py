@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from semfov.errors import SemfovError, check
-from semfov.fit.gaze import GazeFit, fit_oculomotor, fitted_density, maps_of, score
-from semfov.fit.viewing import Viewed, log_centre, others_of
+from semfov.fit.gaze import GazeFit, fitted_density, maps_of, score
+from semfov.fit.viewing import Viewed, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
 from semfov.io.code import modules_digest
 from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.scene_run import digest_of
-
-Maps = Literal["features", "none", "other people"]
-"""What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
 
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
@@ -43,18 +39,28 @@ def _folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int
 
 
 class Fold:
-    """The pictures of one of `count` folds, which are held out, and the others, to which models are fitted.
+    """The pictures of one of `count` folds, which are held out, and the others, to which a model is fitted.
 
-    With `only`, models are fitted to one data set, and scored on all. The pictures are looked at when they are needed.
+    The pictures are looked at when they are needed.
     """
 
-    def __init__(self, groups: Groups, number: int, count: int, only: int | None = None) -> None:
-        self._groups, self.number, self.count, self.only = groups, number, count, only
+    def __init__(self, groups: Groups, number: int, count: int, settings: GazeFit) -> None:
+        self._groups, self.number, self.count, self.settings = groups, number, count, settings
 
     @property
     def groups(self) -> Sequence[Viewed]:
         """The pictures, by data set and size."""
         return self._groups()
+
+    @property
+    def judged(self) -> Sequence[Viewed]:
+        """The same pictures, with the fixations that are predicted."""
+        return self.groups
+
+    @property
+    def what(self) -> dict[str, object]:
+        """What models and scores depend on, beside the pictures."""
+        return {"fit": self.settings.plain(), "fold": [self.number, self.count]}
 
     @cached_property
     def _split(self) -> list[tuple[list[int], list[int]]]:
@@ -67,62 +73,44 @@ class Fold:
             before[group.source] = first + len(group)
         return split
 
-    @property
-    def held(self) -> list[list[int]]:
-        """The pictures of each group that are held out."""
-        return [held for _, held in self._split]
-
-    @property
-    def fitted(self) -> list[list[int]]:
-        """The pictures of each group that models are fitted to."""
-        return self._of(self.only)
+    def fitted(self, source: int | None = None) -> list[list[int]]:
+        """The pictures of each group that models are fitted to, of one data set or of all."""
+        pairs = zip(self.groups, self._split, strict=True)
+        return [fitted if source in (None, group.source) else [] for group, (fitted, _) in pairs]
 
     @cached_property
     def centres(self) -> dict[int, Tensor]:
         """Log density of the centre bias of each data set."""
-        return {source: log_centre(self.groups, self._of(source)) for source in {each.source for each in self.groups}}
+        sources = {each.source for each in self.groups}
+        return {source: log_centre(self.groups, self.fitted(source)) for source in sources}
 
-    def _of(self, source: int | None) -> list[list[int]]:
-        """The other pictures of each group of one data set, or of all."""
-        pairs = zip(self.groups, self._split, strict=True)
-        return [fitted if source in (None, group.source) else [] for group, (fitted, _) in pairs]
+    def fit(self) -> FixationDensity:
+        """The model that is fitted to the other pictures."""
+        return fitted_density(self.settings, self.groups, self.fitted(), f"fold {self.number + 1} of {self.count}")
 
-    def fit(self, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
-        """The model that is fitted to the other pictures; that of given maps has oculomotor biases alone."""
-        if maps == "features":
-            return fitted_density(fit, self.groups, self.fitted, f"fold {self.number + 1} of {self.count}")
-        # The density of other people holds the centre bias already.
-        centre = log_centre(self.groups, self.fitted) if maps == "none" else torch.zeros(1, 1)
-        model = FixationDensity({"none": 1}, centre=centre)
-        known = [self.given(maps, *each) for each in zip(self.groups, self.fitted, strict=True)]
-        fit_oculomotor(model, self.groups, known, self.fitted, fit)
-        return model.requires_grad_(False)
+    def maps(self, model: FixationDensity, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
+        """The maps of some pictures of a group."""
+        return maps_of(model, group, pictures)
 
-    def given(self, maps: Maps, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
-        """Maps that are not fitted: flat ones, or the densities of other people."""
-        if maps == "other people":
-            return [others_of(group, each, self.centres[group.source]) for each in pictures]
-        return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
-
-    def scores(
-        self, model: FixationDensity, fit: GazeFit, maps: Maps = "features", judges: Groups | None = None
-    ) -> Scores:
-        """Scores on the held-out pictures with and without each term, and of the centre bias of each data set.
-
-        `judges` are the same pictures viewed by other people, whose fixations are predicted.
-        """
+    def scores(self, model: FixationDensity) -> Scores:
+        """Scores on the held-out pictures with and without each term, and of the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, some in zip(self.groups, (judges or self._groups)(), self.held, strict=True):
-            known = maps_of(model, group, some) if maps == "features" else self.given(maps, group, some)
+        for group, seen, (_, some) in zip(self.groups, self.judged, self._split, strict=True):
+            known = self.maps(model, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
-            found = {CENTRE: score(bias, seen, self.given("none", group, some), some, conditional=False)[0]}
+            found = {CENTRE: score(bias, seen, flat_maps(group, some), some, conditional=False)[0]}
             for conditional, names in ROWS.items():
-                if fit.saccade_epochs or not conditional:
+                if self.settings.saccade_epochs or not conditional:
                     scored = score(model, seen, known, some, conditional=conditional, without=((CENTRE,), ()))
                     found |= dict(zip(names, scored, strict=True))
             for name, each in found.items():
                 scores.setdefault((name, group.source), []).append(each)
         return {key: torch.cat(parts) for key, parts in scores.items()}
+
+
+def flat_maps(group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
+    """Maps of some pictures of a group that tell nothing."""
+    return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
 
 
 class FoldStore:
@@ -135,9 +123,9 @@ class FoldStore:
         self.folder, code = folder, modules_digest("semfov.gaze.saliency", __name__)
         self.what = {**what, "code": code}
 
-    def model(self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features") -> FixationDensity:
+    def model(self, name: str, fold: Fold) -> FixationDensity:
         """The model of a fold, read or fitted."""
-        file, what = self._place(name, fold, fit, maps)
+        file, what = _place(name, fold)
         key, path = digest_of({**self.what, **what}), self.folder / f"{file} model.safetensors"
         try:
             model = FixationDensity.from_pretrained(path)
@@ -145,21 +133,19 @@ class FoldStore:
                 return model.requires_grad_(False)
         except SemfovError:  # whatever is wrong with the file, it can be fitted again
             pass
-        model = fold.fit(fit, maps)
+        model = fold.fit()
         model.metadata["key"] = key
         model.save(path)
         return model
 
-    def scores(
-        self, name: str, fold: Fold, fit: GazeFit, maps: Maps = "features", judges: Groups | None = None
-    ) -> Scores:
+    def scores(self, name: str, fold: Fold) -> Scores:
         """The scores of a fold, read or computed."""
 
         def computed() -> dict[str, Tensor]:
-            scores = fold.scores(self.model(name, fold, fit, maps), fit, maps, judges)
+            scores = fold.scores(self.model(name, fold))
             return {f"{row}/{source}": each for (row, source), each in scores.items()}
 
-        kept = self.kept(*self._place(name, fold, fit, maps), computed)
+        kept = self.kept(*_place(name, fold), computed)
         return {(row, int(source)): kept[f"{row}/{source}"] for row, source in (key.rsplit("/", 1) for key in kept)}
 
     def kept(
@@ -173,11 +159,10 @@ class FoldStore:
             write_tensors(path, key, kept)
         return kept
 
-    def _place(self, name: str, fold: Fold, fit: GazeFit, maps: Maps) -> tuple[str, dict[str, object]]:
-        """The name of a fold's files, and what they depend on."""
-        what: dict[str, object] = {"name": name, "fit": fit.plain()}
-        what |= {"fold": [fold.number, fold.count, fold.only], "maps": maps}
-        return f"{name} fold {fold.number + 1} of {fold.count}", what
+
+def _place(name: str, fold: Fold) -> tuple[str, dict[str, object]]:
+    """The name of a fold's files, and what they depend on."""
+    return f"{name} fold {fold.number + 1} of {fold.count}", {"name": name, **fold.what}
 
 
 def joined(scored: Sequence[Scores]) -> Scores:

@@ -64,8 +64,8 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     expected = f"at least {max(config.folds, 1)} pictures in each file, or fewer folds than {config.folds}"
     check(fewest >= max(config.folds, 1), "fixations", expected, fewest)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
-    folds = [Fold(lambda: groups, number, config.folds) for number in range(config.folds)]
-    scored = joined([kept.scores(detector.name, fold, config.fit) for fold in folds])
+    folds = [Fold(lambda: groups, number, config.folds, config.fit) for number in range(config.folds)]
+    scored = joined([kept.scores(detector.name, fold) for fold in folds])
     model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
     _describe_viewing(model, groups)
     scanpaths = sum(len(some) for group in groups for some in group.people)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -106,19 +106,14 @@ class Viewed:
         place = torch.as_tensor(pictures)
         return replace(self.features, maps={name: each[place].float() for name, each in self.features.maps.items()})
 
-    def by(self, subjects: Collection[str]) -> Viewed:
-        """The same pictures, viewed by some of the people."""
-        some = tuple(tuple(each for each in people if each.subject in subjects) for people in self.people)
-        return replace(self, people=some)
-
     @cached_property
     def counts(self) -> Tensor:
         """Numbers of fixations, without the first of each path, in the cells of each picture, `(P, rows, columns)`."""
         rows, columns = cells_of(self.size)
-        return torch.stack([_counted(paths, self.size, (rows, columns)).sum(0) for paths in self.paths])
+        return torch.stack([counted(paths, self.size, (rows, columns)).sum(0) for paths in self.paths])
 
 
-def _counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
+def counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
     """Numbers of fixations of each path but its first in cells, `(paths, rows, columns)`."""
     counts = torch.zeros(len(paths), cells[0] * cells[1])
     for row, path in zip(counts, paths, strict=True):
@@ -241,22 +236,7 @@ def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, 
     return Events(torch.cat(before), cell, person)
 
 
-def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3, share: float = 0.05) -> Tensor:
-    """Log density of the fixations of all other people, for each person of a picture, `(people, rows, columns)`.
-
-    Counts without first fixations are blurred by `blur` cells, and mixed with a `share` of the centre bias `centre`, a
-    log density `(rows, columns)`.
-    """
-    cells = cells_of(group.size)
-    bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
-    counts = _counted(group.paths[picture], group.size, cells)
-    smooth = torch.stack([_blurred(each, blur) for each in counts.sum(0) - counts]).flatten(1)
-    total = smooth.sum(1, keepdim=True)
-    density = (1 - share) * torch.where(total > 0, smooth / total, bias) + share * bias
-    return density.log().unflatten(1, cells)
-
-
-def _blurred(counts: Tensor, sigma: float) -> Tensor:
+def blurred(counts: Tensor, sigma: float) -> Tensor:
     """Counts `(rows, columns)` blurred by a Gaussian whose weights sum to 1 at the border too."""
     for axis in (0, 1):
         place = torch.arange(counts.shape[axis], dtype=counts.dtype)
@@ -271,6 +251,6 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
     for group, some in zip(groups, pictures, strict=True):
         if len(some):
             seen = group.counts[torch.as_tensor(some)].sum(0)
-            smooth = _blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
+            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
             total += smooth / smooth.sum()
     return ((1 - floor) * total / total.sum() + floor / total.numel()).log()

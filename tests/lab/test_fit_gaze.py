@@ -11,13 +11,14 @@ from scipy.ndimage import gaussian_filter
 from torch.nn import functional as F
 
 from eval.human import main as compare
+from eval.human.folds import StudiedFold, others_of, viewed_by
 from eval.human.viewing import covering
 from semfov import Detector, InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
 from semfov.detection import Candidates
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
-from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore, _folds
+from semfov.fit.gaze_folds import CENTRE, FoldStore, _folds
 from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, _summary_of
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
@@ -28,7 +29,6 @@ from semfov.fit.viewing import (
     features_of,
     log_centre,
     look,
-    others_of,
 )
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
@@ -128,24 +128,24 @@ def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
 def test_people_are_predicted_by_the_others(group):
     """A density of other people predicts better than a centre bias, and is not that of a person's own fixations."""
     fit = GazeFit(saccade_epochs=1)
-    fold = Fold(lambda: [group], 0, 4)
-    scored = fold.scores(fold.fit(fit, "other people"), fit, "other people")
+    fold = StudiedFold(lambda: [group], 0, 4, fit, maps="other people")
+    scored = fold.scores(fold.fit())
     assert _summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
-    alone = group.by({"0"})
+    alone = viewed_by(group, {"0"})
     assert float(others_of(alone, 5, torch.zeros(39, 52)).std()) < 1e-6
 
 
 def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monkeypatch):
-    half, others = group.by({"0", "1", "2"}), group.by({"3", "4", "5"})
+    half, others = viewed_by(group, {"0", "1", "2"}), viewed_by(group, {"3", "4", "5"})
     assert {each.subject for some in others.people for each in some} == {"3", "4", "5"}
     fit = GazeFit(epochs=2, units=4, saccade_epochs=0)
     store = FoldStore(tmp_path, {"data": "drawn"})
-    fold = Fold(lambda: [half], 1, 4)
-    first = store.scores("halves", fold, fit, judges=lambda: [others])
+    fold = StudiedFold(lambda: [half], 1, 4, fit, judges=lambda: [others])
+    first = store.scores("halves", fold)
     assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
     monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
     monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
-    again = store.scores("halves", fold, fit, judges=lambda: [others])
+    again = store.scores("halves", fold)
     assert all(torch.equal(first[key], again[key]) for key in first)
 
 
