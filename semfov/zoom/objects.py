@@ -146,6 +146,8 @@ def probable_objects(
 ) -> tuple[Objects, tuple[float, float]]:
     """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown."""
     objects = _probable(*merge_with_facts(glances, lattice, target, latest=latest), certainty)
+    if not any(remaining):
+        return objects, (0.0, 0.0)
     before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
