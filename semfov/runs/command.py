@@ -139,7 +139,7 @@ def run_command(
     except KeyboardInterrupt:
         # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
         # it and would end by the signal although it was caught here. A string that runs to its end resets this.
-        exec("")
+        exec("")  # noqa: S102
         print(f"{_ENDINGS[signal.SIGINT]}{goes_on}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated as ended:

@@ -58,17 +58,6 @@ def test_the_rule_of_semba_divides_only_the_second_term(likelihood, data):
         torch.testing.assert_close(after, fusion.kaplan(torch.from_numpy(beta), torch.from_numpy(scores)))
 
 
-def test_kaplan_mean_equals_that_of_the_integrated_posterior():
-    """Monte Carlo over the prior: the posterior mean of p is E[p (p·λ)] / E[p·λ]."""
-    beta, likelihood = torch.tensor([0.7, 2.0, 1.3]).double(), torch.tensor([0.9, 0.2, 0.05]).double()
-    torch.manual_seed(0)
-    draws = torch.distributions.Dirichlet(beta).sample((200_000,))
-    weights = draws @ likelihood
-    posterior = (weights[:, None] * draws).mean(0) / weights.mean()
-    after = fusion.kaplan(beta, likelihood)
-    torch.testing.assert_close(after / after.sum(), posterior, atol=2e-3, rtol=0)
-
-
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
 def test_rules_ignore_scale_and_order_of_classes(rule):
     torch.manual_seed(1)

@@ -40,15 +40,6 @@ def test_overlap_equals_the_loop(columns, rows, size, corners):
     assert got == expected
 
 
-def test_pixels_agree_with_cells():
-    """Every pixel centre lies in the cell that `cell_of` says, counted by slicing an image."""
-    grid = Grid(4, 3, (12, 9))
-    image = torch.arange(12).reshape(3, 4).repeat_interleave(3, 0).repeat_interleave(3, 1)
-    ys, xs = torch.meshgrid(torch.arange(9), torch.arange(12), indexing="ij")
-    cells = grid.cell_of(torch.stack([xs, ys], -1).float())
-    assert torch.equal(cells, image)
-
-
 @pytest.mark.parametrize("rule", ["overlap", "centre", "box_centre"])
 def test_footprint_rules(rule):
     grid = Grid(10, 10, (100, 100))

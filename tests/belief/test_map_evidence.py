@@ -133,23 +133,6 @@ def test_gain_is_zero_where_the_look_is_not_closer_than_before(toy_map):
         assert bool((got != 0).all()) == closer
 
 
-def test_gradients(toy_map, gathered):
-    model, said = toy_map().double().requires_grad_(False), gathered()
-
-    def everything(nearest, best, mean, distance, closest):
-        odds = model.log_odds(type(said)(nearest, best, mean, distance, *remaining_fields(said)), 6, 4)
-        nothing = model.emptiness(odds, closest, said.looks[::4], 6, torch.tensor([[1.0, 1, 2, 3]] * 2).double())
-        probabilities = torch.cat([nothing[:, None], odds], 1).sigmoid().transpose(1, 2)
-        return odds, nothing, model.gain(probabilities, closest, said.looks[::4], GRID.cell_distance[[2, 9]].double())
-
-    values = [said.nearest, said.best, said.mean, said.distance, said.distance[::4] + 0.01]
-    assert torch.autograd.gradcheck(everything, [value.clone().requires_grad_() for value in values], fast_mode=True)
-
-
-def remaining_fields(said):
-    return said.score, said.looks, said.visited, said.target
-
-
 def test_sizes_have_defaults_and_limits():
     for name, value in [
         ("look_width", 0),

@@ -31,7 +31,7 @@ class LookTester(GraphTester):
 
 
 class TestTargetEvidence(LookTester):
-    test_compile = test_export = None  # traced as a part of AnyOf
+    test_export = None  # traced as a part of AnyOf
 
     def make(self):
         return evidence()
@@ -42,7 +42,7 @@ class TestTargetEvidence(LookTester):
 
 
 class TestMapEvidence(LookTester):
-    test_compile = test_export = None  # traced as a part of AnyOfOneMap
+    test_export = None  # traced as a part of AnyOfOneMap
 
     def make(self):
         return mapping()
@@ -70,7 +70,7 @@ class ObserverTester(LookTester):
 class PartTester(ObserverTester):
     """An observer that is traced as a part of another one."""
 
-    test_compile = test_export = None
+    test_export = None
 
 
 globals().update(

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, InputError, TargetEvidence
-from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Target
 from tests.belief import reference
 
@@ -130,22 +129,6 @@ def test_gradients_reach_every_parameter(looks):
         assert float(parameter.grad.abs().sum()) > 0, name
     # In the prior only the target has a gradient.
     assert model.prior.grad.nonzero()[:, 0].tolist() == [1]
-
-
-def test_gradients_through_log_odds_and_presence(gathered):
-    torch.manual_seed(1)
-    model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
-    torch.nn.init.normal_(model.prior)
-    start = gathered(episodes=1, classes=3)
-
-    def odds(nearest, best, mean, distance, score, prior):
-        said = Gathered(nearest, best, mean, distance, score, start.looks, start.visited, start.target)
-        with torch.nn.utils.stateless._reparametrize_module(model, {"prior": prior}):
-            cells = model.log_odds(said, 6)
-            return cells, model.chance(said, 6), model.presence(cells, said)
-
-    values = [start.nearest, start.best, start.mean, start.distance, start.score, model.prior]
-    assert torch.autograd.gradcheck(odds, [value.detach().clone().requires_grad_() for value in values])
 
 
 def test_bad_input(looks, model):

@@ -435,7 +435,7 @@ def untimed(file):
     return re.sub(r'"seconds": [\d.]+|,[\d.]+$', "", text, flags=re.M)
 
 
-@pytest.mark.parametrize("kind", ["json", "csv", "geojson", "coco.json"])
+@pytest.mark.parametrize("kind", ["json", "coco.json"])
 def test_a_folder_that_was_interrupted_continues(run, folder, tmp_path, agent, monkeypatch, kind):
     find_all, calls = agent.find_all, []
 
@@ -601,13 +601,14 @@ def test_a_folder_may_have_small_and_large_pictures(run, photo, large, agent, ev
     agent.windows = evidence
     photo.rename(large.with_name(photo.name))
     out, page = tmp_path / "out", tmp_path / "page.html"
-    code, _ = run("search", large.parent, "--target", "red", "--passes", 6, "--out", out, "--report", page)
+    code, _ = run("search", large.parent, "--target", "red", "--passes", 2, "--out", out, "--report", page,
+                  "--draw", "animation")  # fmt: skip
     assert code == 0
     assert [(each["name"], "looks" in each) for each in episodes_of(page)] == [
         ("field.png", True),
         ("my photo.png", False),
     ]
-    assert (out / "000-field.png/scanpath.png").is_file()
+    assert (out / "000-field.png/animation.gif").is_file()
     assert (out / "001-my-photo.png/animation.gif").is_file()
 
 
@@ -623,36 +624,22 @@ def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monke
     assert options["duration"] == 5
 
 
-def test_file_names_are_escaped_in_the_report(run, photo, tmp_path):
-    photo = photo.rename(photo.with_name("<img src=x onerror=alert(1)>'\"&$x$.png"))
-    code, _ = run("search", photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
-    assert code == 0
-    assert "<img" not in (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert episodes_of(tmp_path / "page.html")[0]["name"] == photo.name
-
-
-ONE = ("--draw", "scanpath")
-
-
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
-        ("search", "--target", "Cups"),
-        ("find", "--target", "cup"),
-        ("explore", "--shifts", 1, *ONE),
-        ("search", "--target", "cup", "--agent", "published", "--sensor", "published-narrow", "--shifts", 1, *ONE),
-        ("explore", "--agent", "raw", "--sensor", "gradual", "--shifts", 1, *ONE),
+        "search --target Cups",
+        "find --target cup",
+        "search --target cup --agent published --sensor published-narrow --shifts 1 --draw scanpath",
     ],
-    ids=lambda options: " ".join(map(str, options[:5])),
 )
 def test_the_agents_of_the_package_look_at_an_embedded_scene(options, tmp_path, capsys):
     from semfov.cli.main import main
 
     out = ["--out", str(tmp_path / "out"), "--report", str(tmp_path / "page.html")]
     with torch.random.fork_rng():
-        assert main([*map(str, options), *out]) == 0
+        assert main([*options.split(), *out]) == 0
     printed = capsys.readouterr().out
     assert "an embedded scene" in printed
     assert (tmp_path / "out/scanpath.png").is_file()

@@ -70,13 +70,6 @@ def test_threads_read_windows_of_one_picture_at_once(tmp_path, reader):
     assert ([*warnings.filters], [log.level for log in logs]) == before
 
 
-def test_grey_has_three_channels(tmp_path):
-    array = pixels()[..., 0]
-    Image.fromarray(array).save(tmp_path / "grey.png")
-    for source in (array, tmp_path / "grey.png"):
-        assert np.array_equal(open_large(source).pixels((3, 4, 9, 8)), np.repeat(array[4:8, 3:9, None], 3, -1))
-
-
 def test_rotated_photographs_are_read_upright(tmp_path):
     array = pixels()
     exif = Image.Exif()
@@ -147,21 +140,6 @@ def test_truncated_files_are_refused(tmp_path):
         (tmp_path / name).write_bytes(whole[: len(whole) // 2])
         with pytest.raises(DataError, match=r"a\.(jpg|tif): cannot be"):
             open_large(tmp_path / name).pixels((0, 0, 230, 150))
-
-
-@pytest.mark.parametrize("mode", ["RGBA", "LA", "I;16", "1", "P", "CMYK"])
-def test_every_colour_mode_is_read_as_by_read_image(tmp_path, mode):
-    """16-bit values keep their range, and transparent pixels are white."""
-    if mode == "I;16":
-        image = Image.fromarray(np.linspace(0, 65535, 150 * 230).reshape(150, 230).astype(np.uint16))
-    elif mode == "RGBA":
-        image = Image.fromarray(np.dstack([pixels(), pixels(seed=1)[..., 0]]))
-    else:
-        image = Image.fromarray(pixels()).convert(mode)
-    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
-    image.save(path)
-    got = open_large(path).read((0, 0, 230, 150))
-    assert torch.equal(got, (read_image(path) * 255).round().byte())
 
 
 @pytest.mark.parametrize("photometric", ["minisblack", "miniswhite", "rgb"])

@@ -64,15 +64,6 @@ def test_gain_is_summed_over_all_cells(model, dtype, device):
     assert bool((got[~visited] != 0).all())
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_gain_of_a_batch_equals_the_gain_of_each_episode(model):
-    belief, visited = belief_of(model)
-    acquisition = ExpectedGain(model, GRID)
-    whole = acquisition(belief, visited)
-    for row in range(3):
-        assert torch.equal(acquisition(belief[row : row + 1], visited[row : row + 1])[0], whole[row])
-
-
 def test_other_beliefs_are_refused(model):
     acquisition, visited = ExpectedGain(model, GRID), torch.zeros(1, 20, dtype=torch.bool)
     like = torch.empty(0)

@@ -56,7 +56,7 @@ def test_values_are_integrals_over_the_scores(name, calibrated):
             gain = measure(fusion.kaplan(beta, likelihood)) - measure(beta)
             return float(gain) * sum(float(p) * d for p, d in zip(mean, density, strict=True))
 
-        return quad(integrand, 0, 1, limit=200, epsabs=1e-5, epsrel=1e-5)[0]
+        return quad(integrand, 0, 1, limit=200, epsabs=1e-4, epsrel=1e-4)[0]
 
     model = two_classes()
     levels = model.level(GRID.cell_distance)

@@ -90,7 +90,7 @@ class PolicyTester(AcquisitionTester):
     """Values that a policy's acquisition function gives for a belief; that function has the other tests."""
 
     test_shapes = test_no_rows = test_dtypes = test_autocast = test_gradcheck = test_vmap = None
-    test_compile = test_export = None
+    test_export = None
 
     @staticmethod
     def call(module, beta, closest):

@@ -1,4 +1,4 @@
-"""The acquisition functions of Luzio, Bernardino and Moreno (2024), against their equations in loops.
+"""The acquisition functions of Luzio, Bernardino and Moreno (2024), and those made alike, against equations in loops.
 
 Section III-E of the paper; labels of equations are those of its LaTeX source. For every fixation f' and every cell x
 the look is simulated: the distance of the cells' centres, the expected scores (eq:expected_operator), Kaplan's rule
@@ -45,6 +45,27 @@ def two_peaks(beta):
     p = posterior(beta)
     most = p.argmax()
     return p[most] - np.delete(p, most).max()
+
+
+def surprise(before, after):
+    """From the class probabilities of a cell before the look to those after it."""
+    return scipy.stats.entropy(posterior(after), posterior(before))
+
+
+def favourite(beta):
+    """Mean and standard deviation of the probability of a cell's most probable class."""
+    p = posterior(beta).max()
+    return p, math.sqrt(p * (1 - p) / (beta.sum() + 1))
+
+
+def bound(beta, kappa=2.0):
+    mean, deviation = favourite(beta)
+    return mean + kappa * deviation
+
+
+def improvement(before, after, margin=0.0):
+    mean, deviation = favourite(after)
+    return scipy.stats.norm.cdf((mean - favourite(before)[0] - margin) / deviation)
 
 
 class Paper:
@@ -113,13 +134,9 @@ class Paper:
         """eq:minimize: the metric over the whole predicted map, for every fixation."""
         return [sum(metric(beta) for beta in after) for after in self.predicted_maps]
 
-    def expected_improvement(self):
-        """eq:maximize."""
-        before = [two_peaks(beta) for beta in self.beta]
-        return [
-            max(abs(two_peaks(beta) - old) for beta, old in zip(after, before, strict=True))
-            for after in self.predicted_maps
-        ]
+    def change(self, change, join=sum):
+        """The same of the change of each cell; the largest one is eq:maximize."""
+        return [join(map(change, self.beta, after)) for after in self.predicted_maps]
 
     @property
     def grid(self):
@@ -147,12 +164,15 @@ def paper(request):
 EXPLORATION = {
     "kl": lambda paper: paper.total(divergence),
     "negative-entropy": lambda paper: paper.total(negentropy),
-    "two-peaks": Paper.expected_improvement,
+    "two-peaks": lambda paper: paper.change(lambda before, after: abs(two_peaks(after) - two_peaks(before)), max),
+    "surprise": lambda paper: paper.change(surprise),
+    "upper-confidence-bound": lambda paper: paper.change(lambda before, after: bound(after) - bound(before)),
+    "probability-of-improvement": lambda paper: paper.change(improvement),
 }
 # A constant over fixations may differ: the library subtracts the divergence or entropy of the present map.
 UP_TO_A_CONSTANT = {"kl", "negative-entropy"}
 # Values of one map differ from fixation to fixation by 0.01 (kl) and by 1e-4 (the others), or more.
-DOUBLE, SINGLE = 1e-9, {"kl": 5e-5, "negative-entropy": 1e-6, "two-peaks": 5e-7}
+DOUBLE, SINGLE = 1e-9, {"kl": 5e-5, "negative-entropy": 1e-6, "two-peaks": 5e-7, "probability-of-improvement": 1e-4}
 
 
 def assert_agree(got, wanted, tolerance, constant=False):
@@ -168,7 +188,9 @@ def assert_agree(got, wanted, tolerance, constant=False):
 def test_exploration(name, paper):
     wanted, function = EXPLORATION[name](paper), Policy(name, paper.model)(None, paper.grid)
     assert_agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
-    assert_agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
+    assert_agree(
+        paper.values(function, torch.float32), wanted, SINGLE.get(name, 2e-6), constant=name in UP_TO_A_CONSTANT
+    )
 
 
 @pytest.mark.parametrize("target", [1, 4])
@@ -203,3 +225,18 @@ def test_the_constant_is_the_value_of_the_present_map(name, metric, paper):
     function = Policy(name, paper.model)(None, paper.grid)
     present = sum(metric(beta) for beta in paper.beta)
     np.testing.assert_allclose(paper.values(function), np.array(paper.total(metric)) - present, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.5, 3.0])
+def test_the_bound_is_kappa_standard_deviations_above_the_mean(kappa):
+    paper = Paper(SHAPES["row"], 5, 3)
+    wanted = paper.change(lambda before, after: bound(after, kappa) - bound(before, kappa))
+    assert_agree(paper.values(acquisition.UpperConfidenceBound(paper.model, paper.grid, kappa=kappa)), wanted, DOUBLE)
+
+
+@pytest.mark.parametrize("margin", [0.01, 0.2])
+def test_an_improvement_is_one_by_a_margin(margin):
+    paper = Paper(SHAPES["row"], 5, 3)
+    wanted = paper.change(lambda before, after: improvement(before, after, margin))
+    function = acquisition.ProbabilityOfImprovement(paper.model, paper.grid, margin=margin)
+    assert_agree(paper.values(function), wanted, DOUBLE)

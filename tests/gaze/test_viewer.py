@@ -19,7 +19,7 @@ def model_of(log):
 def test_cells_are_drawn_as_often_as_the_density_says():
     """Twin: the sum of the density over the fine cells in each cell of the grid, among those not visited."""
     model, terms = model_of(torch.randn(39, 52))
-    grid, draws = Grid(4, 3, (80, 60)), 4000
+    grid, draws = Grid(4, 3, (80, 60)), 2000
     start = torch.full((draws,), 5)
     choice = Viewer(model, terms, grid, start, torch.Generator().manual_seed(1))
     visited = torch.zeros(draws, 12, dtype=torch.bool)
@@ -30,7 +30,7 @@ def test_cells_are_drawn_as_often_as_the_density_says():
     expected = density.view(3, 13, 4, 13).sum((1, 3)).flatten()
     expected[[5, 0]] = 0
     share = torch.bincount(cells, minlength=12) / draws
-    torch.testing.assert_close(share, expected / expected.sum(), atol=0.03, rtol=0)
+    torch.testing.assert_close(share, expected / expected.sum(), atol=0.04, rtol=0)
     torch.testing.assert_close(points, grid.centres[cells])
 
 

@@ -161,8 +161,6 @@ def test_parameters_are_positive_and_finite(bad):
 
 def test_bad_arguments_and_weights_of_cells_are_named():
     for call in [
-        lambda: dirichlet.mean(torch.tensor([1.0, 0.0])),
-        lambda: dirichlet.entropy(torch.tensor([1.0, -1.0])),
         lambda: dirichlet.log_prob(torch.tensor([1.0, torch.nan]), torch.zeros(2)),
         lambda: dirichlet.log_prob(torch.ones(3), torch.zeros(2)),
         lambda: dirichlet.kl_divergence(torch.ones(3), torch.ones(2)),

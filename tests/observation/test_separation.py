@@ -59,33 +59,6 @@ def test_visibility_is_zero_where_nothing_is_ever_detected():
     assert bool((seen[1:, :2] > 0).all())
 
 
-def test_visibility_falls_as_the_miss_rate_grows(dtype, device):
-    rates = torch.linspace(0, 0.95, 8, dtype=dtype)
-    missed = torch.stack([torch.full_like(rates, 0.5), *[rates] * 3])
-    one = make_model(dtype, levels=1)
-    alpha = one.alpha.detach().expand(4, 8, 4)
-    model = FovealObservationModel(alpha, [0.1 * n for n in range(1, 8)], one.classes, miss_rate=missed).to(device)
-    got = visibility(model)[1:].detach()
-    assert got.dtype == dtype
-    assert got.device.type == device.type
-    assert bool((got.diff(dim=-1) < 0).all())
-
-
-@pytest.mark.parametrize("name", ["yolov3-tiny-published", "yolox-nano-published"])
-def test_visibility_with_the_published_fovea_falls_with_distance(name):
-    """For nearly all classes, and on average at every step away from the fovea."""
-    seen = visibility(FovealObservationModel.from_pretrained(name).double()).detach()[1:]
-    assert bool(seen.isfinite().all())
-    assert bool((seen.mean(0).diff() < 0).all())
-    assert float((seen[:, 0] > seen[:, -1]).double().mean()) > 0.95
-
-
-def test_gradients():
-    alpha = make_model().alpha.detach().requires_grad_()
-    target, background = (make_model(seed=seed).alpha.detach().requires_grad_() for seed in (1, 2))
-    assert torch.autograd.gradcheck(log_ratio_moments, (alpha, target, background))
-
-
 def test_a_model_without_miss_rates_is_refused():
     with pytest.raises(InputError, match="model: expected an observation model with miss rates"):
         visibility(FovealObservationModel.identity(["a"], [0.1]))

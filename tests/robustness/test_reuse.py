@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 import semfov
-from semfov import DirichletBelief, acquisition, fusion
 from semfov.gaze import select_fixation
-from tests.small import beliefs, model, rand
+from tests.small import model, rand
 
 
 def test_vmap_of_the_choice_equals_a_loop():
@@ -32,20 +31,6 @@ def test_vmap_of_gradients_equals_a_loop():
     for one, eccentricity, gradient in zip(scores, distance, every, strict=True):
         one = one.clone().requires_grad_()
         torch.testing.assert_close(torch.autograd.grad(surprise(one, eccentricity), one)[0], gradient)
-
-
-def test_gradients_of_acquisition_values_reach_gaze_and_width_of_the_fovea():
-    """Sensor, calibration, fusion and acquisition in one graph."""
-    gaze, width = torch.tensor([30.0, 20.0], requires_grad=True), torch.tensor(9.0, requires_grad=True)
-    view = semfov.foveate(rand(1, 3, 48, 64), gaze, sigma=width)
-    scores = view.mean((-1, -2)) @ rand(3, 4)
-    likelihood = model()(scores.softmax(-1), torch.tensor([0.1]))
-    beta = fusion.kaplan(beliefs()[:1], likelihood[:, None])
-    belief = DirichletBelief(beta)
-    acquisition.TargetPosterior(2)(belief, belief.closest == 0).sum().backward()
-    for leaf in (gaze, width):
-        assert bool(torch.isfinite(leaf.grad).all())
-        assert float(leaf.grad.abs().sum()) > 0
 
 
 @pytest.mark.parametrize("size", [(48, 64), (200, 300)])

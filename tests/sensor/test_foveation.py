@@ -11,8 +11,13 @@ CONVENTIONS = ("kornia", "opencv")
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("growth", [1.0, 2.0])
-@pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6), pytest.param((164, 171), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("size", "growth"),
+    [
+        *((size, growth) for size in ((16, 24), (17, 13), (1, 1), (1, 6)) for growth in (1.0, 2.0)),
+        pytest.param((164, 171), 2.0, marks=pytest.mark.slow),
+    ],
+)
 def test_foveation_equals_plain_loops(reference_sensor, convention, growth, size):
     image, sigma = draw(1, 2, *size), (4.0, 2.5) if max(size) < 100 else (30.0, 30.0)
     settings = {"levels": 3, "growth": growth, "convention": convention}
@@ -55,34 +60,6 @@ def test_sigma_may_differ_between_images_and_axes(convention, size):
     close(equal[1:], foveate(image[1:], gaze[1:], sigma=9.0, convention=convention))
 
 
-@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_a_fixation_far_outside_shows_only_the_coarsest_level(size):
-    image = draw(1, 3, *size, dtype=torch.float32)
-    far = foveate(image, torch.tensor([1e6, -1e6]), sigma=5.0)
-    assert torch.isfinite(far).all()
-    close(far, foveate(image, torch.tensor([-1e30, 1e30]), sigma=5.0), 0)
-    # No window reaches the image, so only the coarsest level remains: an enlarged image of a few pixels.
-    assert far.std() < 0.1 * image.std()
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_pyramid_can_be_reused(convention):
-    image = draw(2, 3, 170, 164)
-    sensor = Foveation(8.0, levels=4, growth=1.5, convention=convention)
-    bands = sensor.pyramid(image)
-    with torch.no_grad():
-        kept = [level.clone() for level in (*bands.details, bands.base)]
-        views = []
-        for x in (0.0, 7.0, 100.0):
-            gaze = torch.tensor([x, 9.0])
-            views.append((sensor(bands, gaze), sensor(image, gaze)))
-    # Compared after the last fixation, because a later view must not overwrite an earlier one.
-    for reused, direct in views:
-        close(reused, direct, 0)
-    for level, then in zip((*bands.details, bands.base), kept, strict=True):
-        assert torch.equal(level, then)
-
-
 @pytest.mark.parametrize("levels", [0, 3])
 @pytest.mark.parametrize("size", [(170, 164), (163, 2)])
 def test_arguments_are_not_modified(levels, size):
@@ -103,6 +80,7 @@ def test_writing_to_a_view_does_not_change_other_views(size):
         first[0, 0].zero_()
         assert torch.equal(first[0, 1], expected[0, 1])
         assert torch.equal(foveate(bands, gaze, sigma=5.0), expected)
+        assert torch.equal(first[0, 1], expected[0, 1])
 
 
 @pytest.mark.parametrize("levels", [0, 3])
@@ -162,17 +140,6 @@ def test_gradients_in_single_precision(convention):
         close(single, double, 1e-5)
 
 
-def test_gradients_are_finite_after_inference_mode():
-    image = draw(1, 1, 135, 142, dtype=torch.float32)
-    gaze = torch.tensor([30.0, 40.0], requires_grad=True)
-    with torch.inference_mode():
-        expected = foveate(image, gaze, sigma=11.0)
-    result = foveate(image.clone().requires_grad_(), gaze, sigma=11.0)
-    result.sum().backward()
-    close(result.detach(), expected.clone(), 1e-6)
-    assert torch.isfinite(gaze.grad).all()
-
-
 @pytest.mark.parametrize("sigma", [1e-30, 1e-3, 1e30, math.inf])
 def test_views_and_gradients_are_finite_for_extreme_sigma(sigma):
     image = draw(1, 1, 20, 27, dtype=torch.float32).requires_grad_()
@@ -185,19 +152,6 @@ def test_views_and_gradients_are_finite_for_extreme_sigma(sigma):
     assert sigma < 1e-3 or torch.isfinite(gaze.grad).all()
 
 
-def test_gaze_gradient_through_a_reused_pyramid():
-    bands = laplacian_pyramid(draw(1, 3, 150, 132), 4)
-    for _ in range(2):
-        gaze = torch.tensor([60.0, 70.0], dtype=torch.float64, requires_grad=True)
-        view = foveate(bands, gaze, sigma=20.0)
-        view.square().mean().backward()
-        step = torch.tensor([0.01, 0.0], dtype=torch.float64)
-        with torch.no_grad():
-            ahead, behind = (foveate(bands, gaze + s * step, sigma=20.0).square().mean() for s in (1, -1))
-        assert gaze.grad is not None
-        torch.testing.assert_close(gaze.grad[0], (ahead - behind) / 0.02, rtol=1e-5, atol=0)
-
-
 def test_learnable_sigma():
     image, gaze = draw(1, 1, 24, 24, dtype=torch.float32), torch.tensor([8.0, 8.0])
     assert not Foveation(5.0)(image, gaze).requires_grad
@@ -205,13 +159,6 @@ def test_learnable_sigma():
     sensor(image, gaze).square().mean().backward()
     assert sensor.log_sigma.grad is not None
     assert sensor.log_sigma.grad.abs() > 0
-    target = foveate(image, gaze, sigma=9.0)
-    optimiser = torch.optim.Adam(sensor.parameters(), lr=0.05)
-    for _ in range(60):
-        optimiser.zero_grad()
-        (sensor(image, gaze) - target).square().mean().backward()
-        optimiser.step()
-    assert abs(sensor.sigma.item() - 9.0) < 0.5
 
 
 def test_dtype_and_device_follow_a_large_image(dtype, device):

@@ -12,7 +12,7 @@ from semfov.sensor.lines import Taps, banded, separable
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(
-    tiles=st.integers(1, 30),
+    tiles=st.integers(1, 10),
     tile=st.integers(1, 16),
     shift=st.integers(1, 16),
     reach=st.integers(0, 20),

@@ -102,27 +102,6 @@ def test_constant_image_stays_constant(size, gaze, fovea, spacing):
     close(sensor(image, torch.tensor(gaze)), image, 1e-9)
 
 
-def contrast(wavelength, fovea, size=801):
-    """Remaining contrast of a grating at each eccentricity along the x-axis, `(size // 2,)`."""
-    phase = torch.arange(size, dtype=torch.float64) * (2 * math.pi / wavelength)
-    waves = torch.stack([phase.cos(), phase.sin()])[None, :, None].expand(1, 2, 65, size)
-    shown = LogPolar(fovea)(waves, torch.tensor([size // 2, 32.0]))[0, :, 32]
-    # Only the amplitude of a wave changes, not its phase, so its product with the input is the amplitude.
-    return (shown * waves[0, :, 32]).sum(0)[size // 2 :]
-
-
-def test_acuity_falls_off_with_eccentricity_by_the_formula():
-    """Where 1 + r / a doubles, so do the distances of receptors and the wavelength that they resolve."""
-    fovea = 40.0
-    half = {}
-    for wavelength in (8, 16, 32):
-        kept = torch.nn.functional.avg_pool1d(contrast(wavelength, fovea)[None, None], wavelength, 1)[0, 0]
-        half[wavelength] = int((kept < 0.5).nonzero()[0]) + wavelength / 2
-    spread = {wavelength: 1 + place / fovea for wavelength, place in half.items()}
-    assert spread[16] / spread[8] == pytest.approx(2, rel=0.1)
-    assert spread[32] / spread[16] == pytest.approx(2, rel=0.1)
-
-
 def test_fewer_receptors_than_pixels():
     sensor = LogPolar(60.0)
     rings, wedges = sensor.retina.receptors((640, 480))

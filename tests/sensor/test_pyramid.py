@@ -105,16 +105,6 @@ def test_strided_images_empty_batches_and_vmap_by_kornia():
     assert [level.shape[0] for level in levels_of(image[:0], 2)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize("levels", [1, 5])
-def test_sums_of_bands_equal_the_gaussian_pyramid_of_kornia(levels):
-    image = draw(1, 3, 160, 224)
-    bands = laplacian_pyramid(image, levels)
-    expected = kornia.build_pyramid(image, levels + 1)
-    close(bands.base, expected[-1])
-    for band, fine, coarse in zip(bands.details, expected, expected[1:], strict=False):
-        close(band, fine - kornia.pyrup(coarse))
-
-
 @pytest.mark.parametrize("size", SIZES + LARGE)
 def test_pyrdown_equals_opencv(size, device):
     image = draw(1, 3, *size, dtype=torch.float32, device=device)
@@ -152,51 +142,6 @@ def test_sum_of_expanded_bands_is_the_image(convention, size):
     for band in reversed(bands.details):
         result = band + pyrup(result, tuple(band.shape[-2:]), convention)
     close(result, image, 1e-14)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("levels", [0, 1, 4])
-def test_sizes_of_the_bands(convention, levels):
-    bands = laplacian_pyramid(draw(1, 1, 150, 45), levels, convention)
-    rounded = (lambda n: n // 2) if convention == "kornia" else (lambda n: -(-n // 2))
-    size = (150, 45)
-    for band in bands.details:
-        assert tuple(band.shape[-2:]) == size
-        size = tuple(rounded(n) for n in size)
-    assert tuple(bands.base.shape[-2:]) == size
-    assert len(bands.details) == levels
-
-
-def test_positions_of_pixels_in_every_level():
-    # Away from the borders every level reproduces a ramp, so its values are the positions of the pixels.
-    ramp = torch.arange(256, dtype=torch.float64).expand(1, 1, 160, 256)
-    for convention in CONVENTIONS:
-        bands = laplacian_pyramid(ramp, 4, convention)
-        level = ramp
-        for k in range(4):
-            inner = slice(4, -4)
-            close(bands.places(k, -1)[inner], level[0, 0, 0][inner], 1e-9)
-            level = pyrdown(level, convention)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(6, 5), (3, 162), (164, 4)])
-def test_gradients(convention, size):
-    image = draw(1, 1, *size).requires_grad_()
-    fast = max(size) > 100
-    assert torch.autograd.gradcheck(lambda x: pyrdown(x, convention), image, fast_mode=fast)
-    target = (2 * size[0], 2 * size[1] - 1)
-    assert torch.autograd.gradcheck(lambda x: pyrup(x, target, convention), image, fast_mode=fast)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_pyramid_is_equal_with_and_without_gradients(convention):
-    image = draw(1, 2, 163, 172)
-    recorded = laplacian_pyramid(image.clone().requires_grad_(), 3, convention)
-    with torch.no_grad():
-        plain = laplacian_pyramid(image, 3, convention)
-    for a, b in zip((*recorded.details, recorded.base), (*plain.details, plain.base), strict=True):
-        close(a.detach(), b, 1e-14)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -23,19 +23,6 @@ def test_mean_and_max_equal_a_brute_force(height: int, width: int, columns: int,
         np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
 
 
-def test_the_most_salient_unvisited_cell_holds_the_most_salient_pixel_left() -> None:
-    """Luzio, Bernardino and Moreno (2024, section IV-B): after each fixation the pixels of its cell are nullified."""
-    saliency = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 0.1
-    left, visited = saliency[0].clone(), torch.zeros(20, dtype=torch.bool)
-    for _ in range(20):
-        y, x = divmod(int(left.argmax()), 40)
-        row, column = y // 6, x // 10
-        values = cell_saliency(saliency, 4, 5, "max")[0].masked_fill(visited, -torch.inf)
-        assert int(values.argmax()) == row * 4 + column
-        visited[row * 4 + column] = True
-        left[row * 6 : row * 6 + 6, column * 10 : column * 10 + 10] = 0
-
-
 def test_gradients_and_compilation() -> None:
     saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
     for reduction in ("mean", "max"):

@@ -191,17 +191,17 @@ def test_wrong_features_are_named(model, maps, change, words):
 
 
 def test_draws_have_the_density_of_the_next_fixation(model, maps):
-    """Pearson's chi-square of 2,000 draws in 12 regions, below its 0.9999 quantile."""
+    """Pearson's chi-square of 1,000 draws in 12 regions, below its 0.9999 quantile."""
     size = (39, 52)
     terms = {name: each[:1] for name, each in model.terms(maps, size).items()}
     start = torch.tensor([[20.0, 15.0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    paths = model.sample(terms, size, start.expand(2_000, -1), 2, generator)
+    paths = model.sample(terms, size, start.expand(1_000, -1), 2, generator)
     probability = model.given(terms, size, start[:, None])
     probability = torch.stack([*probability.values()]).sum(0).flatten().softmax(0).view(39, 52)
     x, y = paths[:, 1].add(0.5).floor().long().clamp(min=0).unbind(1)
     region = torch.arange(39)[:, None] // 13 * 4 + torch.arange(52) // 13
-    expected = torch.zeros(12, dtype=torch.float64).index_add_(0, region.flatten(), probability.flatten()) * 2_000
+    expected = torch.zeros(12, dtype=torch.float64).index_add_(0, region.flatten(), probability.flatten()) * 1_000
     counts = region[y, x].bincount(minlength=12)
     assert float(((counts - expected) ** 2 / expected).sum()) < 37.4
 

@@ -14,9 +14,8 @@ import torch
 import yaml
 from safetensors import safe_open
 
+from tests.lab.commands.table import COMMANDS, MODEL, RUN, write_material
 from tests.small import once
-
-from .table import COMMANDS, MODEL, RUN, write_material
 
 ROOT = Path(__file__).parents[3]
 
