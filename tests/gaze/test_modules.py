@@ -12,6 +12,7 @@ class AcquisitionTester(GraphTester):
     """For functions of a belief and of the distance from each cell to the closest fixation."""
 
     batched = (0, 1)
+    one_trace = False
 
     def inputs(self):
         return memory()

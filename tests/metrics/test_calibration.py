@@ -64,13 +64,6 @@ def test_sums_equal_loops(dtype, device):
         assert sums.bins[:, number].tolist() == pytest.approx([inside.sum(), q[inside].sum(), y[inside].sum()])
 
 
-def test_the_edges_include_those_of_fifteen_equal_bins():
-    edges = AddedSums.EDGES.tolist()
-    assert edges == sorted(edges)
-    assert edges[6:] == [b / 15 for b in range(1, 15)]
-    assert max(edges[:6]) < 1 / 15
-
-
 predictions = st.lists(st.tuples(st.floats(0, 1, width=32), st.booleans()), max_size=30)
 
 

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from PIL import Image
 
 from semfov import Detections, Grid, InputError
@@ -40,16 +39,6 @@ def searched(request):
 @pytest.fixture
 def frames():
     return [np.full((31, 41, 3), shade, np.uint8) for shade in (0, 100, 200)]
-
-
-def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
-    Film(frames, 0.5, 1.5).save(tmp_path / "a.gif")
-    with Image.open(tmp_path / "a.gif") as film:
-        assert film.n_frames == 3
-        for number, (shade, duration) in enumerate([(0, 500), (100, 500), (200, 2000)]):
-            film.seek(number)
-            assert film.info["duration"] == duration
-            np.testing.assert_allclose(np.asarray(film.convert("RGB")), shade, atol=2)
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
@@ -116,10 +105,3 @@ def test_frames_share_their_colours_and_do_not_depend_on_earlier_ones(searched):
     # Parts that do not change must not flicker.
     first, *others = _in_one_palette(_look_frames(*searched))
     assert all(frame.getpalette() == first.getpalette() for frame in others)
-
-
-def test_render_gives_the_pixels_of_the_figure():
-    figure = Figure(figsize=(1, 0.5), facecolor="#336699")
-    (frame,) = render([figure], dpi=100)
-    assert frame.shape == (50, 100, 3)
-    assert (frame == [0x33, 0x66, 0x99]).all()

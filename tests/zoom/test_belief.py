@@ -60,16 +60,6 @@ def test_long_pictures_are_searched(detector, evidence, size):
     assert path.lattice.levels > 4
 
 
-def test_pooling_of_all_windows_equals_pooling_of_each():
-    scores = torch.rand(9, 11, 4, generator=torch.Generator().manual_seed(0)) ** 8
-    top, summary = (each.flatten(0, 1) for each in pool_spans(scores, [3])[0])
-    assert top.shape == (63, 4)
-    for number, (row, column) in enumerate((r, c) for r in range(7) for c in range(9)):
-        one, one_summary = pool(scores, (column, row, column + 3, row + 3))
-        torch.testing.assert_close(top[number], one)
-        torch.testing.assert_close(summary[number], one_summary)
-
-
 def test_pooling_of_several_sizes_at_once_equals_pooling_of_each_window():
     """Also of windows that are longer than a side of the map."""
     scores = torch.rand(9, 20, 4, generator=torch.Generator().manual_seed(1)) ** 8
@@ -153,16 +143,6 @@ def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
         assert odds_of(belief, window) == pytest.approx(float(table[row, column]), abs=1e-4)
 
 
-def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
-    lattice = belief.lattice
-    window, value = best_find(belief, set())
-    finest = on_lattice(lattice, (lattice.levels - 1, *window.cells[:2]))
-    before = belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]].copy()
-    belief.add(glances.see([finest])[0])
-    assert belief.value(lattice.levels - 1, 0.0)[window.cells[1], window.cells[0]] < before
-    assert value > 0
-
-
 @pytest.mark.parametrize("target", [1, 2, 3])
 def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(glances, evidence, target):
     lattice = glances.lattice
@@ -178,22 +158,6 @@ def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(gl
     assert count > lattice.levels
     # Only when nothing is left to see does a search without thresholds end.
     assert (closest == lattice.levels - 1).all()
-
-
-def test_foresight_counts_only_cells_that_were_not_seen_as_closely(belief, glances):
-    lattice = belief.lattice
-    done = {on_lattice(lattice, (0, 0, 0))}
-    # The whole first level was looked at: another look at it has no value beyond its own finds.
-    across, down = lattice.places(1)
-    for row in range(0, down, lattice.span(1) // 2):
-        for column in range(0, across, lattice.span(1) // 2):
-            window = on_lattice(lattice, (1, column, row))
-            belief.add(glances.see([window])[0])
-            done.add(window)
-    assert (belief.source >= 1).all()
-    window, value = best_find(belief, done, foresight=1.0)
-    assert window.level > 1
-    assert value > 0
 
 
 def test_no_window_is_chosen_twice(belief):
@@ -213,19 +177,6 @@ def test_batches_are_chosen_jointly(belief):
     assert chosen[0][0] == first
     values = [value for _, value in chosen]
     assert values == sorted(values, reverse=True)
-
-
-def test_a_saved_model_is_loaded_unchanged(tmp_path, evidence):
-    evidence.patience, evidence.foresight = 3.5, 0.25
-    evidence.save(tmp_path / "a.safetensors")
-    same = GlimpseEvidence.from_pretrained(tmp_path / "a.safetensors")
-    assert (same.patience, same.foresight) == (3.5, 0.25)
-    scores, summary = torch.rand(5, 3), torch.rand(5, 3)
-    every = same.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3]))
-    torch.testing.assert_close(every, evidence.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3])))
-    for target in (1, 2, 3):
-        one = same.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3]), target)
-        torch.testing.assert_close(one, every[:, target - 1])
 
 
 def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):

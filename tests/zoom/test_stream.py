@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -74,23 +73,6 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     same_looks(moments, path)
     assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
     assert len(path.closer) == len(moments[-1].closer) == 2
-
-
-def test_windows_are_looked_at_again_after_the_half_life_of_evidence(agent, picture):
-    live, last = agent.episode(rate=math.log(2) / 4.5), {}
-    overviews = []
-    for number in range(30):
-        moment = live.step(picture)
-        window = moment.window
-        # Neither an older look nor a repeated one is among those that count; the overview is looked at in time.
-        assert len({look.window for look in moment.glances}) == len(moment.glances) <= 6
-        if window.level == 0:
-            overviews.append(number)
-        elif window in last:
-            assert number - last[window] > 4.5
-        last[window] = number
-    assert overviews == [*range(0, 30, 5)]
-    assert len(last) < 30 - len(overviews) + 1
 
 
 def test_looks_are_forgotten_by_the_frames_that_passed(agent, picture):
@@ -187,23 +169,6 @@ def test_the_first_frame_decides_how_a_stream_is_looked_at(raw, picture):
     small = raw.live(["red", "blue"]).step(picture[:, :128, :128])
     assert (type(small).__name__, small.targets) == ("WindowMoment", (1, 3))
     assert raw.live(["red"]).describe() == "finding all “red”"
-
-
-def test_frames_of_opencv_and_other_kinds_give_the_same_moments(raw, picture):
-    pixels = (picture * 255).round().byte().permute(1, 2, 0).numpy()
-    given = [
-        ("rgb", picture),
-        ("rgb", pixels),
-        ("bgr", pixels[..., ::-1]),
-        ("bgr", np.ascontiguousarray(pixels[..., ::-1])),
-    ]
-    lives = [(raw.live(how="windows", color=color), frame) for color, frame in given]
-    for _ in range(4):
-        first, *others = [live.step(frame) for live, frame in lives]
-        for other in others:
-            assert other.window == first.window
-            assert other.object_rows() == first.object_rows()
-            assert torch.equal(other.photograph, first.photograph)
 
 
 def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
