@@ -1,6 +1,10 @@
-"""Small tensors are worked on by one thread, because threads that wait for each other cost more than they save."""
+"""Threads: one for small tensors, where waiting for others costs more than they save, and one beside a detector."""
 
+import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -47,3 +51,32 @@ def sizes(values: Iterable[object]) -> Iterator[int]:
             yield from sizes(value)
         elif is_dataclass(value):
             yield from sizes(vars(value).values())
+
+
+def available_cores() -> int:
+    """Number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def beside(work: Callable[[], object] | None, *, idle: bool) -> Iterator[None]:
+    """Have a second thread do some work while the block computes, if the block leaves a core `idle`, or PyTorch does.
+
+    The work is a convenience: it is left out where the cores are shared among processes that one command started, and
+    what fails in it is left to whoever needs its result.
+    """
+    shared = multiprocessing.parent_process() is not None
+    if work is None or shared or not (idle or torch.get_num_threads() < available_cores()):
+        yield
+        return
+
+    def run() -> None:
+        with suppress(Exception), torch.no_grad():
+            work()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()

@@ -1,5 +1,8 @@
 """Small tensors are worked on by one thread, and the number of threads is the same afterwards."""
 
+import multiprocessing
+import threading
+
 import pytest
 import torch
 
@@ -7,7 +10,7 @@ from semfov import DirichletBelief, Grid, acquisition, foveate
 from semfov.belief import fuse
 from semfov.sensor import laplacian_pyramid
 from semfov.sensor import pyramid as pyramids
-from semfov.threads import _MANY_ELEMENTS, one_thread_if_small
+from semfov.threads import _MANY_ELEMENTS, beside, one_thread_if_small
 from tests.small import draw, model
 
 
@@ -66,3 +69,22 @@ def test_hot_paths_use_one_thread(threads, name, monkeypatch):
     assert 1 in counts
     assert counts <= {1, threads}
     assert torch.get_num_threads() == threads
+
+
+def test_work_is_done_beside_a_block_where_a_core_is_left(monkeypatch):
+    """What fails in it is left out, and none is done without a core, or in a process that shares its cores."""
+    names = []
+
+    def work() -> None:
+        names.append(threading.current_thread().name)
+        raise ValueError
+
+    for cores, idle, parent, done in ((1, False, None, 0), (8, False, None, 1), (1, True, None, 1), (8, True, 1, 0)):
+        names.clear()
+        monkeypatch.setattr("semfov.threads.available_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(multiprocessing, "parent_process", lambda parent=parent: parent)
+        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+        with beside(work, idle=idle):
+            pass
+        assert len(names) == done
+        assert threading.current_thread().name not in names

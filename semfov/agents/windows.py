@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from math import isfinite
 from time import perf_counter
 from typing import Any, NamedTuple, Self
@@ -313,14 +313,23 @@ class WindowEpisode(Episode[ZoomPath]):
         self._turns: Iterator[WindowStep[Any]]
         still = self.forgetting is None or self.forgetting.rate == 0
         if isinstance(glances, LiveGlances) and still and not told and glances.lattice.levels > 1:
-            glances.blank = blank_cells(glances.view.picture, glances.lattice)
+            glances.blank = cache(partial(blank_cells, glances.view.picture, glances.lattice))
+        if self.forgetting is None and not told:
+            # The choice after the overview asks for the first, and the record at the end for the second.
+            glances.meanwhile = lambda: (glances.blank(), self._photograph)
         if told:
             self.searches, self._decisions = False, None
             belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
             self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
         elif self.evidence is None or (self._slicing and not self.searches):
-            order = ranked(not_blank(usual_slices(glances.lattice), glances.blank), sought)
-            self._turns = look_by_look(glances, order, None, forgetting=self.forgetting)
+            order = ranked(not_blank(usual_slices(glances.lattice), glances.blank()), sought)
+            self._turns = look_by_look(
+                glances,
+                order,
+                None,
+                forgetting=self.forgetting,
+                guess=lambda looks, done, _: (*order(looks, done), None)[0],
+            )
         elif self.searches and self.target is not None:
             self._turns = look_for(glances, self.evidence, self.target, forgetting=self.forgetting)
         else:

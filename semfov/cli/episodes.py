@@ -38,7 +38,8 @@ from semfov.report import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
-from semfov.runs.workers import available_cores, run_tasks
+from semfov.runs.workers import run_tasks
+from semfov.threads import available_cores
 
 
 class PictureJob(ABC):

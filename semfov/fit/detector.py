@@ -36,7 +36,7 @@ from semfov.runs.scene_run import digest_of, finish
 from semfov.runs.settings import plain
 from semfov.runs.setup import check_sources, detector_options, make_detector
 from semfov.runs.tables import table
-from semfov.runs.workers import available_cores
+from semfov.threads import available_cores
 
 _TITLES = {
     "observation": "Observation model",

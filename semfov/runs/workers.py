@@ -25,6 +25,7 @@ from semfov.errors import InputError, SemfovError
 from semfov.io.code import package_digest
 from semfov.io.files import discard_unfinished
 from semfov.runs.progress import Bar, task_bar
+from semfov.threads import available_cores
 
 _REACH = 10.0
 """Seconds in which a scheduler must answer."""
@@ -110,11 +111,6 @@ _TURNS = 8
 
 _PATIENCE = 5
 """Number of times that a cluster may be lost before its tasks count as failed."""
-
-
-def available_cores() -> int:
-    """Number of CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_tasks(

@@ -1,6 +1,7 @@
 """The belief about a large picture: what the looks so far predict that closer looks will show."""
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -101,9 +102,10 @@ class ZoomBelief:
     Shapes: source, left and blank `(rows, columns)`.
     """
 
-    def __init__(self, lattice: Lattice, evidence: Rates, target: int, blank: Tensor | None = None) -> None:
-        self.lattice, self.target = lattice, target
-        self._there = torch.ones(lattice.rows, lattice.columns) if blank is None else 1 - blank.float()
+    def __init__(
+        self, lattice: Lattice, evidence: Rates, target: int, blank: Callable[[], Tensor | None] = lambda: None
+    ) -> None:
+        self.lattice, self.target, self._blank = lattice, target, blank
         self._areas: dict[int, Cells] = {}
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
@@ -118,10 +120,21 @@ class ZoomBelief:
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0
         self.source = torch.full(shape, -1)
-        self.left = self._there.clone()
+        self.__dict__.pop("left", None)
         self.gists: list[Gist] = []
         self._sums: dict[tuple[int, int], _WindowSums] = {}
         self._odds: WindowOdds | None = None
+
+    @cached_property
+    def _there(self) -> Tensor:
+        """Share of each cell where there is something to see, asked for after the overview, `(rows, columns)`."""
+        blank = self._blank()
+        return torch.ones(self.lattice.rows, self.lattice.columns) if blank is None else 1 - blank.float()
+
+    @cached_property
+    def left(self) -> Tensor:
+        """Share of each cell that is left to see, `(rows, columns)`."""
+        return self._there.clone()
 
     @property
     def evidence(self) -> GlimpseEvidence:

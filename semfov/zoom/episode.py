@@ -1,7 +1,7 @@
 """Episodes over the windows of a picture: look, update the belief and choose, for one object of a class, or for all."""
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Generic, TypeVar
 
 from semfov.episode import Forgetting
@@ -15,6 +15,9 @@ _Belief = TypeVar("_Belief", ZoomBelief, None)
 Order = Callable[[Sequence[Glance], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
 none ends the episode."""
+
+Guess = Callable[[Sequence[Glance], set[Window], Window], WindowChoice | None]
+"""Guesses the window to look at after one that is being looked at, the last argument and among the windows."""
 
 
 class WindowStep(Generic[_Belief]):
@@ -98,10 +101,12 @@ def look_by_look(
     *,
     hints: bool = True,
     forgetting: Forgetting | None = None,
+    guess: Guess | None = None,
 ) -> Iterator[WindowStep[_Belief]]:
     r"""Look at the whole picture, and then at the windows of an order, until it has none left.
 
-    The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it.
+    The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it. The
+    one that is guessed is resampled during the look before, by a second thread.
 
     In a stream (`LiveGlances.show`) looks are forgotten. A look counts for :math:`\ln 2 / r` frames, in which half of
     its evidence would fade at the rate r, or until the next look at its window. The window is then free again. The
@@ -116,8 +121,15 @@ def look_by_look(
             return [(first, choices[0][1])] if choices else [(recent.oldest, 0.0)]
         return choices
 
+    def prepare(window: Window) -> None:
+        assert guess is not None
+        if likely := guess(recent.looks, recent.windows | {window}, window):
+            glances.prepare(likely[0])
+
     choices: Sequence[WindowChoice] = [(first, float("inf"))]
     while choices:
+        if guess is not None and forgetting is None and len(choices) == 1 and recent.looks:
+            glances.meanwhile = partial(prepare, choices[0][0])
         looks = glances.see([window for window, _ in choices], hints=hints)
         for glance, (_, worth) in zip(looks, choices, strict=True):
             recent.add(glance, glances.frame)
@@ -136,7 +148,10 @@ def look_for(
         choice = best_hit(belief, done)
         return [] if choice is None else [choice]
 
-    return look_by_look(glances, best, belief, forgetting=forgetting)
+    def guess(looks: Sequence[Glance], done: set[Window], window: Window) -> WindowChoice | None:
+        return best_hit(belief, done, beside=window)
+
+    return look_by_look(glances, best, belief, forgetting=forgetting, guess=guess)
 
 
 def find_everything(
@@ -155,4 +170,7 @@ def find_everything(
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
-    return look_by_look(glances, best, belief, hints=False, forgetting=forgetting)
+    def guess(looks: Sequence[Glance], done: set[Window], window: Window) -> WindowChoice | None:
+        return best_find(belief, done, belief.foresight, beside=window)
+
+    return look_by_look(glances, best, belief, hints=False, forgetting=forgetting, guess=guess)

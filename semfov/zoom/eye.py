@@ -1,7 +1,7 @@
 """An eye for pictures larger than the detector's input, which looks at windows at a chosen magnification."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,6 +17,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.selection import select
 from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import edges_at
+from semfov.threads import beside
 from semfov.zoom.hints import Hints, hints_of
 from semfov.zoom.lattice import Lattice
 
@@ -24,6 +25,8 @@ Cut = Literal["keep", "drop", "background"]
 _Limit = tuple[float, float, float, float]
 _Frame = tuple[int, int, int, int, int, int, int, int]
 """`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
+
+Resampled = tuple[Tensor, list[_Frame]]
 
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
@@ -120,7 +123,14 @@ class WindowEye(nn.Module):
         return self.glance(view, fixations).detections
 
     def glance(
-        self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None, *, hints: bool = True
+        self,
+        view: WindowView,
+        fixations: Tensor,
+        within: Sequence[_Limit | None] | None = None,
+        *,
+        hints: bool = True,
+        resampled: Resampled | None = None,
+        meanwhile: Callable[[], object] | None = None,
     ) -> WindowLooks:
         """Look at a picture and return hints too.
 
@@ -129,15 +139,18 @@ class WindowEye(nn.Module):
             fixations: `(F, 3)` or `(F, 2)`, as for `look`.
             within: for each look the box of the picture that it shows; None shows all that fits the canvas.
             hints: whether hints are wanted.
+            resampled: the windows, if they were resampled before (`resample`).
+            meanwhile: work for a second thread while the detector computes, where a core is left for it.
 
         Returns:
             Detections and hints of each look.
         """
-        canvas, frames = self._resample(view, fixations, within)
+        canvas, frames = self.resample(view, fixations, within) if resampled is None else resampled
         exact, here = canvas.dtype == torch.uint8, canvas.device
         canvas = canvas.to(next(self.detector.parameters(), canvas).device)
-        proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
-        candidates = proposals.precise()
+        with beside(meanwhile, idle=canvas.device.type != "cpu"):
+            proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
+            candidates = proposals.precise()
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
         border = _WIDE_BORDER if view.lattice.levels == 1 else BORDER
@@ -174,13 +187,20 @@ class WindowEye(nn.Module):
         Raises:
             InputError: a fixation is not finite, or its magnification is not positive.
         """
-        canvases, frames = self._resample(view, fixations, within)
+        canvases, frames = self.resample(view, fixations, within)
         return _unit(canvases), torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)
 
-    def _resample(
-        self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None
-    ) -> tuple[Tensor, list[_Frame]]:
-        """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames; the canvases are bytes if the padding is a byte."""
+    def resample(self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None) -> Resampled:
+        """Resample windows for `glance`.
+
+        Args:
+            view: the picture, from `open`.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+            within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+
+        Returns:
+            Canvases `(F, 3, h, w)`, RGB from 0 to 255, as bytes if the padding is a byte; and frames as of `glimpse`.
+        """
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)

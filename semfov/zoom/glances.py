@@ -1,7 +1,7 @@
 """Windows of a picture, and the results of looks at them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.zoom.eye import WindowEye, WindowLooks, WindowView
+from semfov.zoom.eye import Resampled, WindowEye, WindowLooks, WindowView
 from semfov.zoom.hints import Gist, Hints, gist
 from semfov.zoom.lattice import Lattice
 
@@ -92,8 +92,13 @@ class Glances(ABC):
 
     lattice: Lattice
     frame: float = 0
-    blank: Tensor | None = None
-    """Cells where there is nothing to see, `(rows, columns)`; None for none."""
+    blank: Callable[[], Tensor | None] = staticmethod(lambda: None)
+    """Gives the cells where there is nothing to see, `(rows, columns)`; None for none."""
+    meanwhile: Callable[[], object] | None = None
+    """Work for a second thread during the next look, where a detector leaves a core for it."""
+
+    def prepare(self, window: Window) -> None:  # noqa: B027
+        """Resample the window that is likely to be looked at next; stored looks need nothing."""
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
@@ -105,17 +110,31 @@ class LiveGlances(Glances):
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
+        self._prepared: dict[Window, Resampled] = {}
 
     def show(self, view: WindowView, frame: float) -> None:
         """Take the next frame of a stream, which has the size of the first, and the number of frames until it."""
         self.view, self.frame = view, frame
+        self._prepared.clear()
+
+    def prepare(self, window: Window) -> None:
+        """Resample the window that is likely to be looked at next."""
+        self._prepared[window] = self.eye.resample(self.view, *_aims([window]))
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Resample the windows and detect in them."""
-        fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         hints = hints or any(_points_closer(window, self.lattice) for window in windows)
-        looks = self.eye.glance(self.view, fixations, [window.within for window in windows], hints=hints)
+        resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
+        self._prepared.clear()
+        meanwhile, self.meanwhile = self.meanwhile, None
+        looks = self.eye.glance(self.view, *_aims(windows), hints=hints, resampled=resampled, meanwhile=meanwhile)
         return [_glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
+
+
+def _aims(windows: Sequence[Window]) -> tuple[Tensor, list[tuple[float, float, float, float] | None]]:
+    """Fixations `(F, 3)` of windows, and the boxes that they are limited to."""
+    fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
+    return fixations, [window.within for window in windows]
 
 
 def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:

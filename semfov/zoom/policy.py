@@ -14,26 +14,34 @@ WindowChoice = tuple[Window, float]
 """A window and the value of a look at it."""
 
 
-def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> WindowChoice | None:
+def best_find(
+    belief: ZoomBelief, done: set[Window], foresight: float = 0.0, *, beside: Window | None = None
+) -> WindowChoice | None:
     r"""Choose the window in which a look is expected to find most objects that were not found yet.
 
     .. math:: v(w) = E[n_k(w)] + \kappa \, E[n_{k+1}(w)]
 
     for windows w of all levels k but the first. The second term counts only cells that were not looked at from level k
     yet: a look at the other cells gives no new information about where to look more closely.
+
+    A window counts for the share of it that lies `beside` one which is being looked at: an estimate, without a change
+    of the belief, of what will be the best one afterwards.
     """
     lattice = belief.lattice
     best: WindowChoice | None = None
     for level in range(1, lattice.levels):
-        best = _better(best, belief.value(level, foresight), level, lattice, done)
+        best = _better(best, belief.value(level, foresight), level, lattice, done, beside)
     return best
 
 
-def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) -> WindowChoice | None:
+def best_hit(
+    belief: ZoomBelief, done: set[Window], *, closest: bool = False, beside: Window | None = None
+) -> WindowChoice | None:
     """Choose the window that most probably shows the target, or one after which the target is soon found.
 
     The value of a window is the probability that it shows the target. For windows that can be looked at more closely it
-    is the sum of these probabilities over the closer windows in it, divided by `patience`, if that is larger.
+    is the sum of these probabilities over the closer windows in it, divided by `patience`, if that is larger. `beside`
+    is as for `best_find`.
     """
     lattice, patience = belief.lattice, belief.evidence.patience
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
@@ -44,7 +52,7 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
             values = np.zeros_like(values)
         if not last:
             values = np.maximum(values, _sums(belief, chances, level) / np.float32(patience))
-        best = _better(best, values, level, lattice, done)
+        best = _better(best, values, level, lattice, done, beside)
     return best
 
 
@@ -68,9 +76,16 @@ def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells
 
 
 def _better(
-    best: WindowChoice | None, values: Cells, level: int, lattice: Lattice, done: set[Window]
+    best: WindowChoice | None, values: Cells, level: int, lattice: Lattice, done: set[Window], beside: Window | None
 ) -> WindowChoice | None:
     """The better of a choice and the best window of a level that was not looked at."""
+    if beside is not None:
+        (x1, y1, x2, y2), span = beside.cells, lattice.span(level)
+        shares = [
+            (np.minimum(np.arange(n) + span, end) - np.maximum(np.arange(n), first)).clip(0) / span
+            for n, first, end in zip(values.shape, (y1, x1), (y2, x2), strict=True)
+        ]
+        values = values * (1 - np.outer(*shares)).astype(np.float32)
     flat, across = values.ravel(), values.shape[1]
     for _ in range(len(done) + 1):
         place = int(flat.argmax())

@@ -79,7 +79,7 @@ def test_what_is_left_to_see_of_a_window_is_of_what_is_not_blank():
     array, _ = scan()
     lattice = Lattice.over((900, 600), CANVAS)
     cells = blank_cells(open_large(array), lattice)
-    belief = ZoomBelief(lattice, GlimpseEvidence(3, 8), 1, cells)
+    belief = ZoomBelief(lattice, GlimpseEvidence(3, 8), 1, lambda: cells)
     assert belief.left_share == 1
     for level in range(1, lattice.levels):
         span = lattice.span(level)

@@ -188,3 +188,24 @@ def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     assert torch.equal(background.cut, keep.cut)
     torch.testing.assert_close(drop.detections.boxes, keep.detections.boxes[:, ~keep.cut])
     assert float(background.detections.confidence[0, background.cut].max()) == 0
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, monkeypatch, learned):
+    """The next windows are guessed and resampled while the detector works; records and files are those of one."""
+    agent = agent if learned else ZoomAgent(agent.eye).eval()
+    prepared, prepare = [], LiveGlances.prepare
+    monkeypatch.setattr(LiveGlances, "prepare", lambda self, window: (prepared.append(window), prepare(self, window)))
+    paths = {}
+    for cores in (torch.get_num_threads(), torch.get_num_threads() + 1):
+        monkeypatch.setattr("semfov.threads.available_cores", lambda cores=cores: cores)
+        assert not prepared
+        paths[cores] = agent.search(picture, "green", passes=6), agent.explore(picture, passes=6, worth=0.0)
+    for alone, helped in zip(*paths.values(), strict=True):
+        assert [look.window for look in alone.glances] == [look.window for look in helped.glances]
+        assert alone.values == helped.values
+        assert torch.equal(alone.photograph, helped.photograph)
+        for name in ("boxes", "scores", "labels", "passes"):
+            assert torch.equal(getattr(alone.candidates, name), getattr(helped.candidates, name))
+    looked = {look.window for path in paths[cores] for look in path.glances}
+    assert looked & set(prepared)
