@@ -17,6 +17,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from semfov.detection.load import load_detector
 from semfov.fit.gaze_model import GazeModelFit, fit_gaze_model, gaze_report, summaries
@@ -37,6 +38,8 @@ class FitGazeConfig(GazeModelFit):
         name: name of the model (none: the detector's name).
         out: folder for the model and the report.
     """
+
+    within: ClassVar[str] = ""
 
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     name: SingleName | None = None

@@ -117,14 +117,12 @@ class _GazeJob:
         """Write scanpaths and page of the pictures so far, and list all files."""
         outcomes = [self.outcomes[number] for number in sorted(self.outcomes)]
         written = [Path(each["density"]) for each in outcomes if "density" in each]
+        # As in the folder, or where two pictures would then have one name, as they were named.
+        names = [Path(source.name).name for source in self.sources]
+        count = Counter(name.lower() for name in names)
+        named = zip(names, self.sources, strict=True)
+        names = [name if count[name.lower()] == 1 else source.name for name, source in named]
         if self.table is not None and outcomes:
-            # As in the folder, or where two pictures would then have one name, as they were named.
-            names = [Path(source.name).name for source in self.sources]
-            count = Counter(name.lower() for name in names)
-            names = [
-                name if count[name.lower()] == 1 else source.name
-                for name, source in zip(names, self.sources, strict=True)
-            ]
             paths = [
                 Fixations(names[number], subject, np.array(points), tuple(each["size"]), np.array(durations))
                 for number, each in sorted(self.outcomes.items())
@@ -134,6 +132,8 @@ class _GazeJob:
             written.insert(0, self.table)
         if self.options.report is not None and outcomes:
             parts = [each["part"] for each in outcomes]
+            for number, part in zip(sorted(self.outcomes), parts, strict=True):
+                part["picture"]["name"] = names[number]
             written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
 

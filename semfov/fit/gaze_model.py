@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ class GazeModelFit(ViewingData, GazeFit):
             strides 8 to 32 that the detector has).
         folds: number of folds for the evaluation (0: none).
     """
+
+    within: ClassVar[str] = "gaze."
 
     layers: tuple[str, ...] = ()
     folds: Whole = 5

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,6 +48,8 @@ class ViewingData(Settings):
         cache: folder for the maps of the pictures (None: the user's cache).
     """
 
+    within: ClassVar[str] = ""  # where these settings are a part of others, its name and a point
+
     fixations: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
     sizes: tuple[str, ...] = ()
@@ -62,7 +64,7 @@ class ViewingData(Settings):
         for name, what in {"pictures": "folder", "sizes": "frame", "seconds": "time"}.items():
             given, expected = len(getattr(self, name)), f"a {what} for each of {number} files of fixations"
             none = not number or (not given and name != "pictures")
-            check(none or given == number, name, expected, given)
+            check(none or given == number, f"{self.within}{name}", expected, given)
 
     @property
     def fingerprint(self) -> list[str]:

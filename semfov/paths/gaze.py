@@ -289,6 +289,8 @@ class GazePrediction:
             InputError: there are no fixations beside the first ones, they are of several pictures, or their frame has
                 other proportions.
         """
+        each_of_them = isinstance(people, Sequence) and all(isinstance(each, Fixations) for each in people)
+        check(each_of_them, "people", "a list of Fixations, one for each person", type(people).__name__)
         check(len(people) > 0, "people", "fixations of at least one person", "none")
         pictures = sorted({each.picture for each in people})
         check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")

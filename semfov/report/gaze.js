@@ -1,7 +1,13 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 let picture = data.pictures[0];
-const steps = stepper({ last: () => picture.maps.length - 1, show, word: () => "fixation", pause: 900 });
+let who = 0; // the number of a viewer; 0 for all
+const steps = stepper({ last, show, word: () => "fixation", pause: 900 });
+
+function last() {
+  const most = picture.maps.length - 1;
+  return who ? Math.min(most, picture.paths[who - 1].length) : most;
+}
 
 for (const [number, each] of data.pictures.entries()) find("picture").add(new Option(each.name, number));
 find("episode-choice").hidden = data.pictures.length < 2;
@@ -37,6 +43,7 @@ function drawPaths(step) {
   if (!find("paths").checked) return;
   const unit = Math.max(...picture.size) / 250;
   picture.paths.forEach((points, viewer) => {
+    if (who && viewer !== who - 1) return;
     const colour = data.colours[viewer % data.colours.length];
     const seen = points.slice(0, step);
     if (!seen.length) return;
@@ -57,7 +64,7 @@ function show() {
   const words = step
     ? `Density of the next fixation after ${step} fixation${step > 1 ? "s" : ""}, the mean of ${there} viewers`
     : "Density of all fixations";
-  find("status").textContent = words;
+  find("status").textContent = who ? `Viewer ${who}. ${words}` : words;
   find("drawing").replaceChildren();
   find("drawing").setAttribute("viewBox", `0 0 ${picture.size.join(" ")}`);
   find("drawing").setAttribute("aria-label", `${words} in ${picture.name}`);
@@ -71,9 +78,24 @@ function choose(number) {
   find("image").src = picture.image;
   find("image").alt = picture.name;
   data.pictures.forEach((_, each) => (find(`facts-${each}`).hidden = each !== number));
+  find("who").replaceChildren(new Option("all viewers", 0), ...picture.paths.map((_, n) => new Option(`viewer ${n + 1}`, n + 1)));
+  follow(Math.min(who, picture.paths.length));
+}
+
+function follow(viewer) {
+  find("who").value = who = viewer;
+  steps.stop();
   steps.start(steps.at);
 }
 
 find("picture").addEventListener("change", (event) => choose(Number(event.target.value)));
+find("who").addEventListener("change", (event) => follow(Number(event.target.value)));
+document.addEventListener("keydown", (event) => {
+  const moves = { ArrowUp: who - 1, ArrowDown: who + 1 };
+  // Lists and the slider use these keys themselves.
+  if (!(event.key in moves) || event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
+  event.preventDefault();
+  follow(Math.min(Math.max(moves[event.key], 0), picture.paths.length));
+});
 for (const layer of ["heat", "contours", "paths"]) find(layer).addEventListener("change", show);
 choose(0);

@@ -47,7 +47,8 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
         "title": escape(title),
         "data": json_script(data),
         "facts": "".join(
-            f'<section class="facts-of" id="facts-{number}">{each["facts"]}</section>'
+            f'<section class="facts-of" id="facts-{number}"><h2>{escape(each["picture"]["name"])}</h2>'
+            f"{each['facts']}</section>"
             for number, each in enumerate(parts)
         ),
     }
@@ -101,7 +102,6 @@ def _facts(prediction: GazePrediction) -> str:
         for place, peak in enumerate(prediction.peaks(), 1)
     )
     return (
-        f"<h2>{escape(prediction.name)}</h2>"
         f'<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
         f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
         '<div class="wide" tabindex="0" role="region" aria-label="Places">'

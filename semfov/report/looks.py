@@ -45,7 +45,7 @@ def looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
         f"Click on the number or the border of a {what} to choose its look, or on a row of the list.</p>"
         f'<div class="looks">{looks}</div>'
-        f'<p class="hint">{data["values"]}A look brought the objects that it shows most sharply.</p></article>'
+        f'<p class="hint">{data["values"]}</p></article>'
     )
 
 
@@ -127,7 +127,7 @@ def _look(data: Data, number: int, place: str) -> str:
     facts = {
         **(where if look["turned"] is None else {"Head": look["turned"]}),
         "Value when it was chosen": value,
-        "Objects that it brought": look["brought"],
+        "Objects that no look shows more sharply": look["brought"],
     }
     if look["value"] is None and number:
         del facts["Value when it was chosen"]

@@ -112,7 +112,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         sentences.append(f"Its value was {look.value:.2g}.")
     if closer is not None:
         sentences.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
-    sentences.append(f"Objects that it brought: {kinds or 'none'}.")
+    sentences.append(f"Objects that no look shows more sharply: {kinds or 'none'}.")
     return {
         "view": jpeg_uri(view.pixels, max(1, round((x2 - x1) * magnification)), quality),
         "box": [round(side) for side in look.region],

@@ -73,12 +73,13 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
 
 
-def test_pictures_of_one_name_stay_apart_in_the_table(run, photos, tmp_path):
+def test_pictures_of_one_name_stay_apart_in_the_table_and_on_the_page(run, photos, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     Image.new("RGB", (50, 40)).save(other / "0.png")
-    table = tmp_path / "gaze.csv"
-    assert run(photos, other / "0.png", "--people", 2, "--out", table)[0] == 0
+    table, page = tmp_path / "gaze.csv", tmp_path / "gaze.html"
+    assert run(photos, other / "0.png", "--people", 2, "--out", table, "--report", page)[0] == 0
+    assert [f"<h2>{folder / '0.png'}</h2>" in page.read_text("utf-8") for folder in (photos, other)] == [True, True]
     sizes = {each.picture: each.size for each in read_table(table)}
     assert sizes == {str(photos / "0.png"): (120, 90), "1.png": (80, 100), str(other / "0.png"): (50, 40)}
 

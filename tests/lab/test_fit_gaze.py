@@ -211,6 +211,8 @@ def test_settings_of_gaze_without_their_fixations_are_refused():
     ]:
         with pytest.raises(InputError, match=told):
             ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
+    with pytest.raises(InputError, match=r"^gaze\.pictures: expected a folder for each of 1 files of fixations, got 0"):
+        GazeModelFit(fixations=(Path("people.csv"),))
     with pytest.raises(InputError, match=r"--gaze\.fixations FILE"):
         FitDetectorConfig(model=Path("yolov3-tiny"), gaze=GazeModelFit(seconds=(3.0,))).named()
 

@@ -212,6 +212,9 @@ def test_what_cannot_be_drawn_or_compared_is_refused(gaze):
         gaze.compare([square])
     with pytest.raises(InputError, match="at least one person"):
         gaze.compare([])
+    for wrong in (None, square, [square, "b.png"]):
+        with pytest.raises(InputError, match=r"^people: expected a list of Fixations, one for each person, got "):
+            gaze.compare(wrong)
     only = Fixations("a.png", "1", np.array([[5.0, 5.0]]), (104, 78))
     with pytest.raises(InputError, match="after the first of each person"):
         gaze.compare([only])

@@ -59,6 +59,25 @@ def test_the_slider_steps_through_the_fixations(opened):
     assert heat(opened) == before
 
 
+def test_one_viewer_can_be_followed(opened):
+    """By the list and by keys, up to the viewer's own last fixation."""
+    lengths = [len(each) for each in predicted("a.png").scanpaths(5, seed=0)]
+    most = int(opened.locator("#fixation").get_attribute("max"))
+    opened.keyboard.press("ArrowDown")
+    opened.keyboard.press("ArrowDown")
+    assert opened.locator("#who").input_value() == "2"
+    opened.keyboard.press("End")
+    assert opened.locator("#number").inner_text() == f"{min(lengths[1], most)} of {min(lengths[1], most)}"
+    assert circles(opened) == min(lengths[1], most)
+    assert opened.locator("#status").inner_text().startswith("Viewer 2. ")
+    opened.locator("#who").select_option(label="viewer 5")
+    assert circles(opened) <= lengths[4]
+    opened.locator("#picture").select_option(label="b.png")
+    assert opened.locator("#who").input_value() == "5"
+    opened.locator("#who").select_option(label="all viewers")
+    assert not opened.locator("#status").inner_text().startswith("Viewer")
+
+
 def test_layers_can_be_switched(opened):
     opened.keyboard.press("ArrowRight")
     opened.locator("#paths").uncheck()

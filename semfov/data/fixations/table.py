@@ -163,6 +163,10 @@ def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     return header, rows
 
 
+_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
+"""First bytes of pictures, whatever the names of their files say."""
+
+
 def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     """Names of the columns of a file, and its lines; decimal commas become points."""
     remedy = _REMEDIES.get(path.suffix.lower())
@@ -170,10 +174,12 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
         raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
     if not path.exists():
         raise DataError(f"{path}: no such file; check the path")
-    if path.suffix.lower() in (*PHOTOGRAPHS, *VIDEOS):
+    check_regular(path)
+    with path.open("rb") as file:
+        drawn = path.suffix.lower() in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
+    if drawn or path.suffix.lower() in VIDEOS:
         got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
         raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
-    check_regular(path)
     try:
         text = read_text(path)
         before = _BEFORE.match(text)

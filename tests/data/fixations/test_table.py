@@ -209,9 +209,11 @@ def test_files_that_are_no_text_are_refused_with_their_reader(tmp_path, kind):
         read_fixations(tmp_path / f"a.{kind}")
 
 
-@pytest.mark.parametrize(("name", "kind"), [("kitchen.JPG", "picture"), ("scene.mp4", "video")])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("kitchen.JPG", "picture"), ("scene.mp4", "video"), ("renamed.csv", "picture")]
+)
 def test_pictures_and_videos_are_refused_as_such(tmp_path, name, kind):
-    (tmp_path / name).write_bytes(b"\xff\xd8")
+    (tmp_path / name).write_bytes(b"\xff\xd8\xff")
     with pytest.raises(DataError, match=rf"expected a table of fixations \(.*\), got a {kind}$"):
         read_fixations(tmp_path / name)
 
