@@ -18,7 +18,6 @@ from semfov.io.state import without_settings
 from semfov.paths import GazePrediction
 from semfov.sensor import foveate
 from tests.small import Coloured
-from tests.small import agent as one_agent
 
 SIZE = (160, 120)
 
@@ -436,26 +435,6 @@ def test_all_objects_are_found_by_the_fovea(agent, image):
     alone = agent.find_all(image, "green", how="fovea", passes=6).objects
     assert set(alone.labels.tolist()) == {2}
     assert any(box == pytest.approx([130, 100, 140, 110], abs=6) for box in alone.boxes.tolist())
-
-
-def test_agents_and_streams_are_printed_in_one_line():
-    agent = one_agent(Coloured(("red", "wine glass")))
-    text = repr(agent)
-    assert ("\n" in text, len(text) < 160) == (False, True)
-    assert "coloured, 2 classes" in text
-    live = agent.live("red", how="fovea")
-    assert repr(live) == "LivePerception: searching for “red”, how='fovea'"
-
-
-def test_words_of_other_libraries_are_refused_with_those_of_an_agent():
-    agent = one_agent(Coloured(("red", "wine glass")))
-    for name in ("detect", "find", "predict"):
-        with pytest.raises(
-            AttributeError, match=f"an agent has search, find_all, explore, gaze and live, not '{name}'"
-        ):
-            getattr(agent, name)
-    with pytest.raises(AttributeError, match=r"has no attribute 'nothing'$"):
-        _ = agent.nothing
 
 
 def test_an_exploration_as_people_look_follows_the_density(agent, image, monkeypatch):

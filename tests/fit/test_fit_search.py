@@ -224,7 +224,7 @@ def test_thresholds_equal_the_best_of_all_combinations(seed):
     def draw(*shape):
         return torch.rand(shape, generator=generator, dtype=torch.float64)
 
-    looks, searched = 5, 40
+    looks, searched = 5, 25
     there = draw(searched) < 0.5
     scale = 0.4 + 0.6 * draw(searched)
     anywhere = (draw(looks, searched) * 0.5 + 0.5 * there) * (scale if seed % 2 else 1)
