@@ -51,22 +51,6 @@ def test_thresholds_change_one_at_a_time():
     assert AT.changed(None, 0.0, 0.5) == Thresholds(0.8, 0.0, 0.5)
 
 
-@pytest.mark.parametrize(
-    ("cells", "visited", "presence", "outcome"),
-    [
-        ([0.2, 0.9, 0.82], [2], 0.9, 1),  # nearly as probable as the best cell
-        ([0.2, 0.9, 0.8], [2], 0.9, 0),
-        ([0.7, 0.05, 0.09], [0], 0.49, 2),
-        ([0.7, 0.05, 0.09], [0], 0.5, 3),
-    ],
-)
-def test_limits_of_the_rule(cells, visited, presence, outcome):
-    known = Known(torch.tensor([cells]), torch.tensor([presence]), torch.zeros(1, 3))
-    seen = torch.zeros(1, 3, dtype=torch.bool)
-    seen[0, visited] = True
-    assert int(decide(SimpleNamespace(belief=known, visited=seen), 1, AT)) == outcome
-
-
 def test_a_search_gives_up_by_the_chance_of_a_hit():
     """The probability of a cell given that no fixated cell holds the target."""
     stated = Known(torch.tensor([[0.7, 0.3, 0.2]]), torch.tensor([0.1]), torch.zeros(1, 3))

@@ -146,9 +146,6 @@ def test_errors_name_file_record_and_field(tmp_path, changes, said):
         ('[{"name": "a", "X": [1], "Y": [1, 2]}]', read_cocosearch, r"\[0\] \(a\): expected as many Y as X"),
         ("picture,subject,x,y\na,1,2,3\n", read_table, "got none named width, height"),
         ("picture,subject,x,y,width,height\na,1,2,?,8,6\n", read_table, r"line 2, y: expected a number, got '\?'"),
-        ("picture,subject,x,y,width,height\na,1,2,,8,6\n", read_table, "line 2, y: expected a number, got nothing"),
-        ("picture,subject,x,y,width,height\na,1,2,3,0,6\n", read_table, "line 2, size"),
-        ("picture,subject,x,y,width,height,found\na,1,2,3,8,6,maybe\n", read_table, "line 2, found"),
     ],
 )
 def test_files_of_another_format_are_refused(tmp_path, content, read, said):
