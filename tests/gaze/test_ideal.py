@@ -98,13 +98,6 @@ def test_localisation_equals_a_simulation_of_responses():
     assert got == pytest.approx(share, abs=5 * (0.25 / count) ** 0.5)
 
 
-def test_without_a_signal_accuracy_is_the_largest_prior():
-    place = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
-    assert float(_correct_localisation(place, torch.zeros(3, dtype=torch.float64))) == pytest.approx(0.5, abs=1e-6)
-    even = torch.full((50,), 0.02, dtype=torch.float64)
-    assert float(_correct_localisation(even, torch.zeros(50, dtype=torch.float64))) == pytest.approx(0.02, abs=1e-4)
-
-
 class Sharp:
     """Sees targets perfectly in the fixated cell, and not at all in other cells."""
 

@@ -79,19 +79,6 @@ def test_the_given_share_of_images_is_foveated():
     assert 30 < changed.sum() < 90
 
 
-def test_gradients():
-    augment = RandomFoveation((3.0, 6.0), levels=2, p=1.0)
-    image = draw(2, 1, 6, 7, dtype=torch.float64).requires_grad_()
-    augment(image)
-    drawn = augment._params
-    gaze, sigma = (drawn[name].double().requires_grad_() for name in ("gaze", "sigma"))
-
-    def view(image, gaze, sigma):
-        return augment(image, params=drawn | {"gaze": gaze, "sigma": sigma})
-
-    assert torch.autograd.gradcheck(view, (image, gaze, sigma))
-
-
 def test_boxes_masks_and_keypoints_are_moved_only_by_a_flip_before_the_foveation(device):
     image, mask = draw(2, 3, 40, 56, device=device), (draw(2, 1, 40, 56, device=device) > 0.5).double()
     boxes = torch.tensor([[[3.0, 4.0, 20.0, 30.0], [0.0, 0.0, 55.0, 39.0]]], device=device).expand(2, 2, 4)
