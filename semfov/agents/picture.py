@@ -54,7 +54,8 @@ class OpenedPicture:
         with suppress(SemfovError):
             file = isinstance(self.source, str | PathLike)
             size = self.large.size if file else picture_size(cast(ImageLike | LargePicture, self.source))
-            return "windows" if photographs or pays(size, canvas) else "fovea"
+            # Windows pay where there are two octaves or more to zoom in.
+            return "windows" if photographs or Lattice.over(size, canvas).levels >= 3 else "fovea"
         return "fovea"
 
     def image(self, like: Tensor) -> Tensor:
@@ -88,8 +89,3 @@ def open_picture(
 ) -> OpenedPicture:
     """Open a picture of any kind; one that is open stays as it is."""
     return source if isinstance(source, OpenedPicture) else OpenedPicture(source, color, white, bands)
-
-
-def pays(size: tuple[int, int], canvas: tuple[int, int]) -> bool:
-    """Tell whether a picture is large enough for windows to pay: whether there are two octaves or more to zoom in."""
-    return Lattice.over(size, canvas).levels >= 3

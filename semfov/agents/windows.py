@@ -11,10 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
-from semfov.agents.picture import pays
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike
-from semfov.data.large import open_large, picture_size
+from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import Decision, check_thresholds
 from semfov.detection.detections import Detections
@@ -105,18 +104,6 @@ class ZoomAgent(nn.Module):
     def classes(self) -> tuple[str, ...]:
         """Names of the classes, background first."""
         return ("background", *self.eye.detector.classes)
-
-    def pays(self, picture: _Picture) -> bool:
-        """Tell whether a picture is large enough for windows to pay.
-
-        Args:
-            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
-
-        Returns:
-            True where there are two octaves or more to zoom in: the longer side of the picture is at least four times
-            that of the detector's input.
-        """
-        return pays(picture_size(picture), self.eye.detector.input_size)
 
     def search(
         self,

@@ -19,7 +19,7 @@ from semfov.cli.truth import Truth, read_truth
 from semfov.data.classes import canonical_name
 from semfov.paths import GazeRecord, Scanpath
 from semfov.report.episode import jpeg
-from semfov.viz.belief import plot_belief_bars, plot_belief_strip
+from semfov.viz.belief import plot_belief, plot_belief_bars
 from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import save_figure
@@ -130,7 +130,7 @@ def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[D
     if isinstance(record, Scanpath):
         figures["views"] = lambda: plot_foveated_strip(record)
         if record.target is not None:
-            figures["belief"] = lambda: plot_belief_strip(record)
+            figures["belief"] = lambda: plot_belief(record, None)
             figures["belief_bars"] = lambda: plot_belief_bars(record)
         else:
             figures["map"] = lambda: plot_semantic_map(record)

@@ -119,7 +119,8 @@ class HeadPath(GazeRecord):
         width, height = self.views.world.size
         for number, detections in enumerate(self.detections):
             boxes, field = detections.boxes[0], float(self.pose(number)[2])
-            distances.append(distances_to(boxes, self._eye(number)) * field / width)
+            point = self.views.view_grid.centres[self.actions[number] % self.views.cells]
+            distances.append(distances_to(boxes, point) * field / width)
             border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
             cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
         return merge_fixations([look.detections for look in self], distances, self.closer, cut=cut, around=self.around)
@@ -206,10 +207,6 @@ class HeadPath(GazeRecord):
             what = f"{self.target_name}: {self.decision.outcome} ({there})"
         return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
 
-    def _eye(self, look: int) -> Tensor:
-        """Fixated point of a look in pixels of its view, `(2,)`."""
-        return self.views.view_grid.centres[self.actions[look] % self.views.cells]
-
     def _looks(self) -> Iterator[RecordedLook]:
         """The looks; regions are the smallest boxes around what they show."""
         world = self.views.world
@@ -261,7 +258,7 @@ class HeadPath(GazeRecord):
                 x1, y1, x2, y2 = (side * by for side, by in zip(look.region, (across, down) * 2, strict=True))
                 left, top, right, bottom = whole_pixels((x1, y1, x2, y2), (image.shape[-1], image.shape[-2]))
                 pixels = resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)
-            x, y = self._eye(look.number).tolist()
+            x, y = self.views.view_grid.centres[self.actions[look.number] % self.views.cells].tolist()
             yield LookView(pixels, world.size, self.detections[look.number].boxes[0], (x, y))
 
     def sensor_in_words(self) -> str:

@@ -5,7 +5,7 @@ last value of a cell. To draw in an existing figure, give its axes as `ax=` or `
 """
 
 from semfov.viz.animation import animate
-from semfov.viz.belief import plot_belief, plot_belief_bars, plot_belief_strip
+from semfov.viz.belief import plot_belief, plot_belief_bars
 from semfov.viz.curves import plot_curves
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.fixation import plot_fixation
@@ -20,7 +20,6 @@ __all__ = [
     "animate",
     "plot_belief",
     "plot_belief_bars",
-    "plot_belief_strip",
     "plot_curves",
     "plot_episode",
     "plot_fixation",

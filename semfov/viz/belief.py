@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
 from semfov.viz.drawing import check_fixation, choose_fixations, draw_cross, draw_image, draw_overlay, draw_scale
-from semfov.viz.style import PROBABILITY, make_figure, only, root, styled
+from semfov.viz.style import PROBABILITY, make_figure, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,45 +34,7 @@ def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
 @styled
 def plot_belief(
     scanpath: Scanpath,
-    fixation: int = -1,
-    *,
-    target: int | None = None,
-    image: Tensor | None = None,
-    ax: Axes | None = None,
-) -> Figure:
-    """Plot the probability of a class in every cell after a fixation, over the photograph in grey.
-
-    The colour scale goes from 0, where the photograph is visible unchanged, to 1. All such figures can be compared.
-
-    Args:
-        scanpath: the episode.
-        fixation: number of the fixation; -1 is the last.
-        target: index of the class; None takes the class that was searched for.
-        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own, where it has one.
-        ax: axes to draw in; None makes a figure.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: there is no such fixation or class.
-
-    Example::
-
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
-        save_figure(plot_belief(scanpath), "belief.pdf")
-    """
-    figure, (axes,) = make_figure(1, 1, width=5.6, height=4.6, layout="compressed", axes=only(ax))
-    drawn = draw_belief(
-        axes, scanpath, check_fixation(scanpath, fixation), target, scanpath.image if image is None else image
-    )
-    draw_scale(axes, drawn, f"probability of {_name(scanpath, target)}")
-    return figure
-
-
-@styled
-def plot_belief_strip(
-    scanpath: Scanpath,
+    fixation: int | None = -1,
     *,
     target: int | None = None,
     image: Tensor | None = None,
@@ -80,13 +42,16 @@ def plot_belief_strip(
     columns: int = 5,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """Plot `plot_belief` for several fixations with a common colour scale.
+    """Plot the probability of a class in every cell after a fixation or several, over the photograph in grey.
+
+    The colour scale goes from 0, where the photograph is visible unchanged, to 1. All such figures can be compared.
 
     Args:
         scanpath: the episode.
+        fixation: number of the fixation; -1 is the last. None shows several: the first ones and the last.
         target: index of the class; None takes the class that was searched for.
-        image: as for `plot_belief`.
-        most: largest number of fixations to show: the first ones and the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own, where it has one.
+        most: largest number of fixations to show.
         columns: number of pictures in a row.
         axes: axes to draw in, one for each fixation that is shown; None makes a figure.
 
@@ -94,24 +59,27 @@ def plot_belief_strip(
         The figure.
 
     Raises:
-        InputError: there is no such class, or an argument is out of range.
+        InputError: there is no such fixation or class, or an argument is out of range.
 
     Example::
 
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
-        save_figure(plot_belief_strip(scanpath, most=4, columns=2), "beliefs.pdf")
+        save_figure(plot_belief(scanpath), "belief.pdf")
+        save_figure(plot_belief(scanpath, None, most=4, columns=2), "beliefs.pdf")
     """
     check(columns >= 1, "columns", "at least 1", columns)
-    fixations, grey = choose_fixations(scanpath, most), scanpath.image if image is None else image
+    fixations = choose_fixations(scanpath, most) if fixation is None else [check_fixation(scanpath, fixation)]
+    grey, (width, height) = scanpath.image if image is None else image, scanpath.grid.extent.tolist()
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
-    width, height = scanpath.grid.extent.tolist()
     size = max(2.6 * columns, 3.2) + 0.6, max(rows * (2.6 * height / width + 0.3), 2.2)
-    figure, panels = make_figure(rows, columns, width=size[0], height=size[1], layout="compressed", axes=axes)
+    wide, high = size if fixation is None else (5.6, 4.6)
+    figure, panels = make_figure(rows, columns, width=wide, height=high, layout="compressed", axes=axes)
     used = panels[: len(fixations)]
-    for panel, fixation in zip(used, fixations, strict=True):
-        drawn = draw_belief(panel, scanpath, fixation, target, grey)
-        panel.set_title(f"fixation {fixation}: {panel.get_title()}", parse_math=False)
+    for panel, number in zip(used, fixations, strict=True):
+        drawn = draw_belief(panel, scanpath, number, target, grey)
+        if fixation is None:
+            panel.set_title(f"fixation {number}: {panel.get_title()}", parse_math=False)
     draw_scale(used, drawn, f"probability of {_name(scanpath, target)}")
     for panel in panels[len(fixations) :]:
         panel.remove()

@@ -16,7 +16,6 @@ from semfov.viz import (
     COLOURS,
     plot_belief,
     plot_belief_bars,
-    plot_belief_strip,
     plot_curves,
     plot_episode,
     plot_fixation,
@@ -154,7 +153,7 @@ def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
 
 
 def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
-    figure = draw(plot_belief_strip(scanpath, image=image, columns=2))
+    figure = draw(plot_belief(scanpath, None, image=image, columns=2))
     belief = scanpath.probabilities[..., 2]
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title()]
     np.testing.assert_allclose([np.asarray(m.get_array()).ravel() for m in maps], belief, rtol=1e-6)
@@ -169,7 +168,7 @@ def test_the_colour_bar_of_a_strip_lies_inside_the_figure(size, looks):
     fixed = {"grid": grid, "cells": cells, "fixations": grid.centres[cells], "values": torch.zeros(looks, 16)}
     belief = torch.full((looks, 16, 2), 0.5)
     classes = "background", "baseball glove"
-    figure = draw(plot_belief_strip(Scanpath(classes=classes, target=1, detections=(), probabilities=belief, **fixed)))
+    figure = draw(plot_belief(Scanpath(classes=classes, target=1, detections=(), probabilities=belief, **fixed), None))
     box, whole = figure.axes[-1].get_tightbbox(), figure.bbox
     assert whole.x0 <= box.x0 < box.x1 <= whole.x1
     assert whole.y0 <= box.y0 < box.y1 <= whole.y1

@@ -21,9 +21,8 @@ def calls(scanpath):
     views = [image] * 3
     p = torch.rand(500, 1)
     return {
-        "plot_belief": ((scanpath,), {"image": image}, "ax"),
+        "plot_belief": ((scanpath, None), {"image": image}, 3),
         "plot_belief_bars": ((scanpath,), {}, 3),
-        "plot_belief_strip": ((scanpath,), {"image": image}, 3),
         "plot_curves": ((CURVES,), {"label": "targets found (%)"}, "ax"),
         "plot_episode": ((scanpath, image, views), {}, "figure"),
         "plot_fixation": ((scanpath, 1, image, image), {}, 3),
