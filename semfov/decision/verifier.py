@@ -87,7 +87,10 @@ class Verifier(Generic[LookType]):
         """Take in a look of the search, and choose the place that is to be looked at closely."""
         self.places.see(look)
         if self.places.forgetting.rate:
-            self.verdicts = [self._followed(verdict) for verdict in self.verdicts]
+            for number, verdict in enumerate(self.verdicts):
+                box = _follow_target(verdict.look.box, self.places.detections, verdict.look.target)
+                if box is not verdict.look.box:
+                    self.verdicts[number] = verdict._replace(look=self.places.move(verdict.look, box))
         self._choose(last=last)
 
     def look(self) -> CloseUp:
@@ -202,12 +205,6 @@ class Verifier(Generic[LookType]):
             return look.place
         return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
 
-    def _followed(self, verdict: _Verdict) -> _Verdict:
-        """The verdict at the place to which a look has followed its target."""
-        look = verdict.look
-        box = _follow_target(look.box, self.places.detections, look.target)
-        return verdict if box is look.box else verdict._replace(look=self.places.move(look, box))
-
     def _recent(self, verdict: _Verdict) -> bool:
         """Whether at least half of the evidence of a closer look is left."""
         return verdict.age <= self.places.forgetting.span
@@ -222,16 +219,9 @@ class Verifier(Generic[LookType]):
 
 
 def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
-    """Move the box of a target to the middle of the detection that best shows it (`best_detection`).
+    """Move the box `(4,)` of a target to the middle of the detection that best shows it; it keeps its size.
 
-    The box keeps its size, because a closer look measures it better than a look of the fovea.
-
-    >>> box, scores = torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]])
-    >>> detections = Detections(box, scores, torch.ones(1, 1).bool())
-    >>> _follow_target(torch.tensor([0.0, 0.0, 8.0, 8.0]), detections, 1)
-    tensor([ 3.,  0., 11.,  8.])
-
-    Shapes: box `(4,)` → `(4,)`.
+    A closer look measures the size better than a look of the fovea.
     """
     real = detections.mask[0]
     boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]

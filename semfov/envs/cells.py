@@ -95,7 +95,7 @@ class CellGazes(Gazes):
         self.action_space = spaces.Discrete(scenery.shape[0] * scenery.shape[1])
         self.belief_space = spaces.Box(0, 1, (classes + 2, *scenery.shape), np.float32)
         super().__init__(scenery, count, **options)
-        self.observer: Observer = scenery.together() if together else scenery.observer
+        self.observer: Observer = scenery.together if together else scenery.observer
         self.looks = _SceneLooks(scenery.open, self.observer, count)
         self.cell = torch.zeros(count, dtype=torch.int64)
         self.size = torch.zeros(count, 2)

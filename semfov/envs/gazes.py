@@ -108,7 +108,11 @@ class Gazes(ABC):
         if "belief" in self.observation_space.spaces:
             entries["belief"] = self.planes(rows)
         if self._side is not None:
-            entries["glimpse"] = self.glimpses(rows, self._side)
+            with torch.inference_mode():
+                size = self._side, self._side
+                views = [interpolate(self._view(row), size, mode="bilinear", antialias=True) for row in rows.tolist()]
+                pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1)
+            entries["glimpse"] = np.ascontiguousarray(pixels.numpy())
         return entries
 
     def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
@@ -132,13 +136,6 @@ class Gazes(ABC):
             for name, array in entries["detections"].items():
                 array[:, :count] = getattr(seen, name).numpy()
         return entries
-
-    @torch.inference_mode()
-    def glimpses(self, rows: Tensor, side: int) -> NDArray[np.uint8]:
-        """Images that the eye sees in the rows `(n,)`, `(n, side, side, 3)`."""
-        views = [interpolate(self._view(row), (side, side), mode="bilinear", antialias=True) for row in rows.tolist()]
-        pixels: NDArray[np.uint8] = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1).numpy()
-        return np.ascontiguousarray(pixels)
 
     @abstractmethod
     def planes(self, rows: Tensor) -> NDArray[np.float32]:

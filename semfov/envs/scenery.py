@@ -82,7 +82,10 @@ class Scenery:
         self.grid = cache(looking.grid)
         self.answers = cache(lambda scene: answers_of(self.annotation(scene), self.grid(scene), len(self.classes)))
         self.open = cache(self._open)
-        self.together = cache(self._together)
+        # The observer that computes a batch at once: faster, but its rounding depends on the batch.
+        self.together = self.observer
+        if isinstance(self.observer, Target | LearnedMap):
+            self.together = type(self.observer)(self.observer.model, together=True)  # type: ignore[arg-type]
         self.view = lru_cache(_VIEWS)(lambda scene: self.eye.open(self.image(scene)[None]))
         if not any(self.episodes(scene) for scene in self.scenes):
             raise DataError(
@@ -117,12 +120,6 @@ class Scenery:
             episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])
             if episodes:
                 return episodes[random.integers(len(episodes))]
-
-    def _together(self) -> Observer:
-        """The observer that computes all episodes of a batch at once: faster, but its rounding depends on the batch."""
-        if not isinstance(self.observer, Target | LearnedMap):
-            return self.observer
-        return type(self.observer)(self.observer.model, together=True)  # type: ignore[arg-type]
 
     def _open(self, scene: int) -> StoredLooks:
         """Stored looks from every cell of a scene."""

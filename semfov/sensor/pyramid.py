@@ -7,7 +7,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape, lookup, values_known
 from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 from semfov.threads import one_thread_if_small
@@ -42,11 +41,6 @@ class Bands:
         """`(height, width)` of the image."""
         height, width = (self.details[0] if self.details else self.base).shape[-2:]
         return height, width
-
-    def places(self, k: int, axis: int) -> Tensor:
-        """Positions of a band's pixels in the image, `(n,)`."""
-        band = self.details[k]
-        return as_positions(pixel_positions(band.shape[axis], self.shape[axis], k, self.convention), band)
 
 
 def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
