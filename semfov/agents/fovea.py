@@ -37,7 +37,7 @@ from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath
 from semfov.paths.scanpath import Trace
-from semfov.paths.stimulus import Stimulus, in_bytes
+from semfov.paths.stimulus import Stimulus, in_bytes, reduced_copy
 from semfov.strategy import Strategy
 
 _WORTH = 0.1
@@ -224,7 +224,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
         if self.forgetting is None:
             self._trace = Trace(grid, self.classes, self.target, self._beside, self.eye.detector.least)
-            self._stimulus = Stimulus.of(self.eye, image)
+            self._kept = {"stimulus": Stimulus.of(self.eye, image), "photograph": reduced_copy(image[0])}
         return grid
 
     def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
@@ -355,14 +355,14 @@ class FoveaEpisode(Episode[Scanpath]):
         """The scanpath so far."""
         decision = self.decision
         if self.target is None or self._last is None:
-            return self._trace.scanpath(stimulus=self._stimulus, ending=self.ending)
+            return self._trace.scanpath(ending=self.ending, **self._kept)
         outcome = OUTCOMES[self._outcome] if decision is None else decision.outcome
         target = class_meant(self._last[0].belief, self.target)
         if self._verifier is not None and outcome == "found":
             target = self._verifier.best.target
         return self._trace.scanpath(
-            stimulus=self._stimulus,
             ending=self.ending,
+            **self._kept,
             target=target,
             found=outcome == "found",
             decision=decision,

@@ -24,7 +24,7 @@ from semfov.errors import check, check_whole
 from semfov.metrics.exploration import count_right
 from semfov.paths import Scanpath
 from semfov.paths.scanpath import Trace
-from semfov.paths.stimulus import Stimulus
+from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.runs.search_protocol import Trial
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation
@@ -163,7 +163,8 @@ class CellGazes(Gazes):
             boxes = objects.boxes[objects.labels == episode.target]
         path = self.scanpath()
         view = self._stimulus.views(path.fixations[-1:])[0]
-        return render([plot_fixation(path, -1, self._stimulus.image, view, boxes=boxes)])[0]
+        image = reduced_copy(scenery.image(episode.scene)).float() / 255
+        return render([plot_fixation(path, -1, image, view, boxes=boxes)])[0]
 
     def scanpath(self) -> Scanpath:
         """The looks of the first episode, which are kept for pictures."""

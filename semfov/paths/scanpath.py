@@ -106,7 +106,7 @@ class Scanpath(GazeRecord):
             for exploration.
         presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
         seconds: time of each look by stage (`semfov.episode.STAGES`); the clock of the episode is their sum so far.
-        stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.
+        stimulus: the data for the foveated views of the photograph; None if it was not kept.
 
     Example::
 
@@ -145,11 +145,6 @@ class Scanpath(GazeRecord):
     def shifts(self) -> int:
         """Number of gaze shifts (saccades): fixations after the start."""
         return len(self) - 1
-
-    @property
-    def image(self) -> Tensor | None:
-        """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
-        return super().image if self.stimulus is None else self.stimulus.image
 
     @property
     def decided_by(self) -> str:
@@ -268,7 +263,7 @@ class Scanpath(GazeRecord):
             "settings": None,
         }
         if self.stimulus is not None:
-            tensors |= {name: getattr(self.stimulus, name) for name in ("photograph", "canvas")}
+            tensors["canvas"] = self.stimulus.canvas
             record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
             record["settings"] = dict(self.stimulus.settings)
         return tensors, record
@@ -287,13 +282,11 @@ class Scanpath(GazeRecord):
         check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         for look in shared["closer"]:
             check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
-        stimulus = Stimulus.restored(tensors, record)
         return {
             "grid": grid,
             **{name: tensors.get(name) for name in (*_TENSORS, *_OPTIONAL)},
             "seconds": tuple(seconds),
-            "stimulus": stimulus,
-            "photograph": shared["photograph"] if stimulus is None else None,
+            "stimulus": Stimulus.restored(tensors, record),
         }
 
 

@@ -1,4 +1,4 @@
-"""The stimulus of an episode: the photograph, and the data for its foveated views, small enough to keep."""
+"""The stimulus of an episode: the data for its foveated views, small enough to keep, and reduced photographs."""
 
 from __future__ import annotations
 
@@ -22,21 +22,19 @@ LONGEST = 1280
 
 @dataclass(frozen=True)
 class Stimulus:
-    """A photograph for figures, and the canvas from which foveated views are made, both as bytes.
+    """The canvas from which foveated views of a photograph are made, as bytes.
 
     The canvas is the photograph fitted into the detector's input, or into the canvas of the sensor. A view is computed
     on request, by applying the sensor of the eye to the canvas. A stimulus from a file has no sensor, so the sensor is
     made from its settings (`sensor_of`).
 
     Attributes:
-        photograph: `(3, h, w)` uint8, RGB, longer side at most `LONGEST` pixels.
         canvas: `(3, H, W)` uint8, RGB.
         placement: scale and position of the photograph on the canvas.
         settings: settings of sensor and detector (`Eye.settings`).
         sensor: sensor of the eye; None makes one from the settings.
     """
 
-    photograph: Tensor
     canvas: Tensor
     placement: Placement
     settings: Mapping[str, Any]
@@ -49,33 +47,22 @@ class Stimulus:
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
             canvas, placement = eye.fit(image)
-            return cls(reduced_copy(image[0]), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
+            return cls(in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
 
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
         """Make the stimulus from the content of a file, and check that its parts fit each other."""
-        pictures = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
         values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
         if "canvas" not in tensors and not values:
             return None
-        check(
-            len(pictures) == len(values) == 2,
-            "photograph",
-            "photograph, canvas, placement and settings together",
-            f"{len(pictures) + len(values)} of these 4",
-        )
-        photograph, canvas = pictures
-        placement = Placement(**{name: tuple(value) for name, value in values[0].items()})
+        got = len(tensors.keys() & {"photograph", "canvas"}) + len(values)
+        check(got == 4, "photograph", "photograph, canvas, placement and settings together", f"{got} of these 4")
+        canvas, placement = tensors["canvas"], Placement(**{name: tuple(each) for name, each in values[0].items()})
         for axis in (0, 1):
             room, side = canvas.shape[2 - axis], placement.size[axis] * placement.scale[axis]
             fits = round(side) >= 1 and placement.offset[axis] + round(side) <= room
             check(fits, "placement", f"the photograph on a canvas of {room} px", f"{side:g} px")
-        return cls(photograph, canvas, placement, values[1])
-
-    @property
-    def image(self) -> Tensor:
-        """The photograph, `(3, h, w)` in [0, 1]."""
-        return self.photograph.float() / 255
+        return cls(canvas, placement, values[1])
 
     def views(self, fixations: Tensor) -> list[Tensor]:
         """Foveated views of the photograph, as the detector received them, without the border of the canvas.

@@ -358,7 +358,7 @@ def with_picture(make):
     sensor = {"sigma": 20.0, "levels": 3, "growth": 2.0, "convention": "kornia", "reference": 80.0}
     settings = {"sensor": sensor, "detector": {"name": "fixed"}}
     placement = Placement((80.0, 60.0), (1.0, 1.0), (0, 0))
-    return replace(record, stimulus=Stimulus(photograph, photograph.clone(), placement, settings))
+    return replace(record, photograph=photograph, stimulus=Stimulus(photograph.clone(), placement, settings))
 
 
 @pytest.mark.parametrize("make", RECORDS)

@@ -35,7 +35,7 @@ def with_photograph(scanpath, image):
     settings = {"sensor": sensor, "detector": {"name": "none"}}
     placement = Placement((80, 60), (width / 80, height / 60), (0, 0))
     pixels = in_bytes(image)
-    return replace(scanpath, stimulus=Stimulus(pixels, pixels, placement, settings))
+    return replace(scanpath, photograph=pixels, stimulus=Stimulus(pixels, placement, settings))
 
 
 def test_the_frame_contains_the_page(scanpath, image, hostile):

@@ -105,7 +105,8 @@ def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
     sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
     placement = Placement((80, 60), (1.0, 1.0), (0, 0))
     settings = {"sensor": sensor, "detector": {"name": "none"}}
-    kept = replace(scanpath, stimulus=Stimulus(in_bytes(image), in_bytes(image), placement, settings))
+    stimulus = Stimulus(in_bytes(image), placement, settings)
+    kept = replace(scanpath, photograph=in_bytes(image), stimulus=stimulus)
     drawn = np.asarray(draw(plot_scanpath(kept)).axes[0].images[0].get_array())
     np.testing.assert_allclose(drawn, image.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
     assert len(draw(plot_belief(kept)).axes[0].images) == 2
