@@ -161,7 +161,7 @@ class HeadAgent(nn.Module):
         gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
         sure = _CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
-        return HeadEpisode(
+        return _HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed,
         ).run()  # fmt: skip
@@ -207,7 +207,7 @@ class HeadAgent(nn.Module):
         check_number(worth, "worth", 0, float("inf"))
         evidence = on_cpu(self.map_evidence)
         gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return HeadEpisode(
+        return _HeadEpisode(
             self, observer, gain, None, indices,
             worth=worth, limits=limits, start=start, duration=duration, seed=seed,
         ).run()  # fmt: skip
@@ -229,7 +229,7 @@ class HeadAgent(nn.Module):
         return self.find_all(scene, None, **options)
 
 
-class HeadEpisode(Episode[HeadPath]):
+class _HeadEpisode(Episode[HeadPath]):
     """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second."""
 
     def __init__(

@@ -25,7 +25,7 @@ class _AnyLook(Look):
 
 
 @dataclass(frozen=True)
-class AnyBelief(Belief):
+class _AnyBelief(Belief):
     r"""Belief about any of several classes. It answers for all of them together, and ignores the target asked for.
 
     .. math:: P(x) = 1 - \prod_k (1 - w_k \, p_k(x))
@@ -96,29 +96,29 @@ class AnyOf(Observer):
         """Thresholds of the inner observer."""
         return self.observer.thresholds
 
-    def start(self, batch: int, grid: Grid, like: Tensor) -> AnyBelief:
+    def start(self, batch: int, grid: Grid, like: Tensor) -> _AnyBelief:
         """The first belief of the inner observer, for each class."""
         inner = tuple(self.observer.start(batch, grid, like) for _ in self._targets)
-        return AnyBelief(inner, self.weights, inner[0].closest)
+        return _AnyBelief(inner, self.weights, inner[0].closest)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _AnyLook:
         """Evidence for each class; `target` is ignored."""
         return _AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> AnyBelief:
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> _AnyBelief:
         """Fade the beliefs of the inner observer."""
         return self._each(belief, look, lambda each, of: self.observer.fade(each, of, keep, visited))
 
-    def update(self, belief: Belief, look: Look) -> AnyBelief:
+    def update(self, belief: Belief, look: Look) -> _AnyBelief:
         """Update the beliefs of the inner observer."""
         return self._each(belief, look, self.observer.update)
 
-    def _each(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> AnyBelief:
-        belief, look = own(belief, AnyBelief, "belief"), own(look, _AnyLook, "look")
+    def _each(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> _AnyBelief:
+        belief, look = own(belief, _AnyBelief, "belief"), own(look, _AnyLook, "look")
         inner = tuple(change(each, of) for each, of in zip(belief.inner, look.inner, strict=True))
         return replace(belief, inner=inner, closest=inner[0].closest)
 
 
 def class_meant(belief: Belief, target: int) -> int:
-    """The class that a search is about: the likeliest one of several (`AnyBelief.likeliest`), otherwise the target."""
-    return int(belief.likeliest()) if isinstance(belief, AnyBelief) else target
+    """The class that a search is about: the likeliest one of several, otherwise the target."""
+    return int(belief.likeliest()) if isinstance(belief, _AnyBelief) else target
