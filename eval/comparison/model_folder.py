@@ -90,7 +90,7 @@ def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
     if policy.policy == EVIDENCE:
         return ["evidence"]
     learned = ["map"] if policy.scores == "learned" else []
-    model = policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model()
+    model = policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model
     return [*learned, *(["observation"] if model or policy.scores == "calibrated" else [])]
 
 

@@ -55,7 +55,7 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         self.function = FUNCTIONS[lookup(function, FUNCTIONS, "policy")] if isinstance(function, str) else function
-        takes = self.function.takes()
+        takes = self.function.takes
         needed = MapEvidence if self.function.needs_map else FovealObservationModel
         if "model" in takes and not isinstance(model, needed):
             words = "a learned map" if self.function.needs_map else "an observation model"
@@ -100,7 +100,7 @@ class Policy(nn.Module):
             **{name: getattr(self, name) for name in self._given},
         }
         arguments = {}
-        for name, parameter in self.function.takes().items():
+        for name, parameter in self.function.takes.items():
             if given.get(name) is not None:
                 arguments[name] = given[name]
             elif parameter.default is parameter.empty:

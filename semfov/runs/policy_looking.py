@@ -114,7 +114,7 @@ def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -
     return any(
         policy.scores == "calibrated"
         or _of(policy.misses, belief.misses)
-        or (policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model())
+        or (policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model)
         for policy in policies
     )
 
@@ -131,7 +131,7 @@ def _make_strategy(
     function = FUNCTIONS[policy.policy]
     model = models.map if function.needs_map else models.observation
     common = {"fovea": fovea, "prior": belief.prior}
-    own = {name: common[name] for name in common.keys() & function.takes()}
+    own = {name: common[name] for name in common.keys() & function.takes}
     chosen = Policy(function, model, samples=policy.samples, calibrated=calibrated, **own)
     if _by_evidence(policy, task):
         return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)

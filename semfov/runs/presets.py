@@ -65,7 +65,7 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
         alone = {
             f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
             for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
-            if not FUNCTIONS[policy.policy].needs_model()
+            if not FUNCTIONS[policy.policy].needs_model
         }
     both = {
         f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
@@ -100,9 +100,9 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     if choice.tempering is not None:
         check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
     if choice.samples is not None and not (
-        choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes()
+        choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes
     ):
-        names = ", ".join(name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes())
+        names = ", ".join(name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes)
         raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
     known = presets(task).values()
     scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]

@@ -160,7 +160,7 @@ def test_models_of_the_posterior_and_no_samples_are_refused():
 def test_policies_take_the_expectation_by_their_settings():
     model = four_classes()
     for name, kind in acquisition.FUNCTIONS.items():
-        if "likelihoods" in kind.takes():
+        if "likelihoods" in kind.takes:
             made = Policy(name, model, samples=4, calibrated=False)(1, GRID)
             assert torch.equal(made.likelihoods, sampled_likelihoods(model, 4, calibrated=False))
             assert Policy(name, model)(1, GRID).likelihoods is None

@@ -42,7 +42,7 @@ def model_for(name, model, mapping):
 def test_a_policy_makes_its_acquisition_function(name, model):
     beta = 0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1))
     given = {"target": 1, "model": model, "grid": GRID}
-    expected = FUNCTIONS[name](**{each: given[each] for each in FUNCTIONS[name].takes() if each in given})
+    expected = FUNCTIONS[name](**{each: given[each] for each in FUNCTIONS[name].takes if each in given})
     assert torch.equal(values_of(Policy(name, model)(1, GRID), beta), values_of(expected, beta))
 
 
@@ -78,7 +78,7 @@ def test_every_named_function_is_public():
 def test_models_are_submodules_of_the_policy(name, model, mapping):
     """They are in its state dict, and change dtype with it."""
     policy, part = Policy(name, model_for(name, model, mapping)), model_for(name, model, mapping)
-    needed = "model" in FUNCTIONS[name].takes()
+    needed = "model" in FUNCTIONS[name].takes
     assert list(policy.state_dict()) == ([f"model.{name}" for name in part.state_dict()] if needed else [])
     policy.double()
     moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
@@ -107,7 +107,7 @@ def test_a_user_defined_function_is_registered_under_its_name():
 
 def test_a_missing_model_is_an_error_when_the_policy_is_made():
     for name, kind in FUNCTIONS.items():
-        if "model" not in kind.takes():
+        if "model" not in kind.takes:
             Policy(name)
             continue
         needed = "a learned map" if kind.needs_map else "an observation model"

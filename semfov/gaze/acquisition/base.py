@@ -26,6 +26,8 @@ class AcquisitionFunction(nn.Module, ABC):
     Attributes:
         name: name in settings.
         tasks: tasks that the function is for.
+        takes: the arguments that the function is made from, by name.
+        needs_model: whether it is made from an observation model.
         needs_map: whether its `model` is a learned map, whose belief alone it works on.
         by_belief: whether its values depend on the belief.
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
@@ -44,25 +46,19 @@ class AcquisitionFunction(nn.Module, ABC):
 
     name: ClassVar[str] = ""
     tasks: ClassVar[tuple[Task, ...]] = ()
+    takes: ClassVar[Mapping[str, Parameter]]
+    needs_model: ClassVar[bool]
     needs_map: ClassVar[bool] = False
     by_belief: ClassVar[bool] = True
     by_place: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
+        parameters = signature(cls).parameters.items()
+        cls.takes = {n: each for n, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        cls.needs_model = "model" in cls.takes and not cls.needs_map
         if "name" in cls.__dict__:
             FUNCTIONS[cls.name] = cls
-
-    @classmethod
-    def takes(cls) -> Mapping[str, Parameter]:
-        """The arguments that the function is made from, by name."""
-        parameters = signature(cls).parameters.items()
-        return {name: each for name, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
-
-    @classmethod
-    def needs_model(cls) -> bool:
-        """Whether the function is made from an observation model."""
-        return "model" in cls.takes() and not cls.needs_map
 
     @abstractmethod
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
