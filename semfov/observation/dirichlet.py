@@ -213,6 +213,11 @@ def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
     """
     check(parameter > 0, "parameter", "a positive number", parameter)
     _check_parameters(alpha, "alpha")
+    return divergence_from_symmetric(alpha, parameter)
+
+
+def divergence_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
+    """`kl_from_symmetric` without the checks."""
     base = alpha.shape[-1] * parameter
     # There are few sums and their terms are large: double precision costs little here.
     total = alpha.sum(-1).double()

@@ -76,14 +76,14 @@ def test_classes_are_drawn_as_often_as_they_are_probable():
     for turn in range(7):
         visited = torch.arange(5) < min(turn, 5)
         outlook = look_ahead_by_samples(beta, marked, visited)
-        drawn = (outlook.evidence > 0).double().unflatten(-2, (2, samples)).sum(-2)
+        drawn = (outlook.likelihood > 0).double().unflatten(-2, (2, samples)).sum(-2)
         assert torch.equal(drawn[:, 0], drawn[:, 1])
         assert ((drawn[:, 0] / samples - outlook.mean).abs() <= 1 / samples).all()
     # Over many turns a class that is rarer than one draw is drawn as often as it is probable, too.
     rare = torch.tensor([[0.004, 0.006, 0.99]], dtype=torch.float64)
     marked = torch.eye(3, dtype=torch.float64)[:, None, None].expand(3, 1, 8, 3)
     turns = [look_ahead_by_samples(rare, marked, torch.arange(600) < turn) for turn in range(600)]
-    share = torch.stack([(each.evidence[0] > 0).double().mean(0) for each in turns]).mean(0)
+    share = torch.stack([(each.likelihood[0] > 0).double().mean(0) for each in turns]).mean(0)
     assert share.tolist() == pytest.approx(rare[0].tolist(), abs=5e-4)
 
 
@@ -96,7 +96,8 @@ def test_values_approach_the_sum_over_all_classes_and_looks(name):
     got = make(model, GRID, likelihoods=single.expand(4, 3, 5000, 4))
     values = [make(model, GRID, likelihoods=single[k : k + 1].expand(4, 3, 1, 4)) for k in range(4)]
     mean = beta / beta.sum(-1, keepdim=True)
-    cells = [each.cell_values(look_ahead_by_samples(beta, each.likelihoods, UNSEEN)) for each in values]
+    after = [each.cell_values(look_ahead_by_samples(beta, each.likelihoods, UNSEEN)) for each in values]
+    cells = [looks - each.present(beta)[..., None] for looks, each in zip(after, values, strict=True)]
     exact = sum(mean[:, k, None] * cells[k] for k in range(4))
     levels = model.level(GRID.cell_distance)
     seen = torch.stack([exact[x, levels[x]] for x in range(3)])

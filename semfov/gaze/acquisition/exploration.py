@@ -15,7 +15,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.lookahead import Lookahead, Outlook
-from semfov.observation.dirichlet import kl_from_symmetric
+from semfov.observation.dirichlet import divergence_from_symmetric
 from semfov.observation.foveal import FovealObservationModel
 
 
@@ -60,11 +60,12 @@ class KLDivergence(Lookahead):
         self.prior = prior
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Increase of the divergence from the prior."""
-        # The present map is appended as one more level, so that the special functions are called once.
-        every = torch.cat([outlook.next_beta, outlook.beta[..., None, :]], -2)
-        divergence = kl_from_symmetric(every, self.prior)
-        return divergence[..., :-1] - divergence[..., -1:]
+        """Divergence from the prior after the look."""
+        return divergence_from_symmetric(outlook.next_beta, self.prior)
+
+    def present(self, beta: Tensor) -> Tensor:
+        """Divergence from the prior."""
+        return divergence_from_symmetric(beta, self.prior)
 
 
 class BayesianSurprise(Lookahead):
@@ -189,15 +190,18 @@ class UpperConfidenceBound(Lookahead):
         self.kappa = kappa
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Increase of the bound."""
-        after, before = (
-            peak + self.kappa * _deviation(peak, total)
-            for peak, total in (
-                (outlook.next_mean.amax(-1), outlook.next_total),
-                (outlook.mean.amax(-1), outlook.total),
-            )
-        )
-        return after - before[..., None]
+        """The bound after the look."""
+        return self._bound(outlook.next_mean, outlook.next_total)
+
+    def present(self, beta: Tensor) -> Tensor:
+        """The bound."""
+        total = beta.sum(-1)
+        return self._bound(beta / total[..., None], total)
+
+    def _bound(self, mean: Tensor, total: Tensor) -> Tensor:
+        """U of beliefs with means `(..., K+1)`."""
+        peak = mean.amax(-1)
+        return peak + self.kappa * _deviation(peak, total)
 
 
 class ProbabilityOfImprovement(Lookahead):

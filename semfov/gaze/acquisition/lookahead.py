@@ -14,7 +14,9 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.foveal import FovealObservationModel
 from semfov.threads import one_thread_if_small
 
-_BLOCK = 1 << 16  # elements of looks that are worked on at once
+_BLOCK = 1 << 16  # elements that are worked on at once, which stay in the processor's cache
+_PRODUCT = 7 << 20  # elements that one product gives; the C library keeps freed memory of up to 32 MB
+_PAIRS = 1 << 22  # values of a seen cell for a fixation that are looked up at once
 _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, however many there are
 
 
@@ -22,18 +24,20 @@ class Outlook(NamedTuple):
     """The present belief, and the belief after one more look from each of N levels of distance.
 
     The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
-    and N M in place of N. Evidence r is `(..., X·Y, N, K+1)`.
+    and N M in place of N. Likelihoods of the look are `(..., X·Y, N, K+1)`, and their means under the present belief
+    `(..., X·Y, N, 1)`.
     """
 
     beta: Tensor
     total: Tensor
     mean: Tensor
-    evidence: Tensor
+    likelihood: Tensor
+    scale: Tensor
 
     @property
     def growth(self) -> Tensor:
         """Relative change of the mean, `p' / p - 1 = (r - 1) / (T + 1)`, `(..., X·Y, N, K+1)`."""
-        return (self.evidence - 1) / (self.total[..., None, None] + 1)
+        return (self.likelihood / self.scale - 1) / (self.total[..., None, None] + 1)
 
     @property
     def next_mean(self) -> Tensor:
@@ -43,14 +47,15 @@ class Outlook(NamedTuple):
     @property
     def next_total(self) -> Tensor:
         """Sum of the parameters after Kaplan's update, `T' = (T + 1) / (1 + min r / T)`, `(..., X·Y, N)`."""
-        total = self.total[..., None]
-        return (total + 1) / (1 + self.evidence.amin(-1) / total)
+        total, least = self.total[..., None], self.likelihood.amin(-1) / self.scale[..., 0]
+        return (total + 1) / (1 + least / total)
 
     @property
     def next_beta(self) -> Tensor:
         """Parameters after Kaplan's update, `β' = β + β (r - min r) / (T + min r)`, `(..., X·Y, N, K+1)`."""
-        beta, least = self.beta[..., None, :], self.evidence.amin(-1, keepdim=True)
-        return torch.addcdiv(beta, beta * (self.evidence - least), self.total[..., None, None] + least)
+        beta, least = self.beta[..., None, :], self.likelihood.amin(-1, keepdim=True)
+        share = (self.likelihood - least).mul_(1 / (self.total[..., None, None] * self.scale + least))
+        return torch.addcmul(beta, beta, share)
 
 
 def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
@@ -64,23 +69,28 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     :math:`F(\beta'(E[S]))`, which the paper calls expected. It is not the expectation :math:`E[F(\beta'(S))]`, because
     neither the update nor F is linear in the scores; `look_ahead_by_samples` computes that.
     """
-    return _outlook(beta, _expected_looks(beta, expected))
+    total, mean = _total_and_mean(beta)
+    return _outlook(beta, total, mean, _expected_looks(mean, expected))
 
 
-def _expected_looks(beta: Tensor, expected: Tensor) -> Tensor:
+def _total_and_mean(beta: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums `(..., X·Y)` of the parameters of a belief, and its means."""
+    total = beta.sum(-1)
+    return total, beta / total[..., None]
+
+
+def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
     """The expected scores of a look at every cell from every level, `(..., X·Y, N, K+1)`."""
-    components = beta.shape[-1]
+    components = mean.shape[-1]
     check(expected.shape[0] == components, "model", f"{components} classes, as the belief has", expected.shape[0])
-    mean, table = beta / beta.sum(-1, keepdim=True), expected.to(beta).flatten(1)
+    table = expected.to(mean).flatten(1)
     scores = mean @ table if mean.ndim == 2 else one_by_one(lambda maps: maps @ table, mean.flatten(0, -3))
     return scores.view(*mean.shape[:-1], *expected.shape[1:])
 
 
-def _outlook(beta: Tensor, likelihood: Tensor) -> Outlook:
+def _outlook(beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Outlook:
     """The belief after looks with these likelihoods, `(..., X·Y, N, K+1)`."""
-    total = beta.sum(-1)
-    mean = beta / total[..., None]
-    return Outlook(beta, total, mean, likelihood / (likelihood * mean[..., None, :]).sum(-1, keepdim=True))
+    return Outlook(beta, total, mean, likelihood, (mean[..., None, :] @ likelihood.mT).mT)
 
 
 def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) -> Outlook:
@@ -94,13 +104,14 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     """
     components = beta.shape[-1]
     check_shape(likelihoods, "likelihoods", components, None, None, components)
-    mean = beta / beta.sum(-1, keepdim=True)
+    total, mean = _total_and_mean(beta)
     number = torch.arange(likelihoods.shape[2], device=beta.device)
     start = (visited.sum(-1).to(beta) * _GOLDEN).frac()[..., None, None]
     point = (number + start) / len(number)
     above = point[..., None] >= mean.cumsum(-1)[..., None, :]
     drawn = above.sum(-1).clamp(max=components - 1)
-    return _outlook(beta, likelihoods.to(beta)[drawn, :, number].transpose(-2, -3).flatten(-3, -2))
+    likelihood = likelihoods.to(beta)[drawn, :, number].transpose(-2, -3).flatten(-3, -2)
+    return _outlook(beta, total, mean, likelihood)
 
 
 def sampled_likelihoods(
@@ -151,27 +162,14 @@ class Lookahead(AcquisitionFunction):
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
-        drawn = self.likelihoods
-        expected = self.model.expected_scores() if drawn is None else None
+        expected = self.model.expected_scores() if self.likelihoods is None else None
 
         def values(maps: Tensor, visited: Tensor) -> Tensor:
-            # So many cells at a time that their looks stay in the processor's cache; the product is faster as a whole.
-            looks = self.model.alpha.shape[1] if drawn is None else drawn.shape[1:3].numel()
-            blocks = values_known(maps) and maps.device.type == "cpu"
-            some = max(1, _BLOCK // (looks * maps.shape[-1])) if blocks else maps.shape[-2]
-            cells = maps.split(some, -2)
-            if expected is not None:
-                scores = _expected_looks(maps, expected).split(some, -3)
-                pieces = [self.cell_values(_outlook(*block)) for block in zip(cells, scores, strict=True)]
-            else:
-                assert drawn is not None
-                # The values of the M looks of a level stand side by side.
-                pieces = [
-                    self.cell_values(look_ahead_by_samples(block, drawn, visited)).unflatten(-1, drawn.shape[1:3])
-                    for block in cells
-                ]
-                pieces = [piece.mean(-1) for piece in pieces]
-            return self.pool(at_levels(torch.cat(pieces, -2), self.levels))
+            after = self._after_drawn(maps, visited) if expected is None else self._after_expected(maps, expected)
+            cells = maps.split(_fitting(_BLOCK, maps, maps.shape[-1]), -2)
+            change = after - torch.cat([self.present(each) for each in cells], -1)[..., None]
+            fixations = self.levels.split(_fitting(_PAIRS, maps, maps.shape[-2]), -1)
+            return torch.cat([self.pool(at_levels(change, levels)) for levels in fixations], -1)
 
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta, visited)
@@ -179,13 +177,50 @@ class Lookahead(AcquisitionFunction):
         turns = visited.expand(beta.shape[:-1]).flatten(0, -2)
         return one_by_one(values, beta.flatten(0, -3), turns).view(beta.shape[:-1])
 
+    def _after_expected(self, beta: Tensor, expected: Tensor) -> Tensor:
+        """`cell_values` of the looks with the expected scores `(K+1, N, K+1)`."""
+        total, mean = _total_and_mean(beta)
+        some, rows = _fitting(_PRODUCT, beta, beta.shape[-1]), []
+        for part in zip(beta.split(some, -2), total.split(some, -1), mean.split(some, -2), strict=True):
+            tables = expected.split(_fitting(_PRODUCT, beta, part[0].numel()), 1)
+            rows.append(torch.cat([self._by_cells(*part, _expected_looks(part[2], table)) for table in tables], -1))
+        return torch.cat(rows, -2)
+
+    def _by_cells(self, beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Tensor:
+        """`cell_values` of looks with these likelihoods `(..., X·Y, N, K+1)`, some cells at a time."""
+        some = _fitting(_BLOCK, beta, likelihood.shape[-2:].numel())
+        blocks = zip(
+            beta.split(some, -2), total.split(some, -1), mean.split(some, -2), likelihood.split(some, -3), strict=True
+        )
+        return torch.cat([self.cell_values(_outlook(*block)) for block in blocks], -2)
+
+    def _after_drawn(self, beta: Tensor, visited: Tensor) -> Tensor:
+        """Mean of `cell_values` over the drawn looks of each level."""
+        drawn = self.likelihoods
+        assert drawn is not None
+        pieces = [
+            self.cell_values(look_ahead_by_samples(cells, drawn, visited))
+            for cells in beta.split(_fitting(_BLOCK, beta, drawn.shape[1:].numel()), -2)
+        ]
+        # The values of the M looks of a level stand side by side.
+        return torch.cat(pieces, -2).unflatten(-1, drawn.shape[1:3]).mean(-1)
+
     @abstractmethod
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Value of seeing each cell from each level, `(..., X·Y, N)`."""
+        """Value of each cell after a look from each level, `(..., X·Y, N)`, `present` not subtracted."""
+
+    def present(self, beta: Tensor) -> Tensor:
+        """Value of the present belief about each cell, `(..., X·Y)`, which is subtracted from those of looks."""
+        return beta.new_zeros(beta.shape[:-1])
 
     def pool(self, values: Tensor) -> Tensor:
         """Value of each fixation `(..., X·Y)`: the sum over the map of the values `(..., seen cell, fixation)`."""
         return values.sum(-2)
+
+
+def _fitting(limit: int, maps: Tensor, elements: int) -> int:
+    """How many things of so many elements are worked on at once: up to the limit on a CPU, else all."""
+    return max(1, limit // elements) if values_known(maps) and maps.device.type == "cpu" else 1 << 40
 
 
 def at_levels(values: Tensor, levels: Tensor) -> Tensor:
