@@ -8,7 +8,7 @@ channels. A product reads a transposed image equally fast, so two passes filter 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, wraps
-from typing import Any, NamedTuple, TypeVar, TypeVarTuple
+from typing import Any, TypeVar, TypeVarTuple
 
 import torch
 from torch import Tensor
@@ -48,6 +48,12 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
     return call
 
 
+_Part = tuple[tuple[int, int, int], tuple[int, int, int], int]
+"""Size, strides and begin of rows of planes."""
+_Product = tuple[Tensor, _Part, _Part]
+"""A matrix, what it multiplies, and where the product is written."""
+
+
 @dataclass(frozen=True)
 class Taps:
     """A linear filter of a line: each output pixel is a weighted sum of input pixels `(length, taps)`."""
@@ -56,9 +62,11 @@ class Taps:
     weight: Tensor
 
 
-class Lines(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Lines:
     """A matrix from input to output lines: dense, or tiles `(tiles, tile, window)` between ends `(2, edge, span)`."""
 
+    count: int
     length: int
     dense: Tensor | None
     ends: Tensor
@@ -78,7 +86,7 @@ def banded(
     tiles = min((count - reach) // shift, length // tile) - before
     if max(count, length) <= _SMALL or tiles < 1:
         dense = _dense(index, weight, count).to(device, dtype)
-        return Lines(length, dense, dense[None], dense[None])
+        return Lines(count, length, dense, dense[None], dense[None])
     start, rows, rest = before * shift - reach, before * tile, (before + tiles) * tile
     inner = index[rows:rest].reshape(tiles, tile, -1) - (start + shift * torch.arange(tiles)[:, None, None])
     middle = _dense(inner, weight[rows:rest].reshape(inner.shape), window).to(device, dtype)
@@ -90,7 +98,7 @@ def banded(
     span = min(count, max(-(-edge // tile) * shift, count - (length - edge) // tile * shift) + reach)
     head, tail = slice(edge), slice(length - edge, length)
     ends = _dense(index[head], weight[head], span), _dense(index[tail] - (count - span), weight[tail], span)
-    return Lines(length, None, torch.stack(ends).to(device, dtype), middle, rows, start, shift)
+    return Lines(count, length, None, torch.stack(ends).to(device, dtype), middle, rows, start, shift)
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
@@ -100,21 +108,79 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     if down.dense is not None and across.dense is not None:
         return down.dense @ (image @ across.dense.mT)
     planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
-    result = planes.new_empty(len(planes), down.length, across.length)
-    # The pass with fewer pixels is the slower one, across, which takes all planes at once. So many planes are filtered
-    # at a time that what is between the passes stays in the cache.
-    shrinks = down.length < planes.shape[1]
-    sides = (down.length, planes.shape[2]) if shrinks else (planes.shape[1], across.length)
-    between = planes.new_empty(min(max(1, _CACHED // (sides[0] * sides[1])), len(planes)), *sides)
-    for group, made in zip(planes.split(len(between)), result.split(len(between)), strict=True):
-        part = between[: len(group)]
-        if not shrinks:
-            _fill(part.flatten(0, 1).mT, group.reshape(-1, group.shape[-1]).mT, across)
-        for plane, filtered in zip(*((group, part) if shrinks else (part, made)), strict=True):
-            _fill(filtered, plane, down)
-        if shrinks:
-            _fill(made.flatten(0, 1).mT, part.flatten(0, 1).mT, across)
-    return result.reshape(*image.shape[:-2], *result.shape[-2:])
+    shrinks = down.length < down.count
+    if not shrinks:
+        planes = planes.contiguous()
+    number, result = len(planes), planes.new_empty(len(planes), down.length, across.length)
+    # So many planes are filtered at a time that what is between the passes stays in the cache.
+    sides = (down.length, across.count) if shrinks else (down.count, across.length)
+    between = planes.new_empty(min(max(1, _CACHED // (sides[0] * sides[1])), number), *sides)
+    for first in range(0, number, len(between)):
+        passes = _passes(down, across, min(len(between), number - first), planes.stride())
+        begin = planes.storage_offset() + first * planes.stride(0)
+        for matrix, (size, strides, offset), into in passes[0]:
+            torch.bmm(matrix, planes.as_strided(size, strides, begin + offset), out=between.as_strided(*into))
+        begin = first * down.length * across.length
+        for matrix, source, (size, strides, offset) in passes[1]:
+            torch.bmm(matrix, between.as_strided(*source), out=result.as_strided(size, strides, begin + offset))
+    return result.view(*image.shape[:-2], *result.shape[-2:])
+
+
+@lru_cache(maxsize=256)
+def _passes(
+    down: Lines, across: Lines, number: int, strides: tuple[int, int, int]
+) -> tuple[list[_Product], list[_Product]]:
+    """Products of both passes over planes; to work them out takes as long as the products of a small plane."""
+    height, width = down.length, across.length
+    if down.length < down.count:
+        # The pass with fewer pixels is the slower one, across, which takes all planes at once.
+        between = (height * across.count, across.count, 1)
+        return (
+            _products(down, number, across.count, strides, between),
+            _products(across, 1, number * height, (0, 1, across.count), (0, 1, width)),
+        )
+    between = (down.count * width, width, 1)
+    return (
+        _products(across, 1, number * down.count, (0, 1, across.count), (0, 1, width)),
+        _products(down, number, width, between, (height * width, width, 1)),
+    )
+
+
+def _products(
+    lines: Lines, number: int, width: int, source: tuple[int, int, int], target: tuple[int, int, int]
+) -> list[_Product]:
+    """Products that filter the columns of planes, given the strides of planes, rows and columns."""
+    made: list[_Product] = []
+
+    def at(row: int, other: int) -> tuple[int, int]:
+        return row * source[1], other * target[1]
+
+    def add(matrix: Tensor, apart: tuple[int, int], begin: tuple[int, int]) -> None:
+        many, rows, window = matrix.shape
+        read = (many, window, width), (apart[0], *source[1:]), begin[0]
+        made.append((matrix, read, ((many, rows, width), (apart[1], *target[1:]), begin[1])))
+
+    planes = source[0], target[0]
+    if lines.dense is not None:
+        add(lines.dense.expand(number, -1, -1), planes, (0, 0))
+        return made
+    tiles, tile, _ = lines.middle.shape
+    step, first, along = at(lines.shift, tile), at(lines.start, lines.rows), lines.count // lines.shift
+    alike = lines.middle.stride(0) == 0 and (lines.count, lines.length) == (along * lines.shift, along * tile)
+    if number > 1 and alike and planes == at(lines.count, lines.length):
+        # Tiles of all planes at once. Those that lie across two planes are written over by the ends.
+        add(lines.middle[:1].expand(tiles + (number - 1) * along, -1, -1), step, first)
+    else:
+        for n in range(number):
+            add(lines.middle, step, (first[0] + n * planes[0], first[1] + n * planes[1]))
+    _, edge, span = lines.ends.shape
+    last = at(lines.count - span, lines.length - edge)
+    if number == 1:
+        add(lines.ends, last, (0, 0))
+        return made
+    for end, begin in zip(lines.ends, ((0, 0), last), strict=True):
+        add(end.expand(number, -1, -1), planes, begin)
+    return made
 
 
 def _dense(index: Tensor, weight: Tensor, count: int) -> Tensor:
@@ -132,30 +198,6 @@ def _product(image: Tensor, lines: Lines) -> Tensor:
     inner = (lines.middle @ _windows(image, lines)).flatten(-3, -2)
     bottom = lines.ends[1, edge - lines.length + made :] @ image[..., image.shape[-2] - span :, :]
     return torch.cat([top, inner, bottom], -2)
-
-
-def _fill(result: Tensor, plane: Tensor, lines: Lines) -> None:
-    """Filter the columns of a plane `(h, w)`, and write each part into its place."""
-    if lines.dense is not None:
-        torch.mm(lines.dense, plane, out=result)
-        return
-    _, edge, span = lines.ends.shape
-    torch.bmm(lines.ends, _both_ends(plane, span), out=_both_ends(result, edge))
-    tiles, tile, window = lines.middle.shape
-    inputs = _parts(plane, lines.start, lines.shift, (tiles, window))
-    torch.bmm(lines.middle, inputs, out=_parts(result, lines.rows, tile, (tiles, tile)))
-
-
-def _both_ends(plane: Tensor, rows: int) -> Tensor:
-    """The first and the last rows of a plane, `(2, rows, w)`, which may overlap."""
-    return _parts(plane, 0, plane.shape[0] - rows, (2, rows))
-
-
-def _parts(plane: Tensor, first: int, apart: int, shape: tuple[int, int]) -> Tensor:
-    """Parts `(n, rows, w)` of a plane that begin at rows `apart`, from a first one; they may overlap."""
-    step, along = plane.stride()
-    begin = plane.storage_offset() + first * step
-    return plane.as_strided((*shape, plane.shape[1]), (apart * step, step, along), begin)
 
 
 def _windows(image: Tensor, lines: Lines) -> Tensor:
