@@ -141,6 +141,7 @@ def test_command_runs_as_printed(line, folder, run):
 
 
 @pytest.mark.slow
+@pytest.mark.lab
 def test_the_three_commands_for_a_custom_detector_run(folder, run):
     """As printed, except for a tiny fit and a detector of colours instead of cups; and the study of a checkout."""
     page = (ROOT / "docs/detectors.md").read_text(encoding="utf-8")

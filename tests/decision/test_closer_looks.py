@@ -1,11 +1,11 @@
 """Searches with closer looks: what an eye sees closely, and the decisions of an agent that looks closely."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-from semfov import ActivePerception, Belief, DataError, Eye, Foveation, InputError, Scanpath
+from semfov import ActivePerception, Belief, Eye, Foveation, InputError
 from semfov.belief.observers import Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
@@ -105,19 +105,6 @@ def test_given_boxes_end_a_search_without_closer_looks(image):
     script = [(cells(c11=0.9), 0.9)]
     boxes = [[130.0, 90, 150, 110]]
     assert agent(Scripted(*script)).search(image, "red", start=11, boxes=boxes).closer == ()
-
-
-def test_closer_looks_survive_a_file(image, tmp_path):
-    scanpath = agent(Scripted((cells(c11=0.9), 0.9))).search(image, "red", start=11)
-    scanpath.save(tmp_path / "path.safetensors")
-    loaded = Scanpath.load(tmp_path / "path.safetensors")
-    (one,), (other,) = scanpath.closer, loaded.closer
-    assert torch.equal(one.box, other.box)
-    assert replace(one, box=other.box) == other
-    assert loaded.decision.place == scanpath.decision.place
-    replace(scanpath, closer=(replace(one, cell=12),)).save(tmp_path / "path.safetensors")
-    with pytest.raises(DataError, match="closer: expected a cell below 12"):
-        Scanpath.load(tmp_path / "path.safetensors")
 
 
 def test_the_picture_and_the_page_show_closer_looks(image):

@@ -87,16 +87,3 @@ def test_counts_equal_a_loop_over_cells(seed, device):
     expected = [counts_by_loop(rows, answers) for rows in probabilities]
     assert torch.stack(got, 1).tolist() == expected
     assert all(sum(column) > 0 for column in zip(*expected, strict=True))
-
-
-def test_counts_of_perfect_empty_and_uniform_maps():
-    answers = torch.zeros(10, 4, dtype=torch.bool)
-    answers[:6, 1] = answers[4:7, 3] = True
-    perfect = answers.float()
-    perfect[:, 0] = (~answers.any(-1)).float()
-    perfect[4:6, 3] = 0.5  # two objects share these cells; either answer is right
-    empty = torch.zeros(10, 4)
-    empty[:, 0] = 1
-    even = torch.full((10, 4), 0.25)
-    got = torch.stack(counts_of(torch.stack([perfect, empty, even]), answers), 1)
-    assert got.tolist() == [[7, 7, 10], [0, 0, 3], [0, 0, 0]]

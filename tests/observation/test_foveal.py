@@ -3,8 +3,6 @@
 Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
 """
 
-import json
-import struct
 import warnings
 
 import numpy as np
@@ -204,18 +202,6 @@ def test_expected_scores_and_prior_are_those_of_the_data():
     torch.testing.assert_close(prior.sum(0), torch.ones(2, dtype=torch.float64))
     np.testing.assert_allclose(prior[0], [0.9, 0.9], atol=2e-3)
     assert bool((prior > 0).all())
-
-
-def test_header_is_readable_json(tmp_path):
-    path = tmp_path / "model.safetensors"
-    FovealObservationModel(table(), EDGES, CLASSES, metadata={"detector": DETECTOR}).save(path)
-    data = path.read_bytes()
-    header = json.loads(data[8 : 8 + struct.unpack("<Q", data[:8])[0]])
-    record = json.loads(header["__metadata__"]["semfov"])
-    assert record["classes"] == CLASSES
-    assert record["metadata"]["detector"]["digest"] == DETECTOR["digest"]
-    assert record["version"]
-    assert record["epsilon"] == 1e-6
 
 
 class Toy:

@@ -528,14 +528,3 @@ def test_objects_of_a_head_have_the_directions_to_turn_to():
     flat = head_path(Flat(torch.rand(3, 48, 64), (40, 30), degree=1.0, fields=(30.0,)))
     for row in flat.object_rows():
         assert (row["pan"], row["tilt"]) == pytest.approx((row["x"] - 32, 24 - row["y"]), abs=1e-4)
-
-
-def test_objects_and_looks_are_printed_in_one_line_each():
-    path = zoom_path()
-    assert repr(path.objects) == "2 objects\n  cup 0.80, box 1,2–9,10, look 2\n  cup 0.70, box 2,4–18,20, look 2"
-    assert "class 1 0.70" in repr(path.candidates)
-    assert "tensor" not in repr(path.objects)
-    record = zoom_path()
-    assert [repr(record[number]).count("\n") for number in range(len(record))] == [0] * len(record)
-    assert record.objects[-1].boxes.equal(record.objects.boxes[-1:])
-    assert len(record.objects[:1]) == 1

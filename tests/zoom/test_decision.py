@@ -1,7 +1,6 @@
 """Deciding whether a large picture holds a class: features of a search, and decisions."""
 
 import math
-from xml.etree import ElementTree
 
 import pytest
 import torch
@@ -158,22 +157,3 @@ def test_a_fitted_probability_is_calibrated():
     assert "ECE" in rows[0]
     sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
     assert sure[~new.there].double().mean() <= 0.05
-
-
-def test_a_path_has_a_text_and_an_html_form(eye, picture):
-    torch.manual_seed(0)
-    agent = ZoomAgent(eye, GlimpseEvidence(3, 8))
-    path = agent.explore(picture, passes=9, worth=0.0)
-    assert len(repr(path)) < 600
-    assert repr(path).startswith(f"ZoomPath: {path.describe()}")
-    assert "All 9 passes were used." in repr(path)
-    assert "All 9 passes were used." in path._repr_html_()
-    drawing = ElementTree.fromstring(path._repr_html_().replace("<br>", "<br/>")).find("svg")
-    rectangles = drawing.findall("rect")
-    assert len(rectangles) == (path.passes - 1) + len(path.objects)
-    assert drawing.find("image") is not None
-    assert len(drawing.findall("text")) == path.passes - 1
-    for number in range(path.passes):
-        box, action = path.looks[number].region, path.glances[number].window
-        x1, y1, x2, y2 = path.lattice.boxes(torch.tensor([action.level, *action.cells[:2]])).tolist()
-        assert box == pytest.approx((max(x1, 0), max(y1, 0), min(x2, 1024), min(y2, 768)), abs=1e-3)

@@ -117,6 +117,7 @@ def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network,
         compare(found, eye.glance(eye.open(picture), torch.tensor([[90.0, 90.0, 1.0]])), 1e-3, 1e-6)
 
 
+@pytest.mark.lab
 def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
     """With a torch detector, in windows of 32 cells."""
     torch.manual_seed(3)

@@ -5,13 +5,11 @@ from functools import partial
 
 import pytest
 import torch
-from matplotlib.figure import Figure
 from torchvision.transforms.functional import to_pil_image
 
 from semfov import Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import open_picture
 from semfov.data.large import open_large
-from semfov.viz import plot_scanpath
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 
@@ -102,19 +100,6 @@ def test_zooming_pays_only_for_large_pictures(agent, picture):
         open_picture(each).kind("auto", agent.eye.detector.input_size) for each in (picture, picture[:, :200, :300])
     ]
     assert kinds == ["windows", "fovea"]
-
-
-def test_a_path_can_be_plotted_in_new_and_in_given_axes(agent, picture):
-    path = agent.search(picture, "red", passes=4)
-    figure = plot_scanpath(path, picture)
-    assert len(figure.axes) == 1
-    assert path.describe().startswith("red: ")
-    mine = Figure()
-    given, other = mine.subplots(1, 2)
-    assert plot_scanpath(path, picture, ax=given) is mine
-    assert given.get_title() == figure.axes[0].get_title()
-    assert [len(given.patches), len(given.texts)] == [len(figure.axes[0].patches), len(figure.axes[0].texts)]
-    assert not other.images
 
 
 def test_invalid_arguments_are_refused(agent, picture):
