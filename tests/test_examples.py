@@ -123,10 +123,10 @@ def test_a_simulated_camera_is_searched_though_its_frames_are_late(run, tmp_path
 
 
 def test_looking_around_turns_the_head_and_draws_it(run, tmp_path):
-    output = run("look_around", "--seconds", 6, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
+    output = run("look_around", "--seconds", 3, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
     seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]
     assert seconds == sorted(seconds)
-    assert seconds[-1] <= 6
+    assert seconds[-1] <= 3
     turns = re.search(r"HeadPath: \d+ objects? from score 0.3 in [\d.]+ s: \d+ looks, (\d+) turns? of the head", output)
     assert int(turns.group(1)) > 0
     for name in ("head.png", "head.gif"):
