@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from semfov.cli.options import CheckOptions
-from semfov.data.fixations import Fixations, read_fixations, suspicions
-from semfov.data.fixations.reading import DATA_SETS, PictureSizes, frame_of, reader_of
+from semfov.data.fixations import Fixations, suspicions
+from semfov.data.fixations.reading import DATA_SETS, PictureSizes, frame_of, read_by, reader_of
 from semfov.data.fixations.table import FrameError
 from semfov.data.sources import PHOTOGRAPHS
 from semfov.errors import DataError, SemfovError, check, printable
@@ -33,7 +34,8 @@ def check_fixations(options: CheckOptions) -> int:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of what the lines below say
-                records = _records(Path(name), given, sizes)
+                reader = reader_of(Path(name))
+                records = _records(reader, Path(name), given, sizes)
             if sizes is not None and not folder:  # one picture is compared with what was looked at in it
                 records = [each for each in records if each.picture in sizes] or records
             lines = suspicions(records, sizes)
@@ -43,7 +45,7 @@ def check_fixations(options: CheckOptions) -> int:
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
             continue
-        kind = DATA_SETS.get(reader_of(name)) if name.lower().endswith(".json") else None
+        kind = DATA_SETS.get(reader)
         usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
         print(f"{printable(name)}: {_content(records, usual)}")
         compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
@@ -53,18 +55,20 @@ def check_fixations(options: CheckOptions) -> int:
     return 1 if wrong else 0
 
 
-def _records(path: Path, given: dict[str, Any], sizes: PictureSizes | None) -> list[Fixations]:
+def _records(
+    reader: Callable[..., list[Fixations]], path: Path, given: dict[str, Any], sizes: PictureSizes | None
+) -> list[Fixations]:
     """The records of a file; where it has no frames, they are the pictures."""
-    if "picture" in given and "picture" not in signature(reader_of(path)).parameters:
+    if "picture" in given and "picture" not in signature(reader).parameters:
         # The file names its pictures.
         check(sizes is not None, "picture", "a picture or folder that exists", given["picture"])
         given = {name: value for name, value in given.items() if name != "picture"}
     try:
-        return read_fixations(path, **given)
+        return read_by(reader, path, given)
     except FrameError as error:
         if sizes is None:
             raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
-        return read_fixations(path, **given, size=sizes)
+        return read_by(reader, path, {**given, "size": sizes})
 
 
 def _content(records: list[Fixations], usual: str) -> str:

@@ -97,16 +97,6 @@ _SYNONYMS = _read(_TABLE)
 """
 
 
-def names_of(name: str) -> tuple[str, ...]:
-    """List the synonyms of a class, with spaces.
-
-    >>> names_of("fork"), names_of("kite")
-    (('cutlery',), ())
-    """
-    lines = (line.partition(": ") for line in _TABLE.strip().splitlines())
-    return next((tuple(others.split(", ")) for word, _, others in lines if word == name), ())
-
-
 # Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
 _ALIASES = {
     "aeroplane": "airplane",
@@ -240,18 +230,3 @@ def _other_numbers(key: str) -> set[str]:
         if key.endswith(end):
             forms.add(key.removesuffix(end) + plural)
     return forms
-
-
-def alike(name: str, names: Sequence[str]) -> list[int]:
-    """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms."""
-    name_key, keys = _plain_key(name), [_plain_key(other) for other in names]
-    forms = {name_key, *_other_numbers(name_key)}
-    same = [place for place, key in enumerate(keys) if key in forms or name_key in _other_numbers(key)]
-    if same:
-        return same
-    return [place for place, key in enumerate(keys) if _calls(key, name_key) or _calls(name_key, key)]
-
-
-def _calls(other: str, key: str) -> bool:
-    """Whether `other` is a synonym of a class."""
-    return key in map(_plain_key, _SYNONYMS.get(other, ()))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.errors import DataError
+from semfov.errors import DataError, SemfovError
 from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
@@ -28,7 +28,7 @@ _FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "B
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
-UNKNOWN = f"not an image in a format that is read ({', '.join(_FORMATS)}); convert it"
+_UNKNOWN = f"not an image in a format that is read ({', '.join(_FORMATS)}); convert it"
 """What is said of the content of a file that is none of these."""
 
 _SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
@@ -79,30 +79,12 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     ...     read_image(folder + "/white.png").shape
     torch.Size([3, 2, 4])
     """
-    from PIL import Image, UnidentifiedImageError
-
     check_white(white)
-    name = f"image {Path(path)}"
-    with quiet_decoders:
-        try:
-            with open_pillow(path) as image:
-                check_proportion(image, path)
-                _check_pixels(image.size, name)
-                wide = image.mode in _SIXTEEN_BITS and white is None
-                array = _pixels(image, name, upright=oriented, white=white)
-        except DataError:
-            raise
-        except FileNotFoundError:
-            raise DataError(f"{name}: no such file; check its path") from None
-        except PermissionError:
-            raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
-        except UnidentifiedImageError:
-            raise DataError(f"{name}: {UNKNOWN}") from None
-        except Image.DecompressionBombError:
-            raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; {_SMALLER}") from None
-        except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(f"{name}: truncated, damaged or of an unsupported kind ({reason}); replace it") from error
+    with opening(Path(path), "decoded"), open_pillow(path) as image:
+        check_proportion(image, path)
+        _check_pixels(image.size, f"image {Path(path)}")
+        wide = image.mode in _SIXTEEN_BITS and white is None
+        array = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
     if wide:
         warn_of_range(float(array.min()) * 65535, float(array.max()) * 65535, path)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
@@ -147,6 +129,30 @@ class _Quiet:
 
 quiet_decoders = _Quiet()
 """A context in which nothing is said of damaged metadata, and of large files, which the limits refuse."""
+
+
+@contextmanager
+def opening(path: Path, what: str) -> Iterator[None]:
+    """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
+    check_regular(path, f"image {path}")
+    with quiet_decoders:
+        try:
+            yield
+        except FileNotFoundError:
+            raise DataError(f"image {path}: no such file; check its path") from None
+        except PermissionError:
+            raise DataError(f"image {path}: no permission to read it; check the file's mode and owner") from None
+        except SemfovError:
+            raise
+        except Exception as error:  # decoders of damaged files raise errors of many kinds
+            if type(error).__name__ == "DecompressionBombError":
+                most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
+                raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
+            if type(error).__name__ == "UnidentifiedImageError":
+                raise DataError(f"image {path}: {_UNKNOWN}") from None
+            reason = " ".join(str(error).split()) or type(error).__name__
+            damage = "truncated, damaged or of an unsupported kind"
+            raise DataError(f"image {path}: {damage}, and cannot be {what} ({reason}); replace it") from None
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from torch import Tensor
 from semfov.data.images import (
     check_proportion,
     open_pillow,
+    opening,
     orientation,
     over_white,
     read_image,
@@ -23,7 +24,7 @@ from semfov.data.raster import RasterPicture
 from semfov.data.reduction import PixelBox
 from semfov.data.tiff import TiffPicture, is_converted
 from semfov.data.tone import White, black_and_white, check_white
-from semfov.data.windowed import BY_WINDOWS, RASTERS, TILED, ChosenBands, LargePicture, opening
+from semfov.data.windowed import BY_WINDOWS, RASTERS, TILED, ChosenBands, LargePicture
 from semfov.errors import DataError, check, check_pixels, lookup
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ class _ArrayPicture(LargePicture):
         self.size = array.shape[1], array.shape[0]
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window."""
         x1, y1, x2, y2 = box
         window = self._array[y1:y2, x1:x2]
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
@@ -92,7 +92,6 @@ class _PhotographPicture(LargePicture):
             self.size = _upright_size(image)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window."""
         x1, y1, x2, y2 = box
         if self._array is None:
             with opening(self.path, "decoded"), open_pillow(self.path) as image:

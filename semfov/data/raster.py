@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.gdal import open_raster, raster_settings
+from semfov.data.images import opening
 from semfov.data.reduction import FIRST, PixelBox, bytes_of
 from semfov.data.tone import White, bytes_between
-from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
+from semfov.data.windowed import LargePicture, chosen_bands, tone_of
 from semfov.errors import DataError
 
 
@@ -68,7 +69,6 @@ class RasterPicture(LargePicture):
         return FIRST if self._has_overviews else super()._first
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window."""
         return self._window(box, 1)
 
     def read(self, box: PixelBox, reduction: int = 1) -> Tensor:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.gdal import MOST_SIDE
-from semfov.data.images import check_tile, open_pillow, quiet_decoders
+from semfov.data.images import check_tile, open_pillow, opening, quiet_decoders
 from semfov.data.reduction import PixelBox
 from semfov.data.tone import White, bytes_between
-from semfov.data.windowed import LargePicture, chosen_bands, opening, tone_of
+from semfov.data.windowed import LargePicture, chosen_bands, tone_of
 from semfov.errors import DataError
 from semfov.io.files import check_regular
 
@@ -118,7 +118,6 @@ class TiffPicture(LargePicture):
             return bool(self._page.subifds) or any(page.is_reduced for page in pages)
 
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window."""
         with opening(self.path, "decoded"):
             return self._bytes(self._values(box))
 

@@ -2,8 +2,8 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.images import MAX_PIXELS, UNKNOWN, quiet_decoders, warn_of_range
+from semfov.data.images import warn_of_range
 from semfov.data.reduction import OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
 from semfov.data.tone import White, black_and_white, sample_windows
-from semfov.errors import DataError, SemfovError, check
-from semfov.io.files import check_regular
+from semfov.errors import check
 
 RASTERS = (".vrt", ".jp2")
 """Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
@@ -123,24 +122,3 @@ def tone_of(
     if seen:
         warn_of_range(float(min(each.min() for each in seen)), float(max(each.max() for each in seen)), picture.path)
     return None
-
-
-@contextmanager
-def opening(path: Path, what: str) -> Iterator[None]:
-    """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
-    check_regular(path, f"image {path}")
-    with quiet_decoders:
-        try:
-            yield
-        except FileNotFoundError:
-            raise DataError(f"image {path}: no such file; check its path") from None
-        except SemfovError:
-            raise
-        except Exception as error:  # decoders of damaged files raise errors of many kinds
-            if type(error).__name__ == "DecompressionBombError":
-                most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
-                raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
-            if type(error).__name__ == "UnidentifiedImageError":
-                raise DataError(f"image {path}: {UNKNOWN}") from None
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None

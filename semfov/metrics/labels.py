@@ -6,38 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.errors import InputError, check, values_known
-
-
-def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
-    """Real numbers of any common type as an array of doubles."""
-    given = values.detach().cpu() if isinstance(values, Tensor) else values
-    try:
-        array = np.asarray(given)
-        numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
-    except (TypeError, ValueError, RuntimeError):
-        numbers = None
-    if numbers is None:
-        raise InputError(f"{argument}: expected real numbers in rows of one length, got {_named(values)}")
-    if finite:
-        check(bool(np.isfinite(numbers).all()), argument, "finite numbers", "infinite ones or NaN; leave these out")
-    return numbers
-
-
-def as_path(points: Any, argument: str) -> NDArray[np.float64]:
-    """Points of fixations, `(n, 2)`, finite."""
-    path = as_array(points, argument, finite=True)
-    path = path.reshape(0, 2) if path.shape == (0,) else path
-    check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
-    return path
-
-
-def _named(values: Any) -> str:
-    kind = getattr(values, "dtype", None)
-    return type(values).__name__ if kind is None else f"{type(values).__name__} of {kind}"
 
 
 def as_numbers(values: Any, argument: str) -> Tensor:

@@ -1,7 +1,7 @@
 import pytest
 
 from semfov.data import canonical_name, class_index
-from semfov.data.classes import _ALIASES, alike, class_indices, class_numbers
+from semfov.data.classes import _ALIASES, class_indices, class_numbers
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.errors import InputError
 
@@ -22,6 +22,7 @@ def test_the_same_class_twice_and_several_in_one_text_are_refused():
 def test_every_class_name_matches_only_its_own_class():
     for place, name in enumerate(COCO_CLASSES):
         for spelling in (name, name.upper(), name.replace(" ", "_")):
-            assert alike(spelling, COCO_CLASSES) == [place]
-    assert alike("sofa", COCO_CLASSES) == [COCO_CLASSES.index("couch")]
-    assert alike("spaceship", COCO_CLASSES) == []
+            assert class_index(spelling, COCO_CLASSES) == place + 1
+    assert COCO_CLASSES[class_index("sofa", COCO_CLASSES) - 1] == "couch"
+    with pytest.raises(InputError, match="unknown class 'spaceship'"):
+        class_index("spaceship", COCO_CLASSES)

@@ -138,7 +138,7 @@ def test_truncated_files_are_refused(tmp_path):
     for name in ("a.jpg", "a.tif"):
         whole = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(whole[: len(whole) // 2])
-        with pytest.raises(DataError, match=r"a\.(jpg|tif): cannot be"):
+        with pytest.raises(DataError, match=r"a\.(jpg|tif): .*cannot be"):
             open_large(tmp_path / name).pixels((0, 0, 230, 150))
 
 

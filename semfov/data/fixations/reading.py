@@ -53,18 +53,25 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     ...     len(read_fixations(path))
     1
     """
-    reader = reader_of(source, options.get("columns"))
+    return read_by(reader_of(source, options.get("columns")), source, options)
+
+
+def read_by(reader: _Reader, source: Any, options: dict[str, Any]) -> list[Fixations]:
+    """The records that a reader gives, if it has these options (`read_fixations`)."""
     if reader in DATA_SETS:
         name = DATA_SETS[reader]
         if "size" in options and reader is not read_osie:
             has = f"none for {source}, a file of {name}, whose frame is that of each trial"
             check(reader is read_cocosearch, "size", has, options["size"])
             options = {"screen": options["size"], **{key: each for key, each in options.items() if key != "size"}}
-        try:
-            return _read(reader, source, options)
-        except DataError as error:
-            raise DataError(f"{error}; it was read as a file of {name}") from None
-    return _read(reader, source, options)
+    shown = source if isinstance(source, str | PathLike) else "it"
+    check_options(options, [*signature(reader).parameters][1:], f"{reader.__name__}, which reads {shown}")
+    try:
+        return reader(source, **options)
+    except DataError as error:
+        if reader not in DATA_SETS:
+            raise
+        raise DataError(f"{error}; it was read as a file of {DATA_SETS[reader]}") from None
 
 
 def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | None = None) -> _Reader:
@@ -78,15 +85,6 @@ def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | No
     ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header}
     ours = ours or not {*(columns or ())} <= {*OURS}
     return read_export if is_export(header) and not ours else read_table
-
-
-def _read(reader: _Reader, source: Any, options: dict[str, Any]) -> list[Fixations]:
-    """The records that a reader gives, if it has these options."""
-    known = [*signature(reader).parameters][1:]
-    check_options(
-        options, known, f"{reader.__name__}, which reads {source if isinstance(source, str | PathLike) else 'it'}"
-    )
-    return reader(source, **options)
 
 
 _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from semfov.errors import InputError, check
 
-_Array = NDArray[np.float64]
+FixationValues = NDArray[np.float64]
 _Size = tuple[int, int]
 
 
@@ -50,7 +51,7 @@ class Letterbox:
         across, down = (whole - self.scale * part for whole, part in zip(self.screen, self.picture, strict=True))
         return across / 2, down / 2
 
-    def to_picture(self, points: _Array) -> _Array:
+    def to_picture(self, points: FixationValues) -> FixationValues:
         """Convert points from the screen to the picture.
 
         Args:
@@ -61,7 +62,7 @@ class Letterbox:
         """
         return np.asarray((points + 0.5 - self.offset) / self.scale - 0.5)
 
-    def to_screen(self, points: _Array) -> _Array:
+    def to_screen(self, points: FixationValues) -> FixationValues:
         """Convert points from the picture to the screen.
 
         Args:
@@ -106,33 +107,39 @@ def _check_size(name: str, size: Any) -> None:
     )
 
 
-def _array(name: str, values: Any) -> _Array:
-    """Numbers of any kind as doubles."""
+def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
+    """Real numbers of any common type as an array of doubles."""
+    given = values.detach().cpu() if isinstance(values, Tensor) else values
     try:
-        return np.asarray(values, dtype=np.float64)
+        array = np.asarray(given)
+        numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{name}: expected numbers, got {type(values).__name__}") from None
+        numbers = None
+    if numbers is None:
+        raise InputError(f"{argument}: expected real numbers in rows of one length, got {_named(values)}")
+    if finite:
+        check(bool(np.isfinite(numbers).all()), argument, "finite numbers", "infinite ones or NaN; leave these out")
+    return numbers
 
 
-def _resized_points(points: _Array, size: _Size, new: _Size) -> _Array:
-    """Convert points to pixels of the same frame at another size.
-
-    Shapes: points `(n, 2)`, size `(width, height)`, new `(width, height)` → `(n, 2)`.
-    """
-    return np.asarray((points + 0.5) * (np.array(new) / np.array(size)) - 0.5)
-
-
-def _resized_box(box: tuple[float, ...], size: _Size, new: _Size) -> tuple[float, float, float, float]:
-    """A box `(x1, y1, x2, y2)`, pixel edges, in pixels of the same frame at another size."""
-    return _box(np.array(box).reshape(2, 2) * (np.array(new) / np.array(size)))
+def as_path(points: Any, argument: str) -> NDArray[np.float64]:
+    """Points of fixations, `(n, 2)`, finite."""
+    path = as_array(points, argument, finite=True)
+    path = path.reshape(0, 2) if path.shape == (0,) else path
+    check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
+    return path
 
 
-def _box(corners: _Array) -> tuple[float, float, float, float]:
+def _named(values: Any) -> str:
+    kind = getattr(values, "dtype", None)
+    return type(values).__name__ if kind is None else f"{type(values).__name__} of {kind}"
+
+
+def _box(corners: FixationValues) -> tuple[float, float, float, float]:
     x1, y1, x2, y2 = corners.reshape(-1).tolist()
     return x1, y1, x2, y2
 
 
-FixationValues = NDArray[np.float64]
 ObjectBox = tuple[float, float, float, float]
 
 
@@ -169,7 +176,7 @@ class Fixations:
         """Check that the arrays belong together; lists and tensors become arrays."""
         for name in ("points", "durations"):
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _array(name, value))
+                object.__setattr__(self, name, as_array(value, name))
         shape = self.points.shape
         check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
         check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
@@ -196,8 +203,9 @@ class Fixations:
         Returns:
             The converted record.
         """
-        box = None if self.box is None else _resized_box(self.box, self.size, size)
-        return replace(self, points=_resized_points(self.points, self.size, size), size=size, box=box)
+        scale = np.array(size) / np.array(self.size)
+        box = None if self.box is None else _box(np.array(self.box).reshape(2, 2) * scale)
+        return replace(self, points=(self.points + 0.5) * scale - 0.5, size=size, box=box)
 
     def in_picture(self, size: tuple[int, int]) -> Fixations:
         """Convert the fixations to pixels of a picture that was shown letterboxed on the frame.

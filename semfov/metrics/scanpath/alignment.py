@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import check, check_number, check_whole
-from semfov.metrics.labels import as_array, as_path
 from semfov.metrics.scanpath.multimatch import aligned
 from semfov.metrics.scanpath.sequence import cell_labels
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array
 from semfov.errors import check, check_number
-from semfov.metrics.labels import as_array
 
 _Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array
 from semfov.errors import check
-from semfov.metrics.labels import as_array
 from semfov.metrics.scanpath.conditional import looked_up, share_below
 
 _Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import check
-from semfov.metrics.labels import as_array, as_path
 
 _Array = NDArray[np.float64]
 

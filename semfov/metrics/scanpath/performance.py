@@ -7,8 +7,9 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import check
-from semfov.metrics.labels import as_array, as_labels, as_numbers, as_path
+from semfov.metrics.labels import as_labels, as_numbers
 from semfov.metrics.search import cumulative_performance
 
 _Array = NDArray[np.float64]

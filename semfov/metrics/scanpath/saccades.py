@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semfov.metrics.labels import as_array, as_path
+from semfov.data.fixations.record import as_array, as_path
 
 _Array = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import InputError, check
-from semfov.metrics.labels import as_array, as_labels, as_path
+from semfov.metrics.labels import as_labels
 
 _Labels = NDArray[np.int64]
 

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data.fixations import Fixations, Letterbox, coco_name, read_ruarte
-from semfov.data.fixations.record import _resized_box, _resized_points
 from semfov.errors import InputError
 
 sides = st.integers(1, 3000)
@@ -33,8 +32,9 @@ def test_letterbox_and_resizing_equal_values_computed_by_hand():
     assert placed.box_to_screen((0, 0, 640, 480)) == (140, 0, 1540, 1050)
     # 480 × 640 becomes 787.5 × 1050.
     assert Letterbox((1680, 1050), (480, 640)).offset == (446.25, 0)
-    assert _resized_box((0, 0, 32, 24), (32, 24), (1680, 1050)) == (0, 0, 1680, 1050)
-    np.testing.assert_allclose(_resized_points(np.array([[0.0, 23.0]]), (32, 24), (1680, 1050)), [[25.75, 1027.625]])
+    larger = Fixations("a.jpg", "1", [[0.0, 23.0]], (32, 24), box=(0, 0, 32, 24)).resized((1680, 1050))
+    assert larger.box == (0, 0, 1680, 1050)
+    np.testing.assert_allclose(larger.points, [[25.75, 1027.625]])
     with pytest.raises(InputError, match=r"^picture:"):
         Letterbox((1680, 1050), (0, 5))
 

@@ -263,7 +263,7 @@ def test_a_record_takes_lists_and_tensors_and_refuses_what_is_no_size():
     for points in ([[1, 2.5]], torch.tensor([[1, 2.5]]), ((1, 2.5),)):
         assert Fixations("a.jpg", "1", points, (80, 60), [200]).resized((160, 120)).points.tolist() == [[2.5, 5.5]]
     for given, said in (
-        (([["a", "b"]], (80, 60)), "points: expected numbers, got list"),
+        (([["a", "b"]], (80, 60)), "points: expected real numbers in rows of one length, got list"),
         (([1, 2], (80, 60)), r"points: expected \(n, 2\)"),
         (([[1, 2]], "80x60"), "size: expected a width and a height above 0, got 80x60"),
         (([[1, 2]], (80, float("nan"))), "size: expected a width and a height above 0"),
