@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.tables import table
-from semfov.data.classes import alike, names_of
+from semfov.data.classes import _SYNONYMS, _TABLE, _other_numbers, _plain_key
 from semfov.data.word_vectors import TEMPERATURE, WordVectors, words_of
 from semfov.detection.class_names import COCO_CLASSES
 
@@ -20,9 +20,18 @@ NEAREST = (1, 3, 5, 10)
 TEMPERATURES = (0.04, 0.06, 0.08, 0.1, 0.15)
 
 
+def alike(name: str) -> list[int]:
+    """Numbers of the classes that a name stands for: in another spelling or, where there is none, as a synonym."""
+    key, keys = _plain_key(name), [_plain_key(other) for other in COCO_CLASSES]
+    forms = {key, *_other_numbers(key)}
+    same = [place for place, other in enumerate(keys) if other in forms or key in _other_numbers(other)]
+    return same or [place for place, other in enumerate(keys) if other in map(_plain_key, _SYNONYMS.get(key, ()))]
+
+
 def cases() -> list[tuple[str, int]]:
     """Other names, each with the index of its class."""
-    pairs = [(other, alike(other, COCO_CLASSES)) for name in COCO_CLASSES for other in names_of(name)]
+    others = dict(line.split(": ") for line in _TABLE.strip().splitlines())
+    pairs = [(each, alike(each)) for name in COCO_CLASSES for each in others.get(name, "").split(", ") if each]
     return [
         (other, places[0])
         for other, places in pairs

@@ -42,19 +42,9 @@ def fit_verification(config: FitVerificationConfig) -> None:
     chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
-    size, components = (config.columns, config.rows), len(eye.detector.classes) + 1
-    store = cell_store(store_folder(config.cache) / "searches", eye.settings(), *size, components)
-    photographs = open_photographs(
-        eye,
-        scenes,
-        chosen,
-        size,
-        classes=config.classes,
-        absent=config.absent,
-        max_area=config.max_target_area,
-        seed=config.seed,
-        store=store,
-    )
+    folder, components = store_folder(config.cache) / "searches", len(eye.detector.classes) + 1
+    store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
+    photographs = open_photographs(eye, scenes, chosen, config, store=store)
     fitted = fit_in_folds(photographs, evidence, config)
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import io
-import json
 import sys
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,14 +19,13 @@ from semfov.agent import ActivePerception
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOptions
 from semfov.cli.outcome import PictureOutcome, picture_outcome
-from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written
+from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.cli.truth import read_truth
 from semfov.data.sources import embedded_picture
 from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.head.world import World
-from semfov.io.code import package_digest
 from semfov.io.files import sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
@@ -37,7 +34,6 @@ from semfov.paths.georeference import georeference
 from semfov.report import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
 from semfov.runs.workers import run_tasks
 from semfov.threads import available_cores
 
@@ -141,22 +137,17 @@ def _check_places(files: Sequence[Path | None]) -> None:
     check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
 
 
-@dataclass
 class _PictureFiles:
     """Files that a command writes about its pictures: results, figures and a page."""
 
-    job: PictureJob
-    stream: TextIO
-    results: ResultsFile | None = None
-    folder: Path | None = None
-    written: list[Path] = field(default_factory=list)
-    episodes: dict[int, dict[str, Any]] = field(default_factory=dict)
-    rows: dict[int, dict[str, Any]] = field(default_factory=dict)
-    finished: SceneResults | None = None
-
-    def __post_init__(self) -> None:
-        """Check the file of results, and find what an interrupted command has finished."""
-        out = self.job.options.out
+    def __init__(self, job: PictureJob, stream: TextIO) -> None:
+        self.job, self.written = job, list[Path]()
+        self.episodes: dict[int, dict[str, Any]] = {}
+        self.rows: dict[int, dict[str, Any]] = {}
+        self.results: ResultsFile | None = None
+        self.folder: Path | None = None
+        self.finished: SceneResults | None = None
+        out = job.options.out
         if out is None:
             return
         kind = kind_of(out)
@@ -164,13 +155,10 @@ class _PictureFiles:
             _check_places([source.file for source in self.job.sources])
         file = out if kind is not None else out / "results.json"
         searched = self.job.title.startswith("search")
-        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=self.stream, truth=self.job.truth)
+        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=stream, truth=self.job.truth)
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several and out != STDOUT:
-            key = digest_of([self.job.depends_on(), package_digest()])[:32]
-            versions = [source.version() for source in self.job.sources]
-            folder = file.with_name(f"{file.name}.unfinished")
-            self.finished = SceneResults(folder, key, lambda number: json.dumps(versions[number]))
+            self.finished = unfinished(file, self.job.depends_on(), self.job.sources)
 
     def before(self) -> dict[int, PictureOutcome]:
         """Outcomes of an interrupted command with the same options and models, by the numbers of the pictures."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from pathlib import Path
@@ -15,7 +14,7 @@ from tqdm import tqdm
 from semfov.agents.picture import open_picture
 from semfov.cli.agent import check_device, class_names
 from semfov.cli.options import GazeOptions
-from semfov.cli.results import tell_written
+from semfov.cli.results import tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.text import plain_name
 from semfov.data.fixations import Fixations, write_table
@@ -23,14 +22,12 @@ from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import SemfovError, check
 from semfov.gaze.saliency.fixation_density import FixationDensity
-from semfov.io.code import package_digest
 from semfov.io.files import check_writable
 from semfov.paths.gaze import GazePrediction
 from semfov.report.gaze import gaze_part, write_gaze_page
 from semfov.report.page import page_path
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
 
 _DENSITIES = (".npy", ".tif", ".tiff", ".png")
 
@@ -89,11 +86,9 @@ class _GazeJob:
         self.finished: SceneResults | None = None
         if several and self.table is not None:
             settings = {name: value for name, value in options.plain().items() if name not in (*WHERE, "quiet")}
-            key = digest_of([settings, self.detector.settings(), self.model.digest(), package_digest()])[:32]
-            versions = [json.dumps(source.version()) for source in self.sources]
-            folder = self.table.with_name(f"{self.table.name}.unfinished")
-            self.finished = SceneResults(folder, key, versions.__getitem__)
-            for number, each in self.finished.items(len(versions)):
+            depends_on = {"options": settings, "detector": self.detector.settings(), "model": self.model}
+            self.finished = unfinished(self.table, depends_on, self.sources)
+            for number, each in self.finished.items(len(self.sources)):
                 (outcome,) = each["records"]
                 if "density" not in outcome or Path(outcome["density"]).exists():  # one that is gone is written again
                     self.outcomes[number] = outcome

@@ -6,16 +6,19 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
 from semfov.errors import check
+from semfov.io.code import package_digest
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.conversion import COLUMNS
 from semfov.runs.results import SceneResults
+from semfov.runs.scene_run import digest_of
 
 _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
 """Ends of the names of files of results."""
@@ -143,6 +146,13 @@ def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
         {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
         for row in [*rows, *({"class": name} for name in missing)]
     ]
+
+
+def unfinished(file: Path, depends_on: Mapping[str, Any], sources: Sequence[PictureSource]) -> SceneResults:
+    """What a command has finished, beside its file: of pictures that are the same, with all that it depends on."""
+    key = digest_of([depends_on, package_digest()])[:32]
+    versions = [json.dumps(source.version()) for source in sources]
+    return SceneResults(file.with_name(f"{file.name}.unfinished"), key, versions.__getitem__)
 
 
 def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:

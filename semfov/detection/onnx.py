@@ -174,7 +174,6 @@ class OnnxDetector(Detector):
                 )
 
     def settings(self) -> dict[str, object]:
-        """List the settings that the detections depend on."""
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
         providers = self.session.providers
         return super().settings() | own | ({} if providers is None else {"providers": list(providers)})

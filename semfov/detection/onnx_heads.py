@@ -129,16 +129,6 @@ def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Can
     return Candidates(_fractions(boxes, canvas), logits.sigmoid())
 
 
-def _decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """Decode RT-DETR that returns one tensor; rows `(B, Q, 4 + K)`, canvas `(width, height)`; rows `(B, Q, 4 + K)`.
-
-    >>> _decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
-    tensor([[[0., 2., 8., 6.]]])
-    """
-    check_shape(rows, "rows", None, None, None)
-    return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])
-
-
 def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offset: float) -> Tensor:
     expected = _cell_count(canvas, strides)
     what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
@@ -409,7 +399,9 @@ def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Cand
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if "pred_boxes" in outputs:
         return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
-    return _decode_rtdetr_rows(_first(outputs), canvas)
+    rows = _first(outputs)  # `(B, Q, 4 + K)`, with the scores after their sigmoid
+    check_shape(rows, "rows", None, None, None)
+    return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])
 
 
 HEADS: dict[str, _DetectionHead] = {

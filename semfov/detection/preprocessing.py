@@ -1,6 +1,5 @@
 """The preprocessing that a network expects, as settings that can be stored with the model."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, Self, get_args
@@ -9,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
+from semfov.io.schema import is_number
 
 _ChannelOrder = Literal["rgb", "bgr"]
 
@@ -29,11 +29,11 @@ class Preprocessing:
         lookup(str(self.channels), get_args(_ChannelOrder), "channel order")
         for name in ("mean", "std"):
             values = getattr(self, name)
-            three = isinstance(values, list | tuple) and len(values) == 3 and all(map(_is_number, values))
+            three = isinstance(values, list | tuple) and len(values) == 3 and all(map(is_number, values))
             check(three, f"preprocessing.{name}", "three numbers", values)
             object.__setattr__(self, name, tuple(map(float, values)))
         for name in ("scale", "fill"):
-            check(_is_number(getattr(self, name)), f"preprocessing.{name}", "a number", getattr(self, name))
+            check(is_number(getattr(self, name)), f"preprocessing.{name}", "a number", getattr(self, name))
         for name in ("stretch", "corner"):
             value = getattr(self, name)
             check(isinstance(value, bool), f"preprocessing.{name}", "true or false", value)
@@ -80,10 +80,6 @@ def check_bytes(canvas: Tensor) -> None:
     """Raise `InputError` unless a canvas is `(B, 3, H, W)`, bytes."""
     fits = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
     check(fits, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

@@ -116,7 +116,6 @@ class _TorchvisionDetector(ModuleDetector):
         return {"pyramid": cast(nn.Module, self.model.backbone)}
 
     def settings(self) -> dict[str, object]:
-        """List the settings that the detections depend on."""
         transform: Any = self.model.transform
         sizes = {"min_size": list(transform.min_size), "max_size": transform.max_size}
         return super().settings() | ({} if self.stretch else sizes)

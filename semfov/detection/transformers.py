@@ -89,7 +89,6 @@ class _TransformersDetector(ModuleDetector):
         return resized_images(images, scale=scale, antialias=scale < 1)
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         outputs = self.model(pixel_values=self.preprocessing(self._pixels(canvas)))
         logits, boxes = outputs.logits.to(canvas.dtype), outputs.pred_boxes.to(canvas.dtype)
         size = (canvas.shape[-1], canvas.shape[-2])
@@ -104,7 +103,6 @@ class _TransformersDetector(ModuleDetector):
         return {"backbone": found[0]} if found else {}
 
     def settings(self) -> dict[str, object]:
-        """List the settings that the detections depend on."""
         own = {"softmax": self.softmax, "preprocessing": self.preprocessing.settings()}
         if self.limits is not None:
             own["edges"] = [*self.limits.values()] if self.resizes else []

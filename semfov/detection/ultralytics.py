@@ -50,7 +50,6 @@ class _UltralyticsDetector(ModuleDetector):
         return {f"head{place}": layers[place] for place in read} if isinstance(read, list | tuple) else {}
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         outputs = self.model(self._pixels(canvas))
         columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
         if not isinstance(columns, Tensor) or columns.ndim != 3 or columns.shape[1] != 4 + self._count:

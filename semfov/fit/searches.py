@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
-from typing import ClassVar, Generic
+from typing import Any, ClassVar, Generic
 
 import torch
 from torch import Tensor
@@ -124,26 +124,23 @@ def open_photographs(
     eye: Eye,
     scenes: Scenes,
     chosen: Sequence[int],
-    cells: tuple[int, int],
+    config: Any,
     *,
-    classes: int,
-    absent: int | None,
-    max_area: float,
-    seed: int,
     store: DetectionStore | None = None,
     spare: int = 0,
     everywhere: Callable[[int], Detections] | None = None,
 ) -> list[SearchedPhotograph]:
-    """Draw classes to search for in photographs; cells `(columns, rows)`."""
-    photographs, protocol = list[SearchedPhotograph](), ProtocolConfig(seed=seed)
+    """Draw classes to search for in photographs, by a `FitVerificationConfig`."""
+    photographs, seed, area = list[SearchedPhotograph](), config.seed, config.max_target_area
+    protocol = ProtocolConfig(seed=seed)
     for index in chosen:
         annotation = scenes.annotation(index)
-        grid = Grid(*cells, annotation.size)
-        targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        grid = Grid(config.columns, config.rows, annotation.size)
+        targets = choose_classes(scenes, index, annotation, config.classes, area, seed, config.absent)
         held = set(annotation.labels.tolist())
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
-        wide = choose_searches(scenes, index, grid, protocol, classes, max_area, more)
+        wide = choose_searches(scenes, index, grid, protocol, config.classes, area, more)
         search_targets = tuple(search._replace(spare=number >= len(targets)) for number, search in enumerate(wide))
         if targets:
             photographs.append(

@@ -396,11 +396,7 @@ class VerificationFit(PartFit):
             run.eye,
             run.scenes,
             judged,
-            (config.columns, config.rows),
-            classes=config.classes,
-            absent=config.absent,
-            max_area=config.max_target_area,
-            seed=config.seed,
+            config,
             spare=min(20, _ABSENT // len(judged)),
             everywhere=run.detections,
         )

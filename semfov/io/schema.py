@@ -79,7 +79,6 @@ class Number(Json):
     whole: bool = False
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         whole = self.whole or self.size is not None
         check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", excerpt(value))
         if self.size is not None:
@@ -92,7 +91,6 @@ class Flag(Json):
     """Requirement of a JSON value: true or false."""
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         check(isinstance(value, bool), name, "true or false", excerpt(value))
 
 
@@ -107,7 +105,6 @@ class Array(Json):
     distinct: bool = False
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
         fits = self.size is None or _fits(self.size, len(value), sizes)
         check(fits, name, f"{self.size} items", f"{len(value)} with {sizes}")
@@ -126,7 +123,6 @@ class Pair(Json):
     items: tuple[Json, ...]
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         fits = isinstance(value, list | tuple) and len(value) == len(self.items)
         check(fits, name, f"a list of {len(self.items)} items", excerpt(value))
         for place, (item, kind) in enumerate(zip(value, self.items, strict=True)):
@@ -140,7 +136,6 @@ class Text(Json):
     options: tuple[str, ...] | None = None
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         fits = isinstance(value, str) and (self.options is None or value in self.options)
         named = f"one of {', '.join(self.options)}" if self.options else "no text"
         check(fits, name, "text" if self.options is None else named, excerpt(value))
@@ -156,7 +151,6 @@ class Object(Json):
     required: tuple[str, ...] = ()
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         check(isinstance(value, Mapping), name, "an object", excerpt(value))
         for key in self.required:
             check(key in value, f"{name}.{key}", "a value", "nothing")
@@ -174,7 +168,6 @@ class Maybe(Json):
     of: Json
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
         if value is not None:
             self.of.check(name, value, sizes)
 
@@ -183,7 +176,7 @@ class Anything(Json):
     """Requirement that any JSON value meets."""
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        """Check a value, see `Json.check`."""
+        pass
 
 
 CLASSES = Array(Text(), "K", least=1, distinct=True)

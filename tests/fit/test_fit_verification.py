@@ -1,5 +1,7 @@
 """The fit of the verification, against loops and SciPy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -149,15 +151,17 @@ def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
     assert chosen == (fits[0] if fits else _LEVELS[-1])
 
 
+SOUGHT = FitVerificationConfig(columns=4, rows=3, max_target_area=1.0)
+
+
 def opened(detector, store=None):
     """Three embedded scenes with classes to search for, and the evidence of an untrained model."""
     eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
     scenes = EmbeddedScenes(CLASSES, count=3)
-    options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
     torch.manual_seed(0)
     evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
     kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
-    return open_photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
+    return open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=kept), evidence
 
 
 @pytest.fixture
@@ -174,8 +178,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
         calls.append(index)
         return _look_from(eye, scenes[index].image, live[index].grid.centres)
 
-    options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
-    found = open_photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
+    found = open_photographs(eye, scenes, [0, 1, 2], SOUGHT, everywhere=stored)
     for _ in range(2):
         for one, other in zip(live, found, strict=True):
             for sought in one.targets:
@@ -190,8 +193,8 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
 
 def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
     live, evidence = seen
-    options = {"classes": 1, "absent": 0, "max_area": 1.0, "seed": 0}
-    few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], (4, 3), **options, spare=n) for n in (0, 1))
+    sought = SimpleNamespace(**{**vars(SOUGHT), "classes": 1, "absent": 0})
+    few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], sought, spare=n) for n in (0, 1))
     config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
     for one, other in zip(few, many, strict=True):
         assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]

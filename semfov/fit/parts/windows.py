@@ -19,6 +19,7 @@ from semfov.fit.windows import MosaicFit, judge_windows, some_explored
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.io.manifest import Part
 from semfov.metrics.averages import FloatArray
+from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes
 from semfov.runs.window_looking import found_in
@@ -98,10 +99,9 @@ class WindowsFit(PartFit):
             median(max(width, height * 4 / 3) for width, height in sizes),
             _OF_INPUT * self.run.eye.detector.input_size[0],
         )
-        return FitZoomConfig(
-            data=own.data,
-            detector=own.detector,
-            holdout=own.holdout or 5,
+        return self.inputs.settings(
+            FitZoomConfig,
+            sensor=SensorConfig(),
             mosaics=max(1, training // 5),
             far=max(1, training // 60),
             crowded=max(1, training // 10),
@@ -115,11 +115,6 @@ class WindowsFit(PartFit):
             tile=max(16, round(width)),
             steps=own.window_steps,
             survey_steps=own.window_steps,
-            seed=own.seed,
-            out=own.out,
-            cache=own.cache,
-            workers=own.workers,
-            scheduler=own.scheduler,
         )
 
     def fit(self) -> PartResult:
