@@ -14,6 +14,8 @@ from torch import Tensor
 
 from semfov.words import OTHER_WORDS
 
+__all__ = ["DataError", "InputError", "SemfovError"]
+
 _ROUNDING = 1e-3
 
 _Name = TypeVar("_Name", bound=str)
@@ -22,17 +24,7 @@ _Result = TypeVar("_Result")
 
 
 def printable(text: str) -> str:
-    r"""Escape control characters, and bytes of names that are not UTF-8; lines stay.
-
-    Args:
-        text: a text, such as the name of a file.
-
-    Returns:
-        The text that a terminal may show.
-
-    >>> printable("a" + chr(27) + "[2J.jpg")
-    'a\\x1b[2J.jpg'
-    """
+    """Escape control characters, and bytes of names that are not UTF-8; lines stay."""
     steering = ("Cc", "Cf", "Cs")  # controls, marks of direction and lone surrogates
     return "".join(
         ascii(each)[1:-1] if unicodedata.category(each) in steering and each not in "\n\t" else each for each in text
@@ -56,43 +48,13 @@ class DataError(SemfovError):
 
 
 def check(condition: bool, argument: str, expected: str, got: object) -> None:
-    """Raise `InputError` with a message in the house's form, unless a condition holds.
-
-    Args:
-        condition: whether the argument is as expected.
-        argument: name of the argument.
-        expected: what the argument must be, in words.
-        got: the value that was passed.
-
-    Raises:
-        InputError: the condition does not hold.
-
-    >>> check(True, "sigma", "a positive number", 3.0)
-    >>> check(False, "sigma", "a positive number", -1.0)
-    Traceback (most recent call last):
-    semfov.errors.InputError: sigma: expected a positive number, got -1.0
-    """
+    """Raise `InputError` with a message in the house's form, unless a condition holds."""
     if not condition:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
 def values_known(*tensors: Tensor) -> bool:
-    """Tell whether the values of tensors can be read.
-
-    They cannot while a graph is traced, under a transform of `torch.func`, or on the device `meta`. Checks of values
-    are left out there.
-
-    Args:
-        tensors: tensors of any shape.
-
-    Returns:
-        Whether the values of all of them can be read.
-
-    >>> values_known(torch.ones(2))
-    True
-    >>> torch.func.vmap(lambda row: torch.tensor(values_known(row)))(torch.ones(2, 3))
-    tensor([False, False])
-    """
+    """Tell whether the values of tensors can be read: not while traced, under `torch.func`, or on the device `meta`."""
     if torch.compiler.is_compiling() or any(tensor.is_meta for tensor in tensors):
         return False
     try:
@@ -105,15 +67,7 @@ def values_known(*tensors: Tensor) -> bool:
 
 
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
-    """Raise `InputError` unless the last dimensions of a tensor have the given sizes.
-
-    Args:
-        tensor: the tensor.
-        argument: name of the argument, for the message.
-        shape: size of each of the last dimensions; `None` stands for any size.
-
-    >>> check_shape(torch.zeros(2, 3, 4), "boxes", None, 4)
-    """
+    """Raise `InputError` unless the last dimensions of a tensor have the given sizes; None stands for any."""
     check_tensor(tensor, argument)
     sizes = tuple(tensor.shape[-len(shape) :])
     if tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True)):
@@ -124,64 +78,25 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
 
 
 def check_tensor(value: object, argument: str) -> None:
-    """Raise `InputError` unless a value is a tensor; the message has the call that converts it.
-
-    Args:
-        value: the value.
-        argument: name of the argument, for the message.
-
-    >>> check_tensor([1.0], "beta")
-    Traceback (most recent call last):
-    semfov.errors.InputError: beta: expected a tensor, got a list; give torch.as_tensor(beta)
-    """
+    """Raise `InputError` unless a value is a tensor; the message has the call that converts it."""
     got = f"a {type(value).__name__}; give torch.as_tensor({argument})"
     check(isinstance(value, Tensor), argument, "a tensor", got.replace("a ndarray", "a NumPy array"))
 
 
 def check_whole(value: object, argument: str, low: int, high: int) -> None:
-    """Raise `InputError` unless a value is a whole number in a range.
-
-    Args:
-        value: the value.
-        argument: name of the argument, for the message.
-        low: the smallest value allowed.
-        high: the largest value allowed.
-
-    >>> check_whole(3, "shifts", 0, 10)
-    """
+    """Raise `InputError` unless a value is a whole number in a range."""
     inside = isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
     check(inside, argument, f"a whole number from {low:,} to {high:,}", repr(value))
 
 
 def check_number(value: object, argument: str, low: float, high: float) -> None:
-    """Raise `InputError` unless a value is a number in a range.
-
-    Args:
-        value: the value.
-        argument: name of the argument, for the message.
-        low: the smallest value allowed.
-        high: the largest value allowed.
-
-    >>> check_number(0.5, "threshold", 0, 1)
-    """
+    """Raise `InputError` unless a value is a number in a range."""
     inside = isinstance(value, Real) and not isinstance(value, bool) and low <= float(value) <= high
     check(inside, argument, f"a number from {low:g} to {high:g}", repr(value))
 
 
 def check_pixels(image: Tensor, argument: str) -> None:
-    """Raise `InputError` unless the values of an image lie in [0, 1], up to rounding.
-
-    The message tells how to bring the image into that range.
-
-    Args:
-        image: pixels of any shape.
-        argument: name of the argument, for the message.
-
-    >>> check_pixels(torch.rand(1, 3, 4, 4), "image")
-    >>> check_pixels(torch.full((1, 3, 4, 4), 255.0), "image")
-    Traceback (most recent call last):
-    semfov.errors.InputError: image: expected RGB in [0, 1], got numbers from 255 to 255; divide by 255
-    """
+    """Raise `InputError` unless the values of an image lie in [0, 1], up to rounding, with how to bring them there."""
     if not values_known(image) or not image.numel():
         return
     # In the order of memory, which is several times faster than across it.
@@ -207,41 +122,14 @@ def _to_unit(least: float, most: float) -> str:
 
 
 def check_finite(tensor: Tensor, argument: str) -> None:
-    """Raise `InputError` where a tensor holds a NaN or an infinite value.
-
-    Args:
-        tensor: the tensor, of any shape.
-        argument: name of the argument, for the message.
-
-    >>> check_finite(torch.tensor([1.0, float("nan")]), "gaze")
-    Traceback (most recent call last):
-    semfov.errors.InputError: gaze: expected finite numbers, got 1 of 2 that are not finite
-    """
+    """Raise `InputError` where a tensor holds a NaN or an infinite value."""
     if values_known(tensor) and not bool((finite := torch.isfinite(tensor)).all()):
         bad = tensor.numel() - int(finite.sum())
         check(False, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
-    """Return a name if it is known; otherwise suggest the nearest known names.
-
-    Args:
-        name: the name that was asked for.
-        known: the names that exist.
-        what: kind of name, for the message.
-
-    Returns:
-        The known name.
-
-    Raises:
-        InputError: the name is unknown.
-
-    >>> lookup("cup", ["cup", "cat"], "class")
-    'cup'
-    >>> lookup("cups", ["cup", "cat"], "class")
-    Traceback (most recent call last):
-    semfov.errors.InputError: unknown class 'cups'; did you mean 'cup'?
-    """
+    """Return a name if it is known; otherwise suggest the nearest known names."""
     names = list(known)
     if name in names:
         return names[names.index(name)]
@@ -251,20 +139,7 @@ def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
 
 
 def check_options(options: Iterable[str], known: Iterable[str], what: str) -> None:
-    """Raise `InputError` for the first unknown option of a call that passes its options on, with the nearest names.
-
-    Args:
-        options: names of the options that were given.
-        known: names of the options that exist.
-        what: whose options they are, for the message.
-
-    Raises:
-        InputError: an option is unknown.
-
-    >>> check_options(["gird"], ["grid", "sigma"], "this agent")
-    Traceback (most recent call last):
-    semfov.errors.InputError: gird: expected an option of this agent, got an unknown one; did you mean grid=?
-    """
+    """Raise `InputError` for the first unknown option of a call that passes its options on, with the nearest names."""
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
@@ -274,21 +149,7 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
 
 
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither.
-
-    Args:
-        function: the method.
-
-    Returns:
-        The method, which checks its arguments first.
-
-    Raises:
-        InputError: by the method: an argument is unknown, missing or one too many.
-
-    >>> checked_keywords(lambda self, picture: picture)(None, pictur="a.jpg")  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    semfov.errors.InputError: ...
-    """
+    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither."""
     form, name = signature(function), function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
     _, *known = form.parameters
     words = [each.name if each.default is each.empty else f"{each.name}=" for each in form.parameters.values()][1:]

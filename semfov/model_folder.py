@@ -109,13 +109,10 @@ class ModelFolder:
         """The class of the sensor."""
         return SENSORS[lookup(self.manifest.sensor["name"], SENSORS, "sensor")].make
 
-    def sensor(self) -> Sensor:
-        """The sensor that the models were fitted for."""
-        return self._sensor.from_settings(self.manifest.sensor)
-
     def eye(self, **source: Any) -> Eye:
         """Load the eye, sensor and detector, with arguments for `load_detector`; checks the models against it."""
-        eye = Eye(self.sensor(), self.load_detector(**source), reference=self.manifest.sensor["reference"])
+        sensor = self._sensor.from_settings(self.manifest.sensor)
+        eye = Eye(sensor, self.load_detector(**source), reference=self.manifest.sensor["reference"])
         for model in self._models.values():
             model.check_compatible(eye.settings())
         return eye
@@ -145,36 +142,22 @@ class ModelFolder:
         assert model is None or isinstance(model, FovealObservationModel)
         return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
 
-    def search(self) -> tuple[Observer, Policy]:
-        """Observer and policy for search."""
-        evidence = self._models.get("evidence")
-        return (Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()), Policy("non-predictive")
-
-    def verification(self) -> Verification | None:
-        """The model of closer looks; None for an agent that decides without them."""
-        model = self._models.get("verification")
-        return model if isinstance(model, Verification) and self.used("evidence") else None
-
-    def explore(self) -> tuple[Observer, Policy]:
-        """Observer and policy for exploration."""
-        learned, sensor = self._models.get("map"), self.manifest.sensor
-        if isinstance(learned, MapEvidence):
-            return LearnedMap(learned), Policy("closer-look", fovea=self._sensor.width(sensor) / sensor["reference"])
-        return Semantic(len(self.manifest.classes) + 1), Policy("random")
-
-    def windows(self) -> GlimpseEvidence | None:
-        """The evidence for large pictures; None for an agent that looks at slices."""
-        model = self._models.get("windows")
-        return model if isinstance(model, GlimpseEvidence) else None
-
     def arguments(self, *, detector: str | PathLike[str] | None = None, **options: Any) -> dict[str, Any]:
-        """Arguments of `semfov.ActivePerception`; takes the arguments of `load_detector`."""
-        grid = self.manifest.grid
+        """Arguments of `semfov.ActivePerception`, of the models that are used; takes the arguments of `load_detector`.
+
+        An agent decides without closer looks, and looks at slices of large pictures, where it has no models for more.
+        """
+        eye, models, sensor = self.eye(detector=detector, **options), self._models, self.manifest.sensor
+        evidence, learned = models.get("evidence"), models.get("map")
+        searching = Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()
+        explore: tuple[Observer, Policy] = Semantic(len(self.manifest.classes) + 1), Policy("random")
+        if isinstance(learned, MapEvidence):
+            explore = LearnedMap(learned), Policy("closer-look", fovea=self._sensor.width(sensor) / sensor["reference"])
         return {
-            "eye": self.eye(detector=detector, **options),
-            "search": self.search(),
-            "explore": self.explore(),
-            "verification": self.verification(),
-            "windows": self.windows(),
-            "grid": grid,
+            "eye": eye,
+            "search": (searching, Policy("non-predictive")),
+            "explore": explore,
+            "verification": models.get("verification") if self.used("evidence") else None,
+            "windows": models.get("windows"),
+            "grid": self.manifest.grid,
         }

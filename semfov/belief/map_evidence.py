@@ -12,7 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import LOOK_FEATURES, class_features
 from semfov.detection.detections import Detections
 from semfov.errors import check_whole
-from semfov.io.schema import Field, Number, Pair, Schema, perceptron
+from semfov.io.schema import Array, Field, Number, Schema, perceptron
 
 _EMPTINESS = 9
 _GAIN = 7
@@ -65,7 +65,7 @@ class MapEvidence(Evidence):
             **perceptron("worth", _GAIN, "R"),
             "prior": Field(("C",), low=-1e3, high=1e3),
         },
-        {"widths": Pair((Number(size="L"), Number(size="R"))), "components": Number(size="C", low=3)},
+        {"widths": Array((Number(size="L"), Number(size="R"))), "components": Number(size="C", low=3)},
     )
 
     def __init__(

@@ -12,7 +12,7 @@ from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm,
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import LOOK_FEATURES, look_features
 from semfov.detection.detections import Detections
-from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
+from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 
 _PRESENCE = 9
 # Log odds for a cell that is assumed not to hold the target.
@@ -78,7 +78,7 @@ class TargetEvidence(Evidence):
             "prior": Field(("C",), low=-1e3, high=1e3),
         },
         {
-            "widths": Pair((Number(size="L"), Number(size="R"))),
+            "widths": Array((Number(size="L"), Number(size="R"))),
             "components": Number(size="C"),
             "thresholds": THRESHOLDS,
         },

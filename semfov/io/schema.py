@@ -96,9 +96,9 @@ class Flag(Json):
 
 @dataclass(frozen=True)
 class Array(Json):
-    """Requirement of a JSON value: a list."""
+    """Requirement of a JSON value: a list, of items of one kind or with a kind for each."""
 
-    of: Json
+    of: Json | tuple[Json, ...]
     size: Size | None = None
     least: int = 0
     ascending: bool = False
@@ -106,27 +106,16 @@ class Array(Json):
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
-        fits = self.size is None or _fits(self.size, len(value), sizes)
-        check(fits, name, f"{self.size} items", f"{len(value)} with {sizes}")
+        size = len(self.of) if isinstance(self.of, tuple) else self.size
+        fits = size is None or _fits(size, len(value), sizes)
+        check(fits, name, f"{size} items", f"{len(value)} with {sizes}")
         check(len(value) >= self.least, name, f"at least {self.least} items", len(value))
-        for place, item in enumerate(value):
-            self.of.check(f"{name}[{place}]", item, sizes)
+        kinds = self.of if isinstance(self.of, tuple) else [self.of] * len(value)
+        for place, (item, kind) in enumerate(zip(value, kinds, strict=True)):
+            kind.check(f"{name}[{place}]", item, sizes)
         grows = not self.ascending or all(a < b for a, b in pairwise(value))
         check(grows, name, "ascending numbers", excerpt(value))
         check(not self.distinct or len(set(value)) == len(value), name, "items that differ", "repeated items")
-
-
-@dataclass(frozen=True)
-class Pair(Json):
-    """Requirement of a JSON value: a list of a fixed number of items."""
-
-    items: tuple[Json, ...]
-
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        fits = isinstance(value, list | tuple) and len(value) == len(self.items)
-        check(fits, name, f"a list of {len(self.items)} items", excerpt(value))
-        for place, (item, kind) in enumerate(zip(value, self.items, strict=True)):
-            kind.check(f"{name}[{place}]", item, sizes)
 
 
 @dataclass(frozen=True)

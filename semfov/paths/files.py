@@ -14,7 +14,7 @@ from semfov.belief.grid import Grid
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
-from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
+from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Schema, Text
 from semfov.io.storage import read, write_file
 from semfov.paths.endings import Ending
 from semfov.paths.stimulus import LONGEST
@@ -75,9 +75,9 @@ _OTHERS = {
 """Calls that write files with these ends of names."""
 
 
-def pair(of: Json) -> Pair:
+def pair(of: Json) -> Array:
     """Requirements of two values of one kind."""
-    return Pair((of, of))
+    return Array(of, 2)
 
 
 def grid_values(grid: Grid) -> dict[str, Any]:

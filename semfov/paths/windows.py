@@ -13,7 +13,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import check
-from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Pair
+from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import GazeRecord
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
@@ -24,7 +24,7 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
 
 _WINDOW = {
-    "fixation": Pair((Number(), Number(), POSITIVE)),
+    "fixation": Array((Number(), Number(), POSITIVE)),
     "level": WHOLE,
     "cells": Array(Number(whole=True), 4),
     "within": Maybe(Array(Number(), 4)),

@@ -88,7 +88,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     # A part that is not used, or that a folder lacks, leaves the agent without it.
     for parts in ({"windows": fitted.part.__class__(None, None, False, "")}, {}):
         replace(Manifest.read(home / "models"), parts=parts).write(home / "models")
-        assert ModelFolder(home / "models").windows() is None
+        assert ModelFolder(home / "models").arguments()["windows"] is None
 
 
 @pytest.mark.parametrize(

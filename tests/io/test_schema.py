@@ -11,7 +11,7 @@ from semfov.belief import MapEvidence, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.io import storage
 from semfov.io.pretrained import PretrainedForEye
-from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
+from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Schema, Text, is_number, is_plain
 from semfov.io.storage import read_tensors, write_tensors
 from semfov.zoom import GlimpseEvidence
 
@@ -292,7 +292,7 @@ def test_schemas_accept_valid_values_and_refuse_invalid_ones():
         (Number(), True),
         (Number(), float("nan")),
         (Array(Number(), ascending=True), [1, 1]),
-        (Pair((Number(), Number())), [1]),
+        (Array((Number(), Number())), [1]),
         (Text(("a",)), "b"),
         (Object({"a": Number()}), {"b": 1}),
         (Object({"a": Number()}, required=("a",)), {}),

@@ -19,7 +19,7 @@ from semfov.errors import InputError, check, check_shape
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
-from semfov.io.schema import Array, Field, Pair, Schema, Text
+from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
 from semfov.io.storage import checksum
 from semfov.sensor.lines import constant
@@ -87,7 +87,7 @@ class FixationDensity(Pretrained):
             "duration": Field(("D", 2), low=0, high=1e2),
             "pause": Field((), low=0, high=1e4),
         },
-        {"layers": Array(Pair((Text(), JsonNumber(low=1, high=1e6, whole=True))), least=1)},
+        {"layers": Array(Array((Text(), JsonNumber(low=1, high=1e6, whole=True))), least=1)},
     )
     start: Tensor
     duration: Tensor
