@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -47,7 +47,7 @@ _OF_ONE_MAP = {"readouts": 1, "units": 4}
 
 
 @dataclass(frozen=True)
-class ViewingConfig(ViewingData, GazeFit):
+class ViewingConfig(ViewingData):
     """Comparison of models with people who view the same pictures without a task.
 
     Args:
@@ -56,6 +56,7 @@ class ViewingConfig(ViewingData, GazeFit):
         studied: number of the detector that is also fitted to half of the people, and to the first data set alone.
         folds: number of folds; every picture is held out once.
         sequences: number of held-out pictures of the first data set for which scanpaths are drawn.
+        fit: how the models are fitted.
         page: page with places for the tables (`<!-- table viewing -->` to `<!-- end -->`); none: it is left alone.
         out: folder for the tables, and for the models and scores of the folds.
     """
@@ -66,6 +67,7 @@ class ViewingConfig(ViewingData, GazeFit):
     folds: Count = 5
     sequences: Whole = 50
     page: Path | None = None
+    fit: GazeFit = field(default_factory=GazeFit)
     out: Path = Path("runs/human_viewing")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -52,11 +52,6 @@ class GazeFit(Settings):
     decay: Positive = 0.01
     dropout: Share = 0.2
     seed: Seed = 0
-
-    @property
-    def fit(self) -> GazeFit:
-        """These settings alone, of those of a command that has others too."""
-        return GazeFit(**{each.name: getattr(self, each.name) for each in fields(GazeFit)})
 
 
 def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, title: str) -> FixationDensity:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,19 +21,21 @@ from semfov.runs.tables import table
 
 
 @dataclass(frozen=True)
-class GazeModelFit(ViewingData, GazeFit):
+class GazeModelFit(ViewingData):
     """Pictures that people viewed freely, and how a model of where they look is fitted to them and evaluated.
 
     Args:
         layers: names of the feature maps (none: those of the shipped model, or of backbone and head at
             strides 8 to 32 that the detector has).
         folds: number of folds for the evaluation (0: none).
+        fit: how the model is fitted.
     """
 
     within: ClassVar[str] = "gaze."
 
     layers: tuple[str, ...] = ()
     folds: Whole = 5
+    fit: GazeFit = field(default_factory=GazeFit)
 
 
 def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:

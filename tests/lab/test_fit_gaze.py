@@ -233,7 +233,7 @@ def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, 
     monkeypatch.setattr("semfov.fit.detector.check_sources", lambda data, config: None)
     monkeypatch.setattr("semfov.fit.detector.make_detector", lambda config: detector)
     data = {"fixations": tmp_path / "people.csv", "pictures": tmp_path / "pictures", "cache": tmp_path, "seconds": 3}
-    data |= {"folds": 2, "epochs": 2, "saccade_epochs": 1, "units": 4}
+    data |= {"folds": 2, "fit.epochs": 2, "fit.saccade_epochs": 1, "fit.units": 4}
     words = [str(word) for name, value in data.items() for word in (f"--gaze.{name}", value)]
     assert main(["fit", "colours", *words, "--out", str(tmp_path / "mymodels")]) == 0, capsys.readouterr().err
     printed = capsys.readouterr().out
