@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from eval.comparison.saliency import open_at_reference
+from eval.comparison.settings import SaliencyConfig
 from semfov import ActivePerception, Scanpath
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
@@ -31,7 +32,7 @@ from semfov.gaze.policies import Policy
 from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
-from semfov.runs.config import DetectorConfig, SaliencyConfig, SensorConfig
+from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.settings import Settings, Shifts, Side
 from semfov.runs.setup import make_eye, make_observation
 from semfov.runs.store import look_everywhere

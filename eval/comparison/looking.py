@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from eval.comparison.saliency import SaliencyStore, saliency_table
+from eval.comparison.settings import ComparedConfig
 from semfov.belief.grid import Grid
 from semfov.errors import lookup
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
-from semfov.runs.config import RunConfig, SaliencyModel
+from semfov.runs.config import SaliencyModel
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import store_folder
 from semfov.strategy import Strategy
@@ -38,7 +39,9 @@ class Candidate(Strategy):
 class ComparedLooking(PolicyLooking):
     """Looks at scenes, and policies that are compared in them, with the saliency that they need of each scene."""
 
-    def __init__(self, config: RunConfig) -> None:
+    config: ComparedConfig
+
+    def __init__(self, config: ComparedConfig) -> None:
         super().__init__(config)
         folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
         self.saliency_stores = {

@@ -5,15 +5,16 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TypeVar
 
+from eval.comparison.settings import ComparedConfig, sensor_settings
 from semfov.errors import InputError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition.base import FUNCTIONS
 from semfov.model_folder import ModelFolder
-from semfov.runs.config import DetectorConfig, PolicyConfig, RunConfig, SensorConfig
+from semfov.runs.config import DetectorConfig, PolicyConfig
 from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
 from semfov.runs.presets import PolicyChoice, resolve
 
-_Config = TypeVar("_Config", bound=RunConfig)
+_Config = TypeVar("_Config", bound=ComparedConfig)
 
 
 def with_models(config: _Config) -> _Config:
@@ -50,7 +51,7 @@ def with_models(config: _Config) -> _Config:
     config = replace(
         config,
         detector=detector,
-        sensor=SensorConfig.of(folder.manifest.sensor),
+        sensor=sensor_settings(folder.manifest.sensor),
         belief=belief,
         policies=tuple(chosen),
     )
@@ -70,7 +71,7 @@ def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfi
     return DetectorConfig(name=source, **{"background": None, **options})
 
 
-def _recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
+def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> PolicyChoice:
     """The policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
@@ -84,7 +85,7 @@ def _recommended_policy(folder: ModelFolder, config: RunConfig) -> PolicyChoice:
     )
 
 
-def _needs(choice: PolicyChoice, config: RunConfig) -> list[str]:
+def _needs(choice: PolicyChoice, config: ComparedConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
+from eval.comparison.settings import ComparedConfig
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
 from semfov.agents.episode import EpisodeLimits
@@ -32,7 +33,7 @@ from semfov.gaze.acquisition.base import Task
 from semfov.gaze.policies import Policy
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
-from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import BoxKey, photograph_looks
 from semfov.runs.results import ResultRecord
@@ -64,7 +65,7 @@ GAZE_SCORE = 0.5
 
 
 @dataclass(frozen=True)
-class DecideConfig(RunConfig):
+class DecideConfig(ComparedConfig):
     """Search for present and for absent classes, each until a decision.
 
     Args:

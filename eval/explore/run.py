@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from eval.comparison.looking import ComparedLooking
+from eval.comparison.settings import ComparedConfig
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.exploration import answers_of
-from semfov.runs.config import PolicyConfig, ProtocolConfig, RunConfig
+from semfov.runs.config import PolicyConfig, ProtocolConfig
 from semfov.runs.exploration_protocol import (
     COUNTS,
     Exploration,
@@ -55,7 +56,7 @@ def _sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
 
 
 @dataclass(frozen=True)
-class ExploreConfig(RunConfig):
+class ExploreConfig(ComparedConfig):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.calibration.evaluation import CalibrationConfig
+from eval.comparison.settings import ComparedConfig
 from eval.comparison.thresholds import ThresholdLooksConfig
 from eval.decide.run import DecideConfig
 from eval.explore.run import ExploreConfig
@@ -17,7 +18,6 @@ from semfov.runs.config import (
     DetectorConfig,
     PolicyConfig,
     ProtocolConfig,
-    RunConfig,
     Scores,
     SensorConfig,
 )
@@ -110,7 +110,7 @@ _EXPECTED_EXPLORATION = tuple(
 )
 """The same two kinds of explorations."""
 
-Experiment = RunConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
+Experiment = ComparedConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
 
 _Changes = dict[str, dict[str, object]]
@@ -298,7 +298,7 @@ def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> 
         yield at_threshold("explore", threshold, name), tour
 
 
-def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+def _studies(config: ResultsConfig) -> Iterator[tuple[str, ComparedConfig]]:
     """Experiments on photographs of the fit set, on which settings are chosen."""
     data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
     nano = detector("nano", config)

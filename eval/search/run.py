@@ -8,16 +8,17 @@ from pathlib import Path
 import torch
 
 from eval.comparison.looking import ComparedLooking
+from eval.comparison.settings import ComparedConfig
 from semfov.episode import Stopwatch
 from semfov.gaze.acquisition.base import Task
-from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.config import PolicyConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
 
 @dataclass(frozen=True)
-class SearchConfig(RunConfig):
+class SearchConfig(ComparedConfig):
     """Visual search: find a target class by moving a fovea, and count the gaze shifts that this takes.
 
     Args:

@@ -1,9 +1,8 @@
 """Settings of the evaluation: dataclasses that are filled in from the command line and from YAML files."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
@@ -11,9 +10,7 @@ from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import lookup
 from semfov.gaze.acquisition.base import Task
-from semfov.gaze.saliency.cells import Reduction
-from semfov.model_folder import ModelFolder
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight, Whole, Workers
+from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Whole, Workers
 from semfov.runs.workers import Where
 from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
@@ -133,13 +130,6 @@ class SensorConfig(Settings):
         """List the name, all settings and the reference, as a model folder keeps them."""
         return {"name": self.name, **self.whole(), "reference": self.reference}
 
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> Self:
-        """Make the settings from what `record` lists."""
-        own = {each.name for each in fields(cls)} - {"settings"}
-        others = {name: value for name, value in record.items() if name not in own}
-        return cls(**{name: record[name] for name in own & record.keys()}, settings=others or None)
-
 
 @dataclass(frozen=True)
 class BeliefConfig(Settings):
@@ -172,22 +162,6 @@ class BeliefConfig(Settings):
     model: str | None = None
     target_model: str | None = None
     map_model: str | None = None
-
-
-@dataclass(frozen=True)
-class SaliencyConfig(Settings):
-    """The saliency baselines, `vocus2` and `itti-koch`.
-
-    Args:
-        view: `foveated` computes the saliency of the foveated view from each fixation (published); `picture` computes
-            the saliency of the whole sharp photograph, once. Neither depends on the detector.
-        reduction: the saliency of a cell is the `max` or the `mean` of that of its pixels.
-        weight: weight of the saliency map as a prior over the cells, for policies that have one.
-    """
-
-    view: Literal["foveated", "picture"] = "foveated"
-    reduction: Reduction = "max"
-    weight: Weight = 1.0
 
 
 @dataclass(frozen=True)
@@ -317,21 +291,13 @@ class RunConfig(LookingConfig):
     """Policies that choose among the cells of scenes, in the episodes of a protocol.
 
     Args:
-        saliency: the saliency baselines.
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
-        models: folder written by `semfov fit`, which defines detector, sensor, grid and fitted models.
 
     Attributes:
         task: the task of the policies.
     """
 
     task: ClassVar[Task] = "search"
-    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str | PolicyConfig, ...] = ("recommended",)
-    models: Path | None = None
-
-    def complete(self, folder: ModelFolder) -> Self:
-        """The settings, completed by the values that this kind of run takes from a folder of models."""
-        return self

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eval.comparison.settings import SaliencyConfig
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.runs.config import DataConfig, PolicyConfig, ProtocolConfig, SaliencyConfig
+from semfov.runs.config import DataConfig, PolicyConfig, ProtocolConfig
 from tests.small import run_settings
 
 pytestmark = pytest.mark.weights

@@ -7,6 +7,7 @@ from typing import get_args
 import pytest
 import torch
 
+from eval.comparison.settings import sensor_settings
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import main as search
 from semfov import ActivePerception, FovealObservationModel, InputError, Scanpath
@@ -46,7 +47,7 @@ def test_a_named_sensor_is_made_again_from_its_settings(name):
     config, sensor = SensorConfig(name), named_sensor(name)
     assert type(sensor) is config.kind is type(sensor_of(sensor.settings()))
     assert sensor_of(sensor.settings()).settings() == config.make().settings() == sensor.settings()
-    assert SensorConfig.of(json.loads(json.dumps(config.record()))).make().settings() == sensor.settings()
+    assert sensor_settings(json.loads(json.dumps(config.record()))).make().settings() == sensor.settings()
     assert config.fovea == config.kind.width(SENSORS[name].settings) / 640
     assert config.kind.describe(sensor.settings())
 
@@ -62,7 +63,7 @@ def test_settings_of_a_sensor_are_given_by_their_names(capsys):
     (config,) = made
     assert config.make().settings() == {"kind": "log-polar", "fovea": 40.0, "spacing": 1.0, "pooling": 2.0}
     assert config.fovea == 40 / 640
-    assert SensorConfig.of(config.record()) == SensorConfig("log-polar", settings=config.whole())
+    assert sensor_settings(config.record()) == SensorConfig("log-polar", settings=config.whole())
     for given, name in (({"sigma": 50.0}, "sigma"), ({"levels": 3}, "levels"), ({"settings": {"width": 1.0}}, "width")):
         with pytest.raises(InputError, match=rf"settings of a LogPolar \(fovea, spacing, pooling\), got {name}"):
             SensorConfig("log-polar", **given).make()

@@ -9,6 +9,7 @@ from typing import Annotated
 import torch
 
 from eval.comparison.looking import ComparedLooking
+from eval.comparison.settings import ComparedConfig
 from eval.human.search.screens import Screens
 from eval.human.search.trials import goal_rectangle, read_searches
 from semfov.belief.grid import Grid
@@ -17,7 +18,7 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.gaze.acquisition.base import Task
-from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig, RunConfig
+from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
@@ -41,7 +42,7 @@ class ScreenConfig(Settings):
 
 
 @dataclass(frozen=True)
-class PeopleSearchConfig(RunConfig):
+class PeopleSearchConfig(ComparedConfig):
     """Comparison of people, models and policies that search for the same targets in the same pictures.
 
     Args:
