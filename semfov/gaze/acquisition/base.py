@@ -33,15 +33,15 @@ class AcquisitionFunction(nn.Module, ABC):
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
     >>> import torch
-    >>> from semfov import DirichletBelief, Grid, policies
-    >>> class Background(AcquisitionFunction):
+    >>> from semfov import DirichletBelief, Grid, acquisition, policies
+    >>> class Background(acquisition.AcquisitionFunction):
     ...     name, tasks = "background", ("search", "exploration")
     ...     def forward(self, belief, visited):
     ...         return belief.class_probabilities()[..., 0]
     >>> look = policies.Policy("background")(None, Grid(2, 1, (20, 10)))
     >>> look(DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]])), torch.zeros(1, 2, dtype=torch.bool))
     tensor([[0.2500, 0.5000]])
-    >>> del FUNCTIONS["background"]
+    >>> del acquisition.FUNCTIONS["background"]
     """
 
     name: ClassVar[str] = ""
