@@ -101,7 +101,16 @@ class MapEvidence(Evidence):
         return self.evidence(class_features(detections, fixation, grid, targets))
 
     def log_odds(self, gathered: Gathered, columns: int, classes: int) -> Tensor:
-        """Log odds `(B, T, X·Y)` of T classes after several looks, gathered with a row for each episode and class."""
+        """Log odds of each class in each cell after several looks.
+
+        Args:
+            gathered: evidence of the looks, one row for each episode and class, `(B·T, ...)`.
+            columns: X, cells in a row.
+            classes: T, 2 or more.
+
+        Returns:
+            `(B, T, X·Y)`.
+        """
         nearest = gathered.nearest.unflatten(0, (-1, classes))
         greatest = nearest.topk(2, 1)
         leads = torch.arange(classes, device=nearest.device)[:, None] == greatest.indices[:, :1]
@@ -112,9 +121,17 @@ class MapEvidence(Evidence):
     def emptiness(
         self, log_odds: Tensor, distance: Tensor, looks: Tensor, columns: int, stands_for: Tensor | None = None
     ) -> Tensor:
-        """Log odds `(B, X·Y)` that a cell holds no object, from those of T classes `(B, T, X·Y)`.
+        """Log odds that a cell holds no object.
 
-        Where T < K, each class stands for several ones `(B, T)`. Distances are those of the closest fixations.
+        Args:
+            log_odds: `(B, T, X·Y)`, log odds of the classes (`log_odds`).
+            distance: `(B, X·Y)`, from each cell to its closest fixation, in longer sides of the image.
+            looks: `(B,)`, number of looks.
+            columns: X, cells in a row.
+            stands_for: `(B, T)`, number of classes that each given class represents, where T < K; None is 1 for each.
+
+        Returns:
+            `(B, X·Y)`.
         """
         each = torch.nn.functional.logsigmoid(-log_odds)
         none = (each if stands_for is None else each * stands_for[..., None]).sum(1)

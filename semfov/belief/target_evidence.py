@@ -113,17 +113,41 @@ class TargetEvidence(Evidence):
         return self.evidence(look_features(detections, fixation, grid, target))
 
     def log_odds(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell after several looks, `(B, X·Y)`."""
+        """Log odds of the target in each cell after several looks.
+
+        Args:
+            gathered: evidence of the looks.
+            columns: X, cells in a row.
+
+        Returns:
+            `(B, X·Y)`.
+        """
         return self.read_out(self.read, gathered.nearest, gathered, columns)
 
     def chance(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell, given that no fixated cell holds it, `(B, X·Y)`."""
+        """Log odds of the target in each cell, given that no fixated cell holds it.
+
+        Args:
+            gathered: evidence of the looks.
+            columns: X, cells in a row.
+
+        Returns:
+            `(B, X·Y)`; the values of fixated cells have no meaning.
+        """
         visited = gathered.visited
         beside = blur(visited.to(gathered.nearest), columns, 0.6)
         return self.read_out(self.guide, gathered.nearest.masked_fill(visited, _EMPTY), gathered, columns, beside)
 
     def presence(self, log_odds: Tensor, gathered: Gathered) -> Tensor:
-        """Log odds that the target is anywhere in the image `(B,)`, from those of the cells `(B, X·Y)`."""
+        """Log odds that the target is anywhere in the image.
+
+        Args:
+            log_odds: `(B, X·Y)`, log odds of the cells (`log_odds`).
+            gathered: evidence of the looks.
+
+        Returns:
+            `(B,)`.
+        """
         peak = log_odds.amax(-1)
         inputs = [
             peak / 3,
