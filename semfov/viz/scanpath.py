@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
@@ -80,12 +81,12 @@ def plot_scanpath(
         title = f"{len(scanpath)} fixations"
         if scanpath.target is not None:
             title = f"“{scanpath.target}”{ {None: '', True: ', found', False: ', not found'}[scanpath.found] }"
-        axes.set_title(f"{scanpath.picture}, {scanpath.subject}: {title}", parse_math=False)
+        axes.set_title(fill(f"{scanpath.picture}, {scanpath.subject}: {title}", 80), parse_math=False)
         lay_out(figure)
         GazePath(axes, scanpath.points, scanpath.size, found=bool(scanpath.found))
         return figure
     draw_place(axes, scanpath, image, boxes)
-    axes.set_title(scanpath.describe(), parse_math=False)
+    axes.set_title(fill(scanpath.describe(), 80), parse_math=False)
     outlined = any(scanpath.outline(look) is not None for look in scanpath)
     entries, sure = annotation_entries(scanpath, boxes), scanpath.confirmed
     name, count, others = scanpath.target_name or "objects", int(sure.sum()), int((~sure).sum())

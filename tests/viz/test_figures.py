@@ -257,3 +257,25 @@ def test_reliability_of_a_calibrated_model_lies_on_the_diagonal():
     axes = draw(plot_reliability({"perfect": (probabilities, labels)})).axes[0]
     x, y = axes.lines[1].get_data()
     np.testing.assert_allclose(x, y, atol=0.03)
+
+
+def test_titles_and_labels_are_inside_the_figure(scanpath, image):
+    """Also the label of a box at the border, and a title that is longer than the figure is wide."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    corner = Detections(
+        torch.tensor([[[70.0, 50, 80, 60]]]), torch.tensor([[[0.1, 0.2, 0.7]]]), torch.ones(1, 1).bool()
+    )
+    long = replace(
+        scanpath, detections=(corner, *scanpath.detections[1:]), classes=("background", "cup", "traffic " * 12)
+    )
+    figure = plot_scanpath(replace(long, target=2), image)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    (axes,), renderer = figure.axes, canvas.get_renderer()
+    for text in (axes.title, *axes.texts):
+        drawn = text if text.get_bbox_patch() is None else text.get_bbox_patch()
+        inside = figure.bbox if text is axes.title else axes.get_window_extent(renderer)
+        box = drawn.get_window_extent(renderer)
+        assert box.x0 >= inside.x0
+        assert box.x1 <= inside.x1
