@@ -244,12 +244,12 @@ class FixationDensity(Pretrained):
         Returns:
             `(B, rows, columns)`.
         """
-        return self.readouts(features, size).mean(1)
+        return self.blurred(self.readouts(features, size).mean(1))
 
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
     ) -> Tensor:
-        """The readouts, whose mean is the map.
+        """The readouts, whose mean is the map once it is blurred.
 
         Args:
             features: as for `forward`.
@@ -284,11 +284,21 @@ class FixationDensity(Pretrained):
                     value = value @ line.mT if axis else line @ value
             hidden = hidden + value
         units = self.mix.shape[-1]
-        hidden = F.relu(hidden).flatten(2).unflatten(1, (-1, units))
-        hidden = F.relu(self.mix @ hidden + self.mix_shift[..., None])
-        value = (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, (rows, columns))
+        hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, units))
+        hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
+        return (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, (rows, columns))
+
+    def blurred(self, maps: Tensor) -> Tensor:
+        """Maps over cells blurred by the Gaussian of the model.
+
+        Args:
+            maps: `(..., rows, columns)`.
+
+        Returns:
+            `(..., rows, columns)`.
+        """
         sigma = self.blur.exp()
-        return _gaussian(rows, sigma) @ value @ _gaussian(columns, sigma).mT
+        return _gaussian(maps.shape[-2], sigma) @ maps @ _gaussian(maps.shape[-1], sigma).mT
 
     def centre_bias(self, size: tuple[int, int]) -> Tensor:
         """The weighted log density of the centre bias.
