@@ -33,7 +33,7 @@ from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.fit.observation import FitObservationConfig
-from semfov.io.files import clean, write_text
+from semfov.io.files import plain_name, write_text
 from semfov.metrics.presence import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -109,7 +109,7 @@ class _SensorsConfig(LookingConfig):
 
     def folder(self, name: str) -> Path:
         """Folder of a candidate."""
-        return self.out / clean(name)
+        return self.out / plain_name(name)
 
 
 def _compare_sensors(config: _SensorsConfig) -> None:

@@ -24,7 +24,7 @@ from eval.comparison.summary import (
 )
 from eval.search.run import SearchRun
 from semfov.errors import DataError
-from semfov.io.files import clean, inside
+from semfov.io.files import inside, plain_name
 from semfov.metrics.averages import FloatArray
 from semfov.metrics.search import cumulative_performance
 from semfov.paths.stimulus import Stimulus
@@ -141,7 +141,7 @@ def _draw_searches(run: SearchRun, records: list[ResultRecord]) -> list[Path]:
         views = Stimulus.of(run.eye, scene.image).views(scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
         # An id may be any text. Cleaned ids may coincide, so the scene's number is put before them.
-        scene_name = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
-        path = inside(run.config.out, f"scanpath_{scene_name}_{clean(record['target_name'])}.png")
+        scene_name = record["scene"] if isinstance(record["scene"], int) else f"{index}-{plain_name(record['scene'])}"
+        path = inside(run.config.out, f"scanpath_{scene_name}_{plain_name(record['target_name'])}.png")
         paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), path))
     return paths

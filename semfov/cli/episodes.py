@@ -21,12 +21,11 @@ from semfov.cli.options import ALL_DRAWINGS, OF_ANY_LOOK, Drawing, PictureOption
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
-from semfov.cli.text import plain_name
 from semfov.cli.truth import read_truth
 from semfov.data.sources import embedded_picture
 from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.head.world import World
-from semfov.io.files import sha256, write_bytes
+from semfov.io.files import plain_name, sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.paths import GazeRecord

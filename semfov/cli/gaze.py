@@ -16,13 +16,12 @@ from semfov.cli.agent import check_device, class_names
 from semfov.cli.options import GazeOptions
 from semfov.cli.results import tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
-from semfov.cli.text import plain_name
 from semfov.data.fixations import Fixations, write_table
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import SemfovError, check
 from semfov.gaze.saliency.fixation_density import FixationDensity
-from semfov.io.files import check_writable
+from semfov.io.files import check_writable, plain_name
 from semfov.paths.gaze import GazePrediction
 from semfov.report.gaze import gaze_part, write_gaze_page
 from semfov.report.page import page_path

@@ -14,9 +14,10 @@ from semfov.agents.picture import PictureLike
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of
 from semfov.cli.sources import PictureSource
-from semfov.cli.text import looks_text, outcome_text, plain_name
+from semfov.cli.text import looks_text, outcome_text
 from semfov.cli.truth import Truth, read_truth
 from semfov.data.classes import canonical_name
+from semfov.io.files import plain_name
 from semfov.paths import GazeRecord, Scanpath
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief, plot_belief_bars

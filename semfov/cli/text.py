@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 from semfov.decision import Decision
@@ -99,12 +98,3 @@ def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def plain_name(name: str) -> str:
-    """Make a name valid on every file system.
-
-    >>> plain_name("my cup, frame 3")
-    'my-cup-frame-3'
-    """
-    return re.sub(r"[^\w.]+", "-", name).strip("-.") or "picture"

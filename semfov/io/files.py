@@ -82,9 +82,13 @@ def inside(folder: str | Path, name: str, *, links: bool = False) -> Path:
     return path
 
 
-def clean(text: str) -> str:
-    """Turn text into a part of a file name: at most 60 letters, digits, `_`, `.` and `-`, without a leading dot."""
-    return re.sub(r"[^A-Za-z0-9_.-]+|\.\.+", "-", text)[:200].strip("-.")[:60] or "none"
+def plain_name(text: str) -> str:
+    """Make a text a name that is valid on every file system.
+
+    >>> plain_name("my cup, frame 3"), plain_name("../..")
+    ('my-cup-frame-3', 'none')
+    """
+    return re.sub(r"[^\w.]+|\.\.+", "-", text)[:200].strip("-.")[:60] or "none"
 
 
 def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None:

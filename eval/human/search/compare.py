@@ -20,7 +20,7 @@ from eval.human.search.trials import drawn_searches, read_searches
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture, write_table
 from semfov.errors import DataError, check
-from semfov.io.files import clean, sha256
+from semfov.io.files import plain_name, sha256
 from semfov.io.tables import csv_text
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import table
@@ -123,7 +123,7 @@ def people_report(
     }
     written = write_texts(out, files)
     for name, searches in scanpaths.items():
-        path = out / "scanpaths" / f"{clean(name)}.csv"
+        path = out / "scanpaths" / f"{plain_name(name)}.csv"
         write_table(path, searches)
         written.append(path)
     for number, (title, rows) in enumerate(tables.items(), start=1):
