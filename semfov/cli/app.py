@@ -8,10 +8,9 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from html import escape
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from PIL import Image, ImageDraw
@@ -225,8 +224,7 @@ def _reduced(image: Tensor) -> Image.Image:
     return picture
 
 
-@dataclass(frozen=True)
-class _OwnLooks:
+class _OwnLooks(NamedTuple):
     """The looks of a person, the cell that the agent would look at next, and its own looks from the same start."""
 
     record: Scanpath

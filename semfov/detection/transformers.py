@@ -33,13 +33,11 @@ class _TransformersDetector(ModuleDetector):
     def __init__(
         self,
         model: nn.Module,
-        classes: Sequence[str] | None = None,
-        *,
-        name: str | None = None,
-        processor: Mapping[str, Any] | None = None,
-        background: BackgroundPolicy | None = None,
-        selection: Selection | None = None,
-        digest: str = "",
+        classes: Sequence[str] | None,
+        name: str | None,
+        processor: Mapping[str, Any] | None,
+        background: BackgroundPolicy | None,
+        **options: Any,
     ) -> None:
         config: Any = model.config
         detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
@@ -68,9 +66,8 @@ class _TransformersDetector(ModuleDetector):
             config.model_type if name is None else name,
             (sides[0] or longest, sides[1] or longest),
             background=("own" if self.softmax else "residual") if background is None else background,
-            selection=selection,
             stretch=self.limits is None,
-            digest=digest,
+            **options,
         )
         factor = (settings.get("rescale_factor") or 1 / 255) if settings.get("do_rescale", True) else 1.0
         self.preprocessing = Preprocessing(stretch=self.limits is None, scale=255 * factor)
@@ -144,17 +141,9 @@ def wrap_transformers(
     device: torch.device | str | None = None,
 ) -> _TransformersDetector:
     """Make a detector of an object detection model of transformers."""
-    selection = Selection(threshold, iou, limit, per_class)
-    detector = _TransformersDetector(
-        model if device is None else model.to(device),
-        classes,
-        name=name,
-        processor=processor,
-        background=background,
-        selection=selection,
-        digest=module_digest(model),
-    )
-    return detector.eval()
+    placed, selection = model if device is None else model.to(device), Selection(threshold, iou, limit, per_class)
+    options = {"selection": selection, "digest": module_digest(model)}
+    return _TransformersDetector(placed, classes, name, processor, background, **options).eval()
 
 
 def load_hub(name: str, *, revision: str | None = None, **options: Any) -> _TransformersDetector:

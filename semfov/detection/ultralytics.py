@@ -16,32 +16,11 @@ from semfov.errors import InputError
 class _UltralyticsDetector(ModuleDetector):
     """A detection model of Ultralytics as a `Detector`; it is differentiable; input_size `(width, height)`."""
 
-    def __init__(
-        self,
-        model: nn.Module,
-        classes: Sequence[str] | None = None,
-        *,
-        name: str = "ultralytics",
-        input_size: int | tuple[int, int] = 640,
-        background: BackgroundPolicy = "residual",
-        selection: Selection | None = None,
-        digest: str = "",
-    ) -> None:
-        network: Any = _network(model)
+    def __init__(self, network: Any, classes: Sequence[str] | None, **options: Any) -> None:
         if classes is None:
             labels = network.names
             classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
-        super().__init__(
-            network,
-            classes,
-            name,
-            (input_size, input_size) if isinstance(input_size, int) else input_size,
-            background=background,
-            selection=selection,
-            fill=114 / 255,
-            stride=32,
-            digest=digest,
-        )
+        super().__init__(network, classes, fill=114 / 255, stride=32, **options)
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """The layers that the head reads; a network without a list of layers has none."""
@@ -80,7 +59,7 @@ def wrap_ultralytics(
         network if device is None else network.to(device),
         classes,
         name=name,
-        input_size=input_size,
+        input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         background=background,
         selection=Selection(threshold, iou, limit, per_class),
         digest=module_digest(network),
