@@ -115,7 +115,7 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     # So many planes are filtered at a time that what is between the passes stays in the cache.
     sides = (down.length, across.count) if shrinks else (down.count, across.length)
     between = planes.new_empty(min(max(1, _CACHED // (sides[0] * sides[1])), number), *sides)
-    for first in range(0, number, len(between)):
+    for first in range(0, number, max(1, len(between))):
         passes = _passes(down, across, min(len(between), number - first), planes.stride())
         begin = planes.storage_offset() + first * planes.stride(0)
         for matrix, (size, strides, offset), into in passes[0]:

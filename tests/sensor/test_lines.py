@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semfov.sensor.lines import Taps, banded, separable
+from tests.small import rand
 
 
 @pytest.mark.slow
@@ -60,3 +61,16 @@ def test_only_long_lines_are_split_into_tiles():
     assert (
         banded(Taps(index[:100], taps.weight[:100]), 100, 8, 8, 1, torch.float32, torch.device("cpu")).dense is not None
     )
+
+
+def test_planes_that_are_filtered_together_do_not_mix():
+    """Tiles lie across planes, and a picture with NaN leaves its neighbours as they are."""
+    index = (torch.arange(200)[:, None] * 2 + torch.tensor([-2, -1, 0, 1, 2])).clamp(0, 399)
+    lines = banded(Taps(index, rand(200, 5).double()), 400, 8, 16, 2, torch.float64, torch.device("cpu"))
+    planes = rand(3, 400, 400).double()
+    planes[1] = torch.nan
+    together = separable(planes, lines, lines)
+    assert together[1].isnan().all()
+    for n in (0, 2):
+        assert torch.equal(together[n], separable(planes[n], lines, lines))
+    assert separable(planes[:0], lines, lines).shape == (0, 200, 200)
