@@ -18,8 +18,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score, look_features
 from semfov.belief.observers import Observer, Semantic
 from semfov.belief.observers.base import own
-from semfov.belief.observers.gathering import EvidenceLook
-from semfov.belief.observers.target import Target, TargetBelief
+from semfov.belief.observers.target import Target, TargetBelief, TargetLook
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms, decide, place_known
@@ -105,9 +104,9 @@ class _TargetExamples(Examples):
     goal: Tensor
     target: Tensor
 
-    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> EvidenceLook:
+    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> TargetLook:
         """Process stored looks with the model in training; see `Examples.look`."""
-        return EvidenceLook(
+        return TargetLook(
             own(observer, Target, "observer").model.evidence(self.features[episodes, cell].float()),
             self.distance[episodes, cell],
             self.score[episodes, cell],

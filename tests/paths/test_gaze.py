@@ -126,7 +126,7 @@ def test_the_fixations_of_one_viewer_are_taken_in_any_form(gaze):
             r"a list of 3; take one: scanpath=scanpaths\[0\]",
         ),
         ([5.0, 5.0], r"a list \(points: expected \(n, 2\)"),
-        (np.array(["a", "b"]), r"a ndarray \(points: expected numbers"),
+        (np.array(["a", "b"]), r"a ndarray \(points: expected real numbers"),
         (None, "NoneType"),
         ("paths.csv", "str"),
         (Fixations("other.png", "1", [[5.0, 5.0]], (104, 78)), "in 'other.png'"),

@@ -17,6 +17,11 @@ from semfov.errors import InputError
 
 
 @dataclass(frozen=True)
+class TargetLook(EvidenceLook):
+    """Evidence of looks about one class, which is not that of a learned map about one."""
+
+
+@dataclass(frozen=True)
 class TargetBelief(GatheredBelief):
     """Belief about a single target: in each cell, there if no fixated cell holds it `(B, X·Y)`, and anywhere `(B,)`."""
 
@@ -68,18 +73,18 @@ class Target(Gatherer):
         even, anywhere = like.new_full((batch, len(grid)), 0.5), like.new_full((batch,), 0.5)
         return TargetBelief(**self.nothing(batch, grid, like), present=even, following=even, anywhere=anywhere)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> EvidenceLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
         """Evidence for the target, which must be given."""
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
         score = highest_score(detections, target)
         targets = torch.full((len(fixation),), target, device=fixation.device)
-        return EvidenceLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), targets, grid.columns)
+        return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), targets, grid.columns)
 
     def update(self, belief: Belief, look: Look) -> TargetBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        belief, look = own(belief, TargetBelief, "belief"), own(look, EvidenceLook, "look")
+        belief, look = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
         columns = look.columns
         all_looks = self.gather(belief, look)
 

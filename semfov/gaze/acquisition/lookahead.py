@@ -220,7 +220,7 @@ class Lookahead(AcquisitionFunction):
 
 def _fitting(limit: int, maps: Tensor, elements: int) -> int:
     """How many things of so many elements are worked on at once: up to the limit on a CPU, else all."""
-    return max(1, limit // elements) if values_known(maps) and maps.device.type == "cpu" else 1 << 40
+    return max(1, limit // max(1, elements)) if values_known(maps) and maps.device.type == "cpu" else 1 << 40
 
 
 def at_levels(values: Tensor, levels: Tensor) -> Tensor:
