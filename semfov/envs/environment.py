@@ -275,11 +275,12 @@ class ZoomEnv(EpisodeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
+        usual = PRICES[lookup(task, PRICES, "task")]
         self.scenery = scenery_or_open(scenery, open_zoom_scenery, options)
         gazes = WindowGaze(
             self.scenery,
             task,
-            price=PRICES[lookup(task, PRICES, "task")] if price is None else price,
+            price=usual if price is None else price,
             find=find,
             belief=belief,
             grid=grid,

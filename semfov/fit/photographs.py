@@ -142,12 +142,13 @@ def fit_photographs(
 
 def _explored(looks: Sequence[Glance], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
     """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
-    for target in (None, *annotation.labels.mode().values[None].tolist()[: len(annotation.labels)]):
+    labels = annotation.labels
+    for target in (None, *([int(labels.mode().values)] if len(labels) else [])):
         objects = {}
         for number in (1, len(looks)):
             found, facts = merge_with_facts(looks[:number], lattice, target)
             objects[number] = facts, right_boxes(found, annotation)
-        held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
+        held = int(((labels == (target or 0)) & ~annotation.crowd).sum())
         yield Exploration(target, held, objects, [(0.0, 0.0)] * len(looks), [0.0] * len(looks))
 
 

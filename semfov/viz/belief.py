@@ -63,7 +63,7 @@ def plot_belief(
 
     Example::
 
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         save_figure(plot_belief(scanpath), "belief.pdf")
         save_figure(plot_belief(scanpath, None, most=4, columns=2), "beliefs.pdf")
     """
@@ -108,7 +108,7 @@ def plot_belief_bars(
 
     Example::
 
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         save_figure(plot_belief_bars(scanpath), "bars.pdf")
     """
     from matplotlib import colormaps

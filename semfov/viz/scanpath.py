@@ -68,7 +68,7 @@ def plot_scanpath(
 
     Example::
 
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         save_figure(plot_scanpath(scanpath), "scanpath.pdf")
     """
     image, (width, height) = photograph_of(scanpath, image), scanpath.size
@@ -131,7 +131,7 @@ def plot_foveated_strip(
 
     Example::
 
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         save_figure(plot_foveated_strip(scanpath, most=4), "views.png")
     """
     views = _views(scanpath, views)
@@ -180,7 +180,7 @@ def plot_episode(
 
     Example::
 
-        scanpath = agent.explore(read_image("kitchen.jpg"))
+        scanpath = agent.explore(read_image("kitchen.jpg"), how="fovea")
         save_figure(plot_episode(scanpath, most=3), "episode.pdf")
     """
     from matplotlib.figure import Figure

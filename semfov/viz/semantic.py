@@ -64,7 +64,7 @@ def plot_semantic_map(
 
     Example::
 
-        scanpath = agent.explore(read_image("kitchen.jpg"))
+        scanpath = agent.explore(read_image("kitchen.jpg"), how="fovea")
         save_figure(plot_semantic_map(scanpath), "map.pdf")
     """
     fixation, grid = check_fixation(scanpath, fixation), scanpath.grid

@@ -86,6 +86,8 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
 @pytest.mark.weights
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
+    with pytest.raises(InputError, match="unknown task 'explore'"):
+        ZoomEnv("explore", zoom_scenery, price=0.5)
     env = ZoomEnv("exploration", zoom_scenery, price=0.5, find=10.0)
     agent = WindowAgent(env)
     _, info = env.reset(seed=0)

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from torch import nn
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition
-from semfov.gaze.acquisition import FUNCTIONS
+from semfov.gaze.acquisition import FUNCTIONS, AcquisitionFunction
 from semfov.gaze.policies import Policy, policy_names
 
 GRID = Grid(4, 3, (80, 60))
@@ -119,6 +120,23 @@ def test_a_missing_model_is_an_error_when_the_policy_is_made():
 def test_the_error_for_a_missing_target_names_the_policy(name, model):
     with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
         Policy(name, model)(None, GRID)
+
+
+@pytest.mark.parametrize(("name", "tasks"), [("kl", ("search",)), ("own", "search"), ("own", ("searching",))])
+def test_a_name_that_is_taken_and_other_tasks_are_refused(name, tasks):
+    with pytest.raises(InputError, match=r"^name: expected one not taken|^tasks: expected a tuple"):
+        type("Own", (AcquisitionFunction,), {"name": name, "tasks": tasks})
+    assert "own" not in FUNCTIONS
+    assert FUNCTIONS["kl"] is acquisition.KLDivergence
+
+
+@pytest.mark.parametrize(
+    ("function", "options", "argument"),
+    [(nn.Linear, {}, "function"), (3, {}, "unknown policy"), ("kl", {"samples": True}, "samples")],
+)
+def test_what_is_no_function_and_other_numbers_of_samples_are_refused(function, options, argument, model):
+    with pytest.raises(InputError, match=f"^{argument}"):
+        Policy(function, model, **options)
 
 
 def test_other_names_are_refused_with_a_suggestion():

@@ -80,7 +80,7 @@ def test_a_replayed_semantic_search_has_the_original_beliefs_and_values(run, sea
             assert len(recorded) == len(path) - (record["found_at"] >= 0 or len(path) == 6)
             for shift, (belief, values) in enumerate(recorded):
                 torch.testing.assert_close(path.values[shift], values)
-                if not run.strategies[name].policy.by_belief:  # such a search keeps no belief
+                if not run.strategies[name].policy.function.by_belief:  # such a search keeps no belief
                     continue
                 torch.testing.assert_close(path.probabilities[shift], belief.probabilities[0])
                 torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])

@@ -124,6 +124,14 @@ def _pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]
             f"{count} of {number} pictures have other proportions than their frames, such as {name}, {across} × {down} "
             f"in {width} × {height}: was it letterboxed on a screen? (Fixations.in_picture)"
         )
+    larger = [each for each in records if each.size > sizes.get(each.picture, each.size)]
+    beyond = any((each.points > sizes[each.picture]).any() for each in larger)
+    if not beyond and sum(map(len, larger)) >= _MANY:
+        (name, size), (across, down) = (larger[0].picture, larger[0].size), sizes[larger[0].picture]
+        found.append(
+            f"no fixation lies beyond the pixels of its picture, although frames are larger, such as {size[0]} × "
+            f"{size[1]} of {name}: give its size, {across} × {down}, if that is what was looked at"
+        )
     return found
 
 

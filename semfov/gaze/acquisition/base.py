@@ -3,11 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from inspect import Parameter, signature
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 from torch import Tensor, nn
 
 from semfov.belief.belief import Belief
+from semfov.errors import check
 
 Task = Literal["search", "exploration"]
 FUNCTIONS: dict[str, type["AcquisitionFunction"]] = {}
@@ -31,6 +32,9 @@ class AcquisitionFunction(nn.Module, ABC):
         needs_map: whether its `model` is a learned map, whose belief alone it works on.
         by_belief: whether its values depend on the belief.
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
+
+    Raises:
+        InputError: a subclass takes the name of another one, or is for other tasks.
 
     >>> import torch
     >>> from semfov import DirichletBelief, Grid, acquisition, policies
@@ -58,6 +62,10 @@ class AcquisitionFunction(nn.Module, ABC):
         cls.takes = {n: each for n, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
         cls.needs_model = "model" in cls.takes and not cls.needs_map
         if "name" in cls.__dict__:
+            own = FUNCTIONS.get(cls.name, cls).__qualname__ == cls.__qualname__
+            check(own, "name", f"one not taken by {FUNCTIONS.get(cls.name)}", repr(cls.name))
+            known = isinstance(cls.tasks, tuple) and set(cls.tasks) <= set(get_args(Task))
+            check(known, "tasks", f"a tuple of {' and '.join(get_args(Task))}", repr(cls.tasks))
             FUNCTIONS[cls.name] = cls
 
     @abstractmethod

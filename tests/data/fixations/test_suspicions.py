@@ -128,6 +128,14 @@ def test_pictures_of_a_folder_are_compared_with_the_frames_by_their_names(tmp_pa
     assert "frames of 400 × 600, 640 × 480" in capsys.readouterr().out
 
 
+def test_fixations_in_the_pixels_of_smaller_pictures_are_told():
+    smaller = {f"{number}.jpg": (640, 480) for number in range(40)}
+    within = [replace(each, size=SIZE) for each in people(size=(640, 480))]
+    assert any("0.jpg: give its size, 640 × 480" in each for each in suspicions(within, smaller))
+    assert suspicions(people(), smaller) == []
+    assert suspicions(people(), dict.fromkeys(smaller, (1600, 1200))) == []
+
+
 def test_one_picture_is_compared_with_its_frame_and_one_that_is_not_there_is_refused(tmp_path, capsys):
     (tmp_path / "none").mkdir()
     for name, size in (("0.jpg", SIZE), ("1.jpg", (400, 600))):
