@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
-from semfov.errors import InputError, check, check_whole, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction, Task
 from semfov.gaze.acquisition.lookahead import sampled_likelihoods
 from semfov.observation.foveal import FovealObservationModel
@@ -69,7 +69,6 @@ class Policy(nn.Module):
         own = [name for name in takes if name not in ("target", "model", "grid")]
         self._given = [lookup(name, own, f"setting of policy {self.name!r}") for name in settings]
         if samples is not None:
-            check_whole(samples, "samples", 1, 1 << 16)
             check("likelihoods" in takes, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
             assert isinstance(model, FovealObservationModel)
             settings["likelihoods"] = sampled_likelihoods(model, samples, calibrated=calibrated)

@@ -152,7 +152,7 @@ def test_looks_are_drawn_from_the_dirichlets_by_a_seed():
 def test_models_of_the_posterior_and_no_samples_are_refused():
     with pytest.raises(InputError, match="model: expected an observation model whose Dirichlets are densities"):
         sampled_likelihoods(two_classes(expected=torch.full((2, 2, 2), 0.5, dtype=torch.float64)), 4)
-    with pytest.raises(InputError, match="samples: expected 1 or more, got 0"):
+    with pytest.raises(InputError, match="samples: expected a whole number from 1 to 65,536, got 0"):
         policies.Policy("kl", two_classes(), samples=0)
     with pytest.raises(InputError, match="likelihoods"):
         look_ahead_by_samples(torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
-from semfov.errors import InputError, check, check_shape, values_known
+from semfov.errors import InputError, check, check_shape, check_whole, values_known
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.foveal import FovealObservationModel
 from semfov.threads import one_thread_if_small
@@ -124,7 +124,7 @@ def sampled_likelihoods(
     The model's Dirichlets must be densities of the scores, as after a fit by maximum likelihood. Likelihoods that are
     not calibrated are the scores S themselves.
     """
-    check(samples >= 1, "samples", "1 or more", samples)
+    check_whole(samples, "samples", 1, 1 << 16)
     if model.expected is not None:
         raise InputError(
             "model: expected an observation model whose Dirichlets are densities of the scores, such as "
