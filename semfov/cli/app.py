@@ -49,7 +49,7 @@ def serve(options: AppOptions) -> int:
     """Serve the page until Ctrl-C."""
     os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # nothing is sent elsewhere
     try:
-        import gradio
+        import gradio  # noqa: F401
     except ImportError:
         raise DataError('app: expected Gradio for the page; pip install "semfov[app]"') from None
     try:
@@ -61,18 +61,27 @@ def serve(options: AppOptions) -> int:
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
-        page = _make_page(agent, options.seed).queue(default_concurrency_limit=1)  # one look at a time
-        look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
-        _, address, _ = page.launch(
-            server_name=options.host, server_port=options.port, prevent_thread_lock=True, share=False, quiet=True,
-            show_error=True, css=_STYLE, theme=look,
-        )  # fmt: skip
+        page = _make_page(agent, options.seed)
+        address = _launched(page, options.host, options.port)
         print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
         try:
             threading.Event().wait()
         finally:
             page.close()
     return 0
+
+
+def _launched(page: Any, host: str, port: int | None) -> str:
+    """Serve a page, with one look at a time; returns its address."""
+    import gradio
+
+    look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
+    page.queue(default_concurrency_limit=1)
+    _, address, _ = page.launch(
+        server_name=host, server_port=port, prevent_thread_lock=True, share=False, quiet=True,
+        show_error=True, css=_STYLE, theme=look,
+    )  # fmt: skip
+    return str(address)
 
 
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
