@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from semfov.fit.gaze import GazeFit, fit_oculomotor
 from semfov.fit.gaze_folds import Fold, Groups, flat_maps
-from semfov.fit.viewing import Viewed, blurred, counted, log_centre
-from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.fit.viewing import Viewed, counted, log_centre
+from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
@@ -81,7 +81,7 @@ def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3,
     cells = cells_of(group.size)
     bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
     counts = counted(group.paths[picture], group.size, cells)
-    smooth = torch.stack([blurred(each, blur) for each in counts.sum(0) - counts]).flatten(1)
+    smooth = blurred(counts.sum(0) - counts, torch.tensor(blur)).flatten(1)
     total = smooth.sum(1, keepdim=True)
     density = (1 - share) * torch.where(total > 0, smooth / total, bias) + share * bias
     return density.log().unflatten(1, cells)

@@ -315,7 +315,7 @@ class WindowEpisode(Episode[ZoomPath]):
                 order,
                 None,
                 forgetting=self.forgetting,
-                guess=lambda looks, done, _: (*order(looks, done), None)[0],
+                guess=lambda looks, done, _: next(iter(order(looks, done)), None),
             )
         elif self.searches and self.target is not None:
             self._turns = look_for(glances, self.evidence, self.target, forgetting=self.forgetting)

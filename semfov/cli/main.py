@@ -51,9 +51,8 @@ def _run(name: str, options: Any) -> int | None:
         nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
         quiet = getattr(options, "quiet", False)
         stack.enter_context(redirect_stdout(nowhere if quiet else sys.stderr if beside else stream))
-        run: Callable[..., int | None] = resolve_name(
-            f"semfov.{_SUBCOMMANDS[name][2]}"
-        )  # what it needs is imported now
+        # What it needs is imported now.
+        run: Callable[..., int | None] = resolve_name(f"semfov.{_SUBCOMMANDS[name][2]}")
         return run(options, stream) if name in ("search", "find", "explore") else run(options)
 
 

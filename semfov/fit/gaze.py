@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from semfov.fit.viewing import Events, Viewed, events_of, log_centre
 from semfov.gaze.saliency.cells import cell_saliency
-from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Whole
 
@@ -80,7 +80,7 @@ def _fit_map(
     def loss_of(group: Viewed, number: int, some: Sequence[int]) -> Tensor:
         kept = torch.rand(parts, 1, model.read.shape[1], generator=generator) >= fit.dropout
         mask = (kept / (1 - fit.dropout)).expand(-1, model.out.shape[1], -1).flatten(0, 1) / scale
-        values = model.blurred(model.readouts(group.some(some), group.size, model.read * mask))
+        values = blurred(model.readouts(group.some(some), group.size, model.read * mask), model.blur.exp())
         values = values + model.centre_bias(group.size)
         log = values - values.flatten(2).logsumexp(2)[..., None, None]
         seen = group.counts[torch.as_tensor(some)]

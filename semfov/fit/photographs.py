@@ -26,7 +26,6 @@ from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread,
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
-from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely
@@ -34,7 +33,6 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, overview
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import merge_with_facts
 from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import usual_slices
 
@@ -144,12 +142,8 @@ def _explored(looks: Sequence[Glance], lattice: Lattice, annotation: Annotation)
     """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
     labels = annotation.labels
     for target in (None, *([int(labels.mode().values)] if len(labels) else [])):
-        objects = {}
-        for number in (1, len(looks)):
-            found, facts = merge_with_facts(looks[:number], lattice, target)
-            objects[number] = facts, right_boxes(found, annotation)
-        held = int(((labels == (target or 0)) & ~annotation.crowd).sum())
-        yield Exploration(target, held, objects, [(0.0, 0.0)] * len(looks), [0.0] * len(looks))
+        nothing, none = [(0.0, 0.0)] * len(looks), [0.0] * len(looks)
+        yield Exploration.of(target, looks, {1, len(looks)}, lattice, annotation, nothing, none)
 
 
 def _fit_objects(explored: Sequence[Exploration]) -> Certainty:

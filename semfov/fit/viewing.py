@@ -22,7 +22,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.placement import Placement
 from semfov.errors import check
-from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema
 from semfov.runs.scene_run import digest_of, store_folder
@@ -238,21 +238,12 @@ def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, 
     return Events(torch.cat(before), cell, person)
 
 
-def blurred(counts: Tensor, sigma: float) -> Tensor:
-    """Counts `(rows, columns)` blurred by a Gaussian whose weights sum to 1 at the border too."""
-    for axis in (0, 1):
-        place = torch.arange(counts.shape[axis], dtype=counts.dtype)
-        weights = (-(place[:, None] - place).square() / (2 * sigma**2)).softmax(-1)
-        counts = weights @ counts if axis == 0 else counts @ weights.mT
-    return counts
-
-
 def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, blur: float = 2.5) -> Tensor:
     """Log density of all fixations of data sets, all alike, blurred and mixed with 2 % uniform, on 39 × 52 cells."""
     total, floor = torch.zeros(39, 52), 0.02
     for group, some in zip(groups, pictures, strict=True):
         if len(some):
             seen = group.counts[torch.as_tensor(some)].sum(0)
-            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], blur)
+            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], torch.tensor(blur))
             total += smooth / smooth.sum()
     return ((1 - floor) * total / total.sum() + floor / total.numel()).log()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice, product
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.progress import track
 from semfov.runs.tables import table
@@ -21,6 +21,7 @@ from semfov.zoom.certainty import FACTS, SPREAD, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge_with_facts
 
 _AFTER = (3, 6, 12, 24)
@@ -56,6 +57,25 @@ class Exploration(NamedTuple):
     objects: dict[int, tuple[Tensor, Tensor]]
     remaining: list[tuple[float, float]]
     promised: list[float]
+
+    @classmethod
+    def of(
+        cls,
+        target: int | None,
+        looks: Sequence[Glance],
+        numbers: Collection[int],
+        lattice: Lattice,
+        annotation: Annotation,
+        remaining: list[tuple[float, float]],
+        promised: list[float],
+    ) -> Self:
+        """The exploration with some looks, judged after the given numbers of them."""
+        objects = {}
+        for number in sorted(numbers):
+            found, facts = merge_with_facts(looks[:number], lattice, target)
+            objects[number] = facts, right_boxes(found, annotation)
+        held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
+        return cls(target, held, objects, remaining, promised)
 
     @property
     def looks(self) -> int:
@@ -100,12 +120,7 @@ def _explorations(
                 remaining.append(turn.belief.remaining())
                 promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
             counts = {min(n, len(glances)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
-            objects = {}
-            for number in sorted(counts):
-                found, facts = merge_with_facts(glances[:number], looks.lattice, target)
-                objects[number] = facts, right_boxes(found, annotation)
-            held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
-            yield Exploration(target, held, objects, remaining, promised[1:])
+            yield Exploration.of(target, glances, counts, looks.lattice, annotation, remaining, promised[1:])
         looks.save()
 
 

@@ -22,7 +22,7 @@ _FAR = 0.5
 _MANY = 20  # fixations from which on shares tell something
 _BAR, _LEVEL = 0.06, 0.03  # shares of a side that is empty where a picture was letterboxed, and where it was not
 _MOST_OUTSIDE, _MOST_REPEATED, _MOST_ALIKE, _MOST_SHORT = 0.1, 0.02, 0.02, 0.1  # shares of the fixations
-STRETCH = 0.02  # what rounding to whole pixels may do to proportions
+_STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 _SHORT, _LONG = 50.0, 5000.0  # milliseconds
 
 
@@ -30,7 +30,8 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     """What is suspicious in fixations, in plain lines; none where nothing is.
 
     - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
-      or many outside it; with `sizes`, frames of other proportions than those of their pictures.
+      or many outside it; with `sizes`, frames of other proportions than those of their pictures, and points within the
+      pixels of pictures that are smaller than their frames.
     - A letterbox: bars at two opposite sides without fixations, while the others reach the border.
     - Points that repeat the one before, records that occur twice, and many fixations at one same point, such as what
       a tracker writes during a blink.
@@ -117,22 +118,26 @@ def _pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]
     number = len({each.picture for each in records})
     found = [f"{len(unknown)} of {number} pictures are not there, such as {unknown[0]}"] if unknown else []
     known = sorted((picture, size, sizes[picture]) for picture, size in frames if picture in sizes)
-    other = [each for each in known if abs(each[1][0] * each[2][1] / (each[1][1] * each[2][0]) - 1) > STRETCH]
+    other = [each for each in known if not _alike(*each[1:])]
     if other:
         (name, (width, height), (across, down)), count = other[0], len({each[0] for each in other})
         found.append(
             f"{count} of {number} pictures have other proportions than their frames, such as {name}, {across} × {down} "
             f"in {width} × {height}: was it letterboxed on a screen? (Fixations.in_picture)"
         )
-    larger = [each for each in records if each.size > sizes.get(each.picture, each.size)]
-    beyond = any((each.points > sizes[each.picture]).any() for each in larger)
-    if not beyond and sum(map(len, larger)) >= _MANY:
-        (name, size), (across, down) = (larger[0].picture, larger[0].size), sizes[larger[0].picture]
+    larger = [(each, sizes[each.picture]) for each in records if each.size > sizes.get(each.picture, each.size)]
+    if sum(len(each) for each, _ in larger) >= _MANY and not any((each.points > size).any() for each, size in larger):
+        each, (across, down) = larger[0]
         found.append(
-            f"no fixation lies beyond the pixels of its picture, although frames are larger, such as {size[0]} × "
-            f"{size[1]} of {name}: give its size, {across} × {down}, if that is what was looked at"
+            f"no fixation lies beyond the pixels of its picture, although frames are larger, such as {each.size[0]} × "
+            f"{each.size[1]} of {each.picture}: give its size, {across} × {down}, if that is what was looked at"
         )
     return found
+
+
+def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two `(width, height)` have the same proportions, but for rounding to whole pixels."""
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= _STRETCH
 
 
 def _repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
@@ -180,10 +185,9 @@ def _durations(records: Sequence[Fixations]) -> list[str]:
 
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
     """Refuse fixations in a frame of other proportions than `(width, height)`, or in another picture than the file."""
-    stretch = (fixations.size[0] * size[1]) / (fixations.size[1] * size[0])
     got = f"{fixations.size[0]} × {fixations.size[1]} of {fixations.subject!r}"
     expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
-    check(abs(stretch - 1) <= STRETCH, argument, expected, got)
+    check(_alike(fixations.size, size), argument, expected, got)
     name = Path(picture or fixations.picture).stem
     same = Path(fixations.picture).stem == name
     check(same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}")

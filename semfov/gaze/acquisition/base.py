@@ -62,8 +62,10 @@ class AcquisitionFunction(nn.Module, ABC):
         cls.takes = {n: each for n, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
         cls.needs_model = "model" in cls.takes and not cls.needs_map
         if "name" in cls.__dict__:
-            own = FUNCTIONS.get(cls.name, cls).__qualname__ == cls.__qualname__
-            check(own, "name", f"one not taken by {FUNCTIONS.get(cls.name)}", repr(cls.name))
+            taken = FUNCTIONS.get(cls.name, cls)
+            # A cell of a notebook that is run again defines its class again.
+            again = taken.__qualname__ == cls.__qualname__
+            check(again, "name", f"one not taken by {taken.__qualname__}", repr(cls.name))
             known = isinstance(cls.tasks, tuple) and set(cls.tasks) <= set(get_args(Task))
             check(known, "tasks", f"a tuple of {' and '.join(get_args(Task))}", repr(cls.tasks))
             FUNCTIONS[cls.name] = cls

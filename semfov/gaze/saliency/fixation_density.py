@@ -244,7 +244,7 @@ class FixationDensity(Pretrained):
         Returns:
             `(B, rows, columns)`.
         """
-        return self.blurred(self.readouts(features, size).mean(1))
+        return blurred(self.readouts(features, size).mean(1), self.blur.exp())
 
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
@@ -287,18 +287,6 @@ class FixationDensity(Pretrained):
         hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, units))
         hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
         return (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, (rows, columns))
-
-    def blurred(self, maps: Tensor) -> Tensor:
-        """Maps over cells blurred by the Gaussian of the model.
-
-        Args:
-            maps: `(..., rows, columns)`.
-
-        Returns:
-            `(..., rows, columns)`.
-        """
-        sigma = self.blur.exp()
-        return _gaussian(maps.shape[-2], sigma) @ maps @ _gaussian(maps.shape[-1], sigma).mT
 
     def centre_bias(self, size: tuple[int, int]) -> Tensor:
         """The weighted log density of the centre bias.
@@ -456,6 +444,11 @@ def _interpolation(
     place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
     pixels = torch.arange(length, device=device, dtype=dtype)
     return (1 - (place[:, None] - pixels).abs()).clamp(min=0)
+
+
+def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
+    """Maps `(..., rows, columns)` blurred by a Gaussian of σ cells, whose weights sum to 1 at the border, too."""
+    return _gaussian(maps.shape[-2], sigma) @ maps @ _gaussian(maps.shape[-1], sigma).mT
 
 
 def _gaussian(cells: int, sigma: Tensor) -> Tensor:
