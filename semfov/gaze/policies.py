@@ -1,6 +1,6 @@
 """Policies: where to look, by an acquisition function, for any target on any grid."""
 
-from typing import Any
+from typing import Any, get_args
 
 from torch import Tensor, nn
 
@@ -28,10 +28,12 @@ class Policy(nn.Module):
             takes the expectation; the model's Dirichlets must be densities of the scores. None takes the look with the
             expected scores, as published.
         calibrated: whether the scores of a drawn look are calibrated before they update the belief.
-        settings: further arguments of the acquisition function.
+        settings: further arguments of the acquisition function, None included; parameters and modules among them are
+            those of the policy. Their names are others than those of arguments and attributes of `Policy`.
 
     Raises:
-        InputError: there is no such function or setting, the model is missing, or `samples` does not suit it.
+        InputError: there is no such function or setting, or one of a name that is not free, the model is missing, or
+            `samples` does not suit it.
 
     >>> import torch
     >>> from semfov import FovealObservationModel
@@ -67,6 +69,8 @@ class Policy(nn.Module):
             raise InputError(f"policy {self.name!r}: expected {words}, got {got}")
         self.model = model if "model" in takes else None
         own = [name for name in takes if name not in ("target", "model", "grid")]
+        taken = [name for name in own if name in ("samples", "calibrated") or hasattr(self, name)]
+        check(not taken, "function", "one whose settings have other names than what a policy has", ", ".join(taken))
         self._given = [lookup(name, own, f"setting of policy {self.name!r}") for name in settings]
         if samples is not None:
             check("likelihoods" in takes, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
@@ -74,15 +78,19 @@ class Policy(nn.Module):
             settings["likelihoods"] = sampled_likelihoods(model, samples, calibrated=calibrated)
             self._given.append("likelihoods")
         for name, value in settings.items():
-            if isinstance(value, Tensor):
+            if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
                 self.register_buffer(name, value, persistent=False)
             else:
                 setattr(self, name, value)
 
     @property
     def name(self) -> str:
-        """Name of the acquisition function."""
-        return self.function.name
+        """Name of the acquisition function, or of its class where it has none."""
+        return self.function.name or self.function.__name__
+
+    def extra_repr(self) -> str:
+        """The name."""
+        return repr(self.name)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """Make the acquisition function for a target on a grid.
@@ -97,20 +105,14 @@ class Policy(nn.Module):
         Raises:
             InputError: the function needs a target or a setting, and has none.
         """
-        given = {
-            "target": target,
-            "model": self.model,
-            "grid": grid,
-            **{name: getattr(self, name) for name in self._given},
-        }
-        arguments = {}
+        given = {"target": target, "model": self.model, "grid": grid}
+        given = {name: value for name, value in given.items() if value is not None and name in self.function.takes}
+        given |= {name: getattr(self, name) for name in self._given}
         for name, parameter in self.function.takes.items():
-            if given.get(name) is not None:
-                arguments[name] = given[name]
-            elif parameter.default is parameter.empty:
+            if given.get(name) is None and parameter.default is parameter.empty:
                 needed = {"target": "a target to search for"}.get(name, f"{name} of a scene")
                 raise InputError(f"policy {self.name!r}: expected {needed}, got none")
-        return self.function(**arguments)
+        return self.function(**given)
 
 
 def policy_names(task: Task) -> list[str]:
@@ -122,7 +124,11 @@ def policy_names(task: Task) -> list[str]:
     Returns:
         The names.
 
+    Raises:
+        InputError: there is no such task.
+
     >>> "predictive" in policy_names("search"), "kl" in policy_names("search")
     (True, False)
     """
+    lookup(task, get_args(Task), "task")
     return [name for name, function in FUNCTIONS.items() if task in function.tasks]

@@ -1,5 +1,7 @@
 """Policies by name: errors, state as modules, copies and pickling."""
 
+from inspect import Parameter, Signature
+
 import pytest
 import torch
 from torch import nn
@@ -60,8 +62,9 @@ def test_settings_reach_the_function(model, mapping):
     assert policy(None, GRID).model is mapping
     with pytest.raises(InputError, match="unknown setting of policy 'kl' 'prio'; did you mean 'prior'"):
         Policy("kl", model, prio=1.0)
-    with pytest.raises(InputError, match="policy 'saliency': expected values of a scene, got none"):
-        Policy("saliency")(None, GRID)
+    for values in ({}, {"values": None}):
+        with pytest.raises(InputError, match="policy 'saliency': expected values of a scene, got none"):
+            Policy("saliency", **values)(None, GRID)
 
 
 @pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "expected-accuracy"])
@@ -122,6 +125,40 @@ def test_the_error_for_a_missing_target_names_the_policy(name, model):
         Policy(name, model)(None, GRID)
 
 
+def test_settings_of_ones_own(model):
+    """None is a value, what a subclass passes on is given to its base, and a parameter is trained and saved."""
+
+    class Passing(acquisition.KLDivergence):
+        def __init__(self, *args, width: float | None = 0.1, **options):
+            super().__init__(*args, **options)
+            self.width = width
+
+    class Weighted(acquisition.Static):
+        name = ""
+
+    made = Policy(Passing, model, prior=2.0, width=None)(None, GRID)
+    assert (made.prior, made.width) == (2.0, None)
+    policy = Policy(Weighted, values=nn.Parameter(torch.rand(12)))
+    values_of(policy(None, GRID), torch.ones(1, 12, 3)).sum().backward()
+    assert torch.equal(policy.values.grad, torch.ones(12))
+    assert list(policy.state_dict()) == ["values"]
+    assert repr(policy) == "Policy('Weighted')"
+
+
+@pytest.mark.parametrize("name", ["samples", "function", "forward", "training"])
+def test_settings_of_names_that_a_policy_has_are_refused(name):
+    takes = Signature([Parameter(name, Parameter.KEYWORD_ONLY, default=1)])
+    with pytest.raises(InputError, match=f"^function: expected one whose settings have other names .*, got {name}$"):
+        Policy(type("Own", (acquisition.Uniform,), {"__signature__": takes}))
+
+
+def test_arguments_without_names_are_refused():
+    own = {"name": "own", "tasks": ("search",), "__init__": lambda self, *values: None}
+    with pytest.raises(InputError, match=r"^__init__: expected arguments that can be given by name, got Own\(\*v"):
+        type("Own", (AcquisitionFunction,), own)
+    assert "own" not in FUNCTIONS
+
+
 @pytest.mark.parametrize(("name", "tasks"), [("kl", ("search",)), ("own", "search"), ("own", ("searching",))])
 def test_a_name_that_is_taken_and_other_tasks_are_refused(name, tasks):
     with pytest.raises(InputError, match=r"^name: expected one not taken|^tasks: expected a tuple"):
@@ -140,6 +177,8 @@ def test_what_is_no_function_and_other_numbers_of_samples_are_refused(function, 
 
 
 def test_other_names_are_refused_with_a_suggestion():
+    with pytest.raises(InputError, match="unknown task 'find'; known: search, exploration"):
+        policy_names("find")
     for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:
         with pytest.raises(InputError, match=f"did you mean '{meant}'"):
             Policy(name)

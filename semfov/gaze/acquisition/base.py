@@ -22,7 +22,8 @@ class AcquisitionFunction(nn.Module, ABC):
     (`semfov.gaze.select_fixation`). The function itself may value visited cells too: inhibition of return excludes
     them. A subclass with a `name` is registered when it is defined: `semfov.policies.Policy` and the settings of runs
     refer to it by that name. Its arguments say what it is made from: `target`, `grid` and `model` for the target, the
-    cells and a fitted model, and settings of its own.
+    cells and a fitted model, and settings of its own. They are given by name; those of its base are among them if it
+    passes `**options` on.
 
     Attributes:
         name: name in settings.
@@ -34,7 +35,7 @@ class AcquisitionFunction(nn.Module, ABC):
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
     Raises:
-        InputError: a subclass takes the name of another one, or is for other tasks.
+        InputError: a subclass takes the name of another one, is for other tasks, or has arguments without names.
 
     >>> import torch
     >>> from semfov import DirichletBelief, Grid, acquisition, policies
@@ -58,14 +59,19 @@ class AcquisitionFunction(nn.Module, ABC):
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
-        parameters = signature(cls).parameters.items()
-        cls.takes = {n: each for n, each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        parameters = signature(cls).parameters
+        kinds = {each.kind for each in parameters.values()}
+        named = {n: each for n, each in parameters.items() if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        # What it passes on by `**` are arguments of its base.
+        cls.takes = {**getattr(cls, "takes", {}), **named} if Parameter.VAR_KEYWORD in kinds else named
         cls.needs_model = "model" in cls.takes and not cls.needs_map
         if "name" in cls.__dict__:
             taken = FUNCTIONS.get(cls.name, cls)
             # A cell of a notebook that is run again defines its class again.
             again = taken.__qualname__ == cls.__qualname__
             check(again, "name", f"one not taken by {taken.__qualname__}", repr(cls.name))
+            by_name = Parameter.VAR_POSITIONAL not in kinds or Parameter.VAR_KEYWORD in kinds
+            check(by_name, "__init__", "arguments that can be given by name", f"{cls.__qualname__}{signature(cls)}")
             known = isinstance(cls.tasks, tuple) and set(cls.tasks) <= set(get_args(Task))
             check(known, "tasks", f"a tuple of {' and '.join(get_args(Task))}", repr(cls.tasks))
             FUNCTIONS[cls.name] = cls
