@@ -37,8 +37,10 @@ WINDOWS = {
     "found": "The probability is high enough, and a detection shows the target.",
     "absent": "No remaining look is worth a pass, and the target is probably absent.",
     "undecided": "No remaining look is worth a pass, but the target is probably there.",
+    "unseen": "No look shows a candidate: the probability is how frequent the class is, not something seen.",
     "closer found": "A closer look confirmed the target.",
     "closer absent": "No closer look was sure enough, and the target is probably absent.",
     "closer undecided": "No closer look was sure enough, but the target is probably there.",
 }
-"""Sentences for looks at windows, by the ending, or by the outcome of the decision that ended the search."""
+"""Sentences for looks at windows, by the ending, or by the outcome of the decision that ended the search; `unseen` is
+for a photograph in which no look shows a place that may hold the target."""

@@ -19,6 +19,7 @@ from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
 from semfov.zoom.certainty import SPREAD, number_of, reacts
+from semfov.zoom.closer import SEEN
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
@@ -208,6 +209,17 @@ class ZoomPath(GazeRecord):
             outcome = f"{self.decision.outcome} (there with probability {self.decision.probability:.2f})"
             return f"{self.target_name}: {outcome} in {passes}"
         return f"{self.objects_in_words()} in {passes}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why the search or the exploration ended, or what a decision without candidates says.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
+        target, decided = self.target, self.ending == "decision" and self.lattice.levels == 1 and not self.closer
+        if decided and target is not None and all(float(each.show[target - 1]) < SEEN for each in self.glances):
+            return self._sentences["unseen"]
+        return super().why_it_ended()
 
     @property
     def measure(self) -> str:

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
-from semfov.viz.drawing import check_fixation, choose_fixations, draw_cross, draw_image, draw_overlay, draw_scale
+from semfov.viz.drawing import (
+    check_fixation,
+    check_foveal,
+    choose_fixations,
+    draw_cross,
+    draw_image,
+    draw_overlay,
+    draw_scale,
+)
 from semfov.viz.style import PROBABILITY, make_figure, root, styled
 
 if TYPE_CHECKING:
@@ -59,7 +67,7 @@ def plot_belief(
         The figure.
 
     Raises:
-        InputError: there is no such fixation or class, or an argument is out of range.
+        InputError: it is no record of a fovea, there is no such fixation or class, or an argument is out of range.
 
     Example::
 
@@ -67,6 +75,7 @@ def plot_belief(
         save_figure(plot_belief(scanpath), "belief.pdf")
         save_figure(plot_belief(scanpath, None, most=4, columns=2), "beliefs.pdf")
     """
+    check_foveal(scanpath)
     check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most) if fixation is None else [check_fixation(scanpath, fixation)]
     grey, (width, height) = scanpath.image if image is None else image, scanpath.grid.extent.tolist()
@@ -104,7 +113,7 @@ def plot_belief_bars(
         The figure.
 
     Raises:
-        InputError: there is no such class, or the axes are too few, too many, or not in 3D.
+        InputError: it is no record of a fovea, there is no such class, or the axes are too few, too many, or not in 3D.
 
     Example::
 
@@ -114,6 +123,7 @@ def plot_belief_bars(
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
+    check_foveal(scanpath)
     posterior, name = class_posterior(scanpath, target).numpy(), _name(scanpath, target)
     fixations, grid = choose_fixations(scanpath, most), scanpath.grid
     highest = max(float(posterior.max()), 1e-9)

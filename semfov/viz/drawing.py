@@ -48,6 +48,12 @@ def check_fixation(record: Record, fixation: int) -> int:
     return fixation % count
 
 
+def check_foveal(record: Record) -> None:
+    """Raise `InputError` where a record has no belief over cells."""
+    got = f"{type(record).__name__} ({record.how})"
+    check(record.how == "fovea", "scanpath", 'the record of a fovea, as how="fovea" makes it', got)
+
+
 def choose_fixations(record: Record, most: int) -> list[int]:
     """Numbers of at most `most` looks: the first ones and the last."""
     check(most >= 1, "most", "at least 1", most)

@@ -16,6 +16,7 @@ from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
+    check_foveal,
     choose_fixations,
     draw_boxes,
     draw_grid,
@@ -127,7 +128,7 @@ def plot_foveated_strip(
         The figure.
 
     Raises:
-        InputError: the views are neither given nor kept by the scanpath, or an argument is out of range.
+        InputError: it is no record of a fovea, its views are neither given nor kept, or an argument is out of range.
 
     Example::
 
@@ -176,7 +177,7 @@ def plot_episode(
         The figure.
 
     Raises:
-        InputError: the photograph or the views are neither given nor kept by the scanpath.
+        InputError: it is no record of a fovea, or the photograph or the views are neither given nor kept by it.
 
     Example::
 
@@ -185,7 +186,7 @@ def plot_episode(
     """
     from matplotlib.figure import Figure
 
-    image, views = photograph_of(scanpath, image), _views(scanpath, views)
+    views, image = _views(scanpath, views), photograph_of(scanpath, image)
     fixations = choose_fixations(scanpath, most)
     aspect = image.shape[-2] / image.shape[-1]
     width = 2.5 * len(fixations) + 5.8
@@ -231,6 +232,7 @@ def annotation_entries(record: Record, boxes: Tensor | None) -> list[LegendEntry
 
 def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
     """The given views, or those of the scanpath."""
+    check_foveal(scanpath)
     views = scanpath.views() if views is None else views
     check(len(views) == len(scanpath), "views", f"{len(scanpath)} views, one for each fixation", len(views))
     return views

@@ -13,6 +13,7 @@ from semfov.belief.grid import Grid
 from semfov.paths import Scanpath
 from semfov.viz.drawing import (
     check_fixation,
+    check_foveal,
     draw_cells,
     draw_cross,
     draw_grid,
@@ -60,13 +61,14 @@ def plot_semantic_map(
         The figure.
 
     Raises:
-        InputError: there is no such fixation.
+        InputError: it is no record of a fovea, or there is no such fixation.
 
     Example::
 
         scanpath = agent.explore(read_image("kitchen.jpg"), how="fovea")
         save_figure(plot_semantic_map(scanpath), "map.pdf")
     """
+    check_foveal(scanpath)
     fixation, grid = check_fixation(scanpath, fixation), scanpath.grid
     image = scanpath.image if image is None else image
     width, height = grid.extent.tolist()

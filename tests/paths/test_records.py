@@ -24,6 +24,7 @@ from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, GazeRecord, HeadPath, Record, WindowMoment, ZoomPath
 from semfov.paths.endings import FIXATIONS, WINDOWS
 from semfov.paths.stimulus import Stimulus, reduced_copy
+from semfov.viz import plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, around, on_lattice
@@ -297,6 +298,14 @@ def test_the_first_look_was_not_chosen_by_a_value(make):
 )
 def test_a_record_tells_what_the_number_of_its_decision_is(record, word):
     assert record.decided_by == word
+
+
+@pytest.mark.parametrize("make", [zoom_path, head_path])
+def test_beliefs_over_cells_are_drawn_of_a_fovea_alone(make):
+    drawn = plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
+    for plot in drawn:
+        with pytest.raises(InputError, match=f'how="fovea".*{make().how}'):
+            plot(make())
 
 
 @pytest.mark.parametrize("make", RECORDS)

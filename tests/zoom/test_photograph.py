@@ -1,6 +1,7 @@
 """Photographs, which one look shows whole: their evidence, the worth of closer looks, slices, and decisions."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import PhotographPlaces, WindowLook, candidates, closer_window
+from semfov.zoom.closer import SEEN, PhotographPlaces, WindowLook, candidates, closer_window
 from semfov.zoom.glances import LiveGlances, overview
 from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import ranked, raw, usual_slices
@@ -178,6 +179,10 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     nothing = agent.search(photograph, "blue")
     assert nothing.decision.outcome == "absent"
     assert nothing.passes == 1
+    assert "not something seen" in nothing.why_it_ended()
+    seen = torch.tensor([0.0, 0.0, SEEN + 1e-6])
+    shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
+    assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
     made = [agent.search(photograph, "red", confirm=least, give_up=0.0).passes for least in (0.01, 0.9)]
     assert made[0] == made[1] > max(path.passes, 3)
