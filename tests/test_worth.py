@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
-from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence
+from semfov import ActivePerception, Eye, Foveation, Grid, MapEvidence
 from semfov.agents.fovea import _WORTH
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.gaze.policies import Policy
+from tests.refusals import refused
 from tests.small import Coloured
 
 SIZE = (160, 120)
@@ -135,10 +136,8 @@ def test_the_map_of_a_search_is_the_learned_map(model, image):
 def test_prices_are_numbers_for_an_agent_with_a_learned_map(image, model):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     agent = ActivePerception(eye, (Semantic(3), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(5, 4))
-    with pytest.raises(InputError, match=r"^worth: expected None for an agent without a learned map"):
-        agent.explore(image, worth=0.1)
+    refused(r"^worth: expected None for an agent without a learned map", agent.explore, image, worth=0.1)
     assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, worth=0).ending == "shifts"
     assert agent.explore(image, shifts=50).ending == "cells"
     for worth in [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400]:
-        with pytest.raises(InputError, match="worth: expected 0 or more"):
-            agent_of(model).explore(image, worth=worth)
+        refused("worth: expected 0 or more", agent_of(model).explore, image, worth=worth)

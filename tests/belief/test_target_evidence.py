@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Detections, Grid, InputError, TargetEvidence
+from semfov import Detections, Grid, TargetEvidence
 from semfov.belief.observers import Target
 from tests.belief import reference
+from tests.refusals import refused
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -132,12 +133,9 @@ def test_gradients_reach_every_parameter(looks):
 
 
 def test_bad_input(looks, model):
-    with pytest.raises(InputError, match="target"):
-        model(looks, FIXATIONS, GRID, 4)
-    with pytest.raises(InputError, match="target"):
-        Target(model).weigh(looks, FIXATIONS, GRID)
-    with pytest.raises(InputError, match="fixation"):
-        model(looks, FIXATIONS[:2], GRID, 1)
+    refused("target", model, looks, FIXATIONS, GRID, 4)
+    refused("target", Target(model).weigh, looks, FIXATIONS, GRID)
+    refused("fixation", model, looks, FIXATIONS[:2], GRID, 1)
 
 
 def test_the_default_classes_are_those_of_coco():

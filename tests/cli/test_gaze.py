@@ -8,13 +8,14 @@ import torch
 from PIL import Image
 from torch.nn import functional as F
 
-from semfov import DataError, Detector, InputError
+from semfov import Detector
 from semfov.cli.main import main
 from semfov.data.fixations import by_picture, read_table
 from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.paths import GazePrediction
+from tests.refusals import refused, unusable
 from tests.small import rand
 
 
@@ -120,14 +121,12 @@ def test_a_model_of_ones_own(run, photos, tmp_path):
     assert own != shipped
     assert own == folder
     assert "did you mean --model?" in run(photos / "0.png", "--models", tmp_path / "own")[2]
-    with pytest.raises(DataError, match=r"semfov gaze --model .*own/gaze\.safetensors"):
-        Manifest.read(tmp_path / "own")
+    unusable(r"semfov gaze --model .*own/gaze\.safetensors", Manifest.read, tmp_path / "own")
     detector = Colours("colours", ("cup",), (416, 416), stride=32).eval()
     image = rand(3, 60, 80)
     by_path = GazePrediction.of(detector, image, model=str(tmp_path / "own/gaze.safetensors"))
     torch.testing.assert_close(by_path.density, GazePrediction.of(detector, image, model=other).density)
-    with pytest.raises(InputError, match=r"model: expected .*from_pretrained"):
-        GazePrediction.of(detector, image, model=3)
+    refused(r"model: expected .*from_pretrained", GazePrediction.of, detector, image, model=3)
 
 
 def test_the_seed_repeats_the_table(run, photos, tmp_path):

@@ -11,6 +11,7 @@ from PIL import Image
 
 from semfov import DataError, read_image
 from semfov.data.images import MAX_PIXELS
+from tests.refusals import unusable
 
 # Four colours, one per quadrant, so that every rotation or mirroring is visible.
 COLOURS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=np.uint8)
@@ -138,11 +139,9 @@ def test_float_tiff(tmp_path):
     Image.fromarray(np.array([[0.0, 0.25, 1.0]], np.float32)).save(tmp_path / "a.tif")
     assert read_image(tmp_path / "a.tif")[0].tolist() == [[0.0, 0.25, 1.0]]
     Image.fromarray(np.array([[0.0, np.nan]], np.float32)).save(tmp_path / "b.tif")
-    with pytest.raises(DataError, match=r"b\.tif: expected values from 0 to 1"):
-        read_image(tmp_path / "b.tif")
+    unusable(r"b\.tif: expected values from 0 to 1", read_image, tmp_path / "b.tif")
     Image.fromarray(np.array([[0, 70000]], np.int32)).save(tmp_path / "c.tif")
-    with pytest.raises(DataError, match=r"c\.tif: expected values from 0 to 65535"):
-        read_image(tmp_path / "c.tif")
+    unusable(r"c\.tif: expected values from 0 to 65535", read_image, tmp_path / "c.tif")
 
 
 @pytest.mark.parametrize("kind", ["gif", "webp", "png"])
@@ -165,8 +164,7 @@ def test_truncated_files_are_refused(tmp_path, kind):
     Image.fromarray(noise).save(tmp_path / f"a.{kind}")
     whole = (tmp_path / f"a.{kind}").read_bytes()
     (tmp_path / f"a.{kind}").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataError, match=rf"a\.{kind}: (truncated, damaged|not an image)"):
-        read_image(tmp_path / f"a.{kind}")
+    unusable(rf"a\.{kind}: (truncated, damaged|not an image)", read_image, tmp_path / f"a.{kind}")
 
 
 @pytest.mark.parametrize("side", [9600, 60000])
@@ -177,8 +175,7 @@ def test_a_decompression_bomb_is_refused(tmp_path, side):
     idat = b"IDAT" + zlib.compress(b"\0" * 100)
     data += struct.pack(">I", len(idat) - 4) + idat + struct.pack(">I", zlib.crc32(idat))
     (tmp_path / "bomb.png").write_bytes(data)
-    with pytest.raises(DataError, match=rf"bomb\.png: .*({MAX_PIXELS:,}|{2 * MAX_PIXELS:,}) pixels"):
-        read_image(tmp_path / "bomb.png")
+    unusable(rf"bomb\.png: .*({MAX_PIXELS:,}|{2 * MAX_PIXELS:,}) pixels", read_image, tmp_path / "bomb.png")
 
 
 def samples():

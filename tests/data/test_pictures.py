@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from semfov.data.pictures import Pictures
-from semfov.errors import DataError
+from tests.refusals import unusable
 
 
 @pytest.fixture
@@ -35,5 +35,4 @@ def test_pictures_are_sorted_by_name_and_lie_in_the_folder(folder):
     assert torch.equal(pictures.annotation(0).boxes, torch.zeros(0, 4))
     assert pictures.targets(0) == []
     for name in ["missing.png", "../a.png"]:
-        with pytest.raises(DataError, match=r"missing\.png|leads out"):
-            Pictures(folder, ["a.png", name], ("person",))
+        unusable(r"missing\.png|leads out", Pictures, folder, ["a.png", name], ("person",))

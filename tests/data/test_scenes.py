@@ -8,7 +8,7 @@ from PIL import Image
 from semfov.data import EmbeddedScenes
 from semfov.data import scenes as module
 from semfov.data.scenes import _DISTRACTORS, _PHOTOGRAPHED_OBJECTS, _TEXTURES
-from semfov.errors import DataError, InputError
+from tests.refusals import refused, unusable
 
 CLASSES = ("person", "motorbike", "cat", "cup")
 COUNT = 40
@@ -148,20 +148,15 @@ def test_objects_of_classes_unknown_to_the_detector_have_no_box():
     for index in range(6):
         assert set(scenes.annotation(index).labels.tolist()) <= {2}
     assert any(scenes.targets(index) == [2] for index in range(6))
-    with pytest.raises(InputError, match="classes: expected at least one of cat, cup, motorcycle, person"):
-        EmbeddedScenes(("zebra",))
+    refused("classes: expected at least one of cat, cup, motorcycle, person", EmbeddedScenes, ("zebra",))
 
 
 def test_bad_arguments_and_missing_files(monkeypatch):
-    with pytest.raises(InputError, match="count"):
-        EmbeddedScenes(CLASSES, count=0)
-    with pytest.raises(InputError, match="seed"):
-        EmbeddedScenes(CLASSES, seed=-1)
+    refused("count", EmbeddedScenes, CLASSES, count=0)
+    refused("seed", EmbeddedScenes, CLASSES, seed=-1)
     with pytest.raises(IndexError):
         EmbeddedScenes(CLASSES, count=2)[2]
     monkeypatch.setitem(module._FOLDERS, "skimage", "elsewhere")
-    with pytest.raises(DataError, match=r"expected the photograph .* pip install"):
-        EmbeddedScenes(CLASSES)
+    unusable(r"expected the photograph .* pip install", EmbeddedScenes, CLASSES)
     monkeypatch.setattr(module, "find_spec", lambda _: None)
-    with pytest.raises(DataError, match=r"expected the package .*, which is not installed; pip install"):
-        EmbeddedScenes(CLASSES)
+    unusable(r"expected the package .*, which is not installed; pip install", EmbeddedScenes, CLASSES)

@@ -14,6 +14,7 @@ from semfov.data import sources
 from semfov.data.images import _FORMATS
 from semfov.data.sources import PHOTOGRAPHS, embedded_picture, open_stream, picture_files
 from semfov.errors import DataError, InputError
+from tests.refusals import refused, unusable
 
 SHADES = (20, 90, 160, 230)
 
@@ -69,8 +70,7 @@ def test_frames_of_a_video_are_read_in_order(video):
 def test_a_playlist_is_no_video(video, tmp_path, suffix):
     path = tmp_path / f"list{suffix}"
     path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n{video}\n#EXT-X-ENDLIST\n")
-    with pytest.raises(DataError, match="expected a video, got a playlist"):
-        open_stream(path)
+    unusable("expected a video, got a playlist", open_stream, path)
 
 
 def test_streams_are_opened_by_their_address(video, serve):
@@ -84,28 +84,20 @@ def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():
     with pytest.raises(DataError, match=r"rtsp://127.0.0.1:9/a: cannot be opened; check that address, user") as caught:
         open_stream("rtsp://admin:secret@127.0.0.1:9/a")
     assert "secret" not in str(caught.value)
-    with pytest.raises(InputError, match=r"expected an address of a stream .*, got gopher"):
-        open_stream("gopher://secret@camera")
+    refused(r"expected an address of a stream .*, got gopher", open_stream, "gopher://secret@camera")
 
 
 def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
-    with pytest.raises(DataError, match="no such file"):
-        picture_files(tmp_path / "none.jpg")
-    with pytest.raises(DataError, match="got none"):
-        picture_files(tmp_path)
+    unusable("no such file", picture_files, tmp_path / "none.jpg")
+    unusable("got none", picture_files, tmp_path)
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"no video")
-    with pytest.raises(DataError, match=r"broken\.mp4: cannot be opened"):
-        open_stream(broken)
-    with pytest.raises(DataError, match="source: no such file or folder"):
-        open_stream(tmp_path / "none.mp4")
-    with pytest.raises(DataError, match=r"source: expected a video, got the folder .*; semfov find takes"):
-        open_stream(tmp_path)
-    with pytest.raises(DataError, match="camera 99: cannot be opened; check that it is connected"):
-        open_stream(99)
+    unusable(r"broken\.mp4: cannot be opened", open_stream, broken)
+    unusable("source: no such file or folder", open_stream, tmp_path / "none.mp4")
+    unusable(r"source: expected a video, got the folder .*; semfov find takes", open_stream, tmp_path)
+    unusable("camera 99: cannot be opened; check that it is connected", open_stream, 99)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(DataError, match="pip install opencv-python-headless"):
-        open_stream(broken)
+    unusable("pip install opencv-python-headless", open_stream, broken)
 
 
 def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from semfov.data import WordVectors, spread
 from semfov.data.word_vectors import words_of
-from semfov.errors import DataError, InputError
+from tests.refusals import refused, unusable
 
 VECTORS = np.random.default_rng(0).normal(size=(6, 5))
 WORDS = ("cup", "wine", "glass", "drink", "cow", "Dog")
@@ -83,23 +83,16 @@ def test_function_words_are_ignored_unless_there_are_no_others(description, word
 
 
 def test_errors_name_the_file_line_or_argument(path, tmp_path):
-    with pytest.raises(DataError, match=r"nothing\.txt"):
-        WordVectors.read(tmp_path / "nothing.txt", ["cup"])
-    with pytest.raises(InputError, match="zebra"):
-        WordVectors.read(path, ["zebra"])
+    unusable(r"nothing\.txt", WordVectors.read, tmp_path / "nothing.txt", ["cup"])
+    refused("zebra", WordVectors.read, path, ["zebra"])
     lines = path.read_text().splitlines()
     where = next(number for number, line in enumerate(lines) if line.startswith("cow"))
     for damaged in ("cow 1 2 3", "cow 1 2 3 4 x", "cow", "cow 1 2 3 4 nan"):
         path.write_text("\n".join([*lines[:where], damaged, *lines[where + 1 :]]))
-        with pytest.raises(DataError, match=f"line {where + 1}: expected a word and 5 numbers"):
-            WordVectors.read(path, ["cup", "cow"])
+        unusable(f"line {where + 1}: expected a word and 5 numbers", WordVectors.read, path, ["cup", "cow"])
     words = WordVectors({"cup": torch.ones(2)})
-    with pytest.raises(InputError, match="'zebra'"):
-        words.vector("zebra")
-    with pytest.raises(InputError, match="target"):
-        spread("a zebra", ["cup"], words)
-    with pytest.raises(InputError, match="classes"):
-        spread("a cup", ["zebra"], words)
+    refused("'zebra'", words.vector, "zebra")
+    refused("target", spread, "a zebra", ["cup"], words)
+    refused("classes", spread, "a cup", ["zebra"], words)
     for options, name in (({"temperature": 0.0}, "temperature"), ({"least": 2}, "least")):
-        with pytest.raises(InputError, match=name):
-            spread("cup", ["cup"], words, **options)
+        refused(name, spread, "cup", ["cup"], words, **options)

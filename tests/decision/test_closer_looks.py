@@ -12,6 +12,7 @@ from semfov.detection import Candidates
 from semfov.gaze.policies import Policy
 from tests.decision.test_rule import Nothing, Scripted, Square, cells
 from tests.decision.test_verifier import AT, FromScore
+from tests.refusals import refused
 
 
 class Fine(Square):
@@ -44,10 +45,8 @@ def test_a_closer_look_shows_more_than_the_whole_image_to_one_box_of_one_image(i
     close = eye.close_up(image[None], whole.boxes[0, 0])
     assert (int(whole.labels[0, 0]), int(close.labels[0, 0])) == (2, 1)
     eye = Eye(Foveation(200.0), Square(), reference=160.0)
-    with pytest.raises(InputError, match="image: expected a tensor of shape"):
-        eye.close_up(image, torch.zeros(4))
-    with pytest.raises(InputError, match="box: expected a tensor of shape"):
-        eye.close_up(image[None], torch.zeros(3))
+    refused("image: expected a tensor of shape", eye.close_up, image, torch.zeros(4))
+    refused("box: expected a tensor of shape", eye.close_up, image[None], torch.zeros(3))
 
 
 def test_the_search_ends_with_the_box_of_the_closer_look(image):

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Detections, Grid, InputError
+from semfov import Detections, Grid
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from tests.decision.test_rule import Known, random_looks
+from tests.refusals import refused
 from tests.small import iou
 
 GRID = Grid(4, 3, (160, 120))
@@ -148,10 +149,8 @@ def test_as_many_closer_looks_as_are_allowed():
 
 def test_a_wrong_setting_is_named():
     for most in (0, 101, 1.5):
-        with pytest.raises(InputError, match="most: expected a whole number"):
-            verifier({}, most=most)
-    with pytest.raises(InputError, match="thresholds: expected"):
-        verifier({}, thresholds=None)
+        refused("most: expected a whole number", verifier, {}, most=most)
+    refused("thresholds: expected", verifier, {}, thresholds=None)
 
 
 @pytest.mark.parametrize("seed", range(3))

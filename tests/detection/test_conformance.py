@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Detections, Detector, InputError, Selection
+from semfov import Detections, Detector, Selection
 from semfov.detection.export import export_onnx
 from semfov.detection.onnx import load_onnx
 from semfov.detection.torchvision import _TorchvisionDetector
 from tests.detection.test_torchvision import MODELS, randomise_heads
+from tests.refusals import refused
 
 NAMES = ("cat", "dog", "cup")
 SHARED = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[3] / "shared")) / "weights"
@@ -143,13 +144,10 @@ def test_scores_are_on_the_simplex_and_shapes_are_right(detector):
 def test_what_is_no_batch_of_images_or_canvases_is_refused(detector):
     one = torch.zeros(1, 3, 40, 50)
     for images in (one[:0], one[:, :, :0], one[:, [0, 0, 1, 2]], one[0], one[None], one.byte()):
-        with pytest.raises(InputError, match=r"images: expected floating-point RGB in \[0, 1\] of shape \(B, 3, H, W"):
-            detector(images)
+        refused(r"images: expected floating-point RGB in \[0, 1\] of shape \(B, 3, H, W", detector, images)
     canvas, placement = detector.fit(photographs(1, 40, 50))
-    with pytest.raises(InputError, match="canvas: expected at least one image"):
-        detector.detect(canvas[:0], placement)
-    with pytest.raises(InputError, match="floating-point"):
-        detector.propose(canvas.byte())
+    refused("canvas: expected at least one image", detector.detect, canvas[:0], placement)
+    refused("floating-point", detector.propose, canvas.byte())
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
@@ -203,8 +201,7 @@ def test_bytes_are_proposed_as_their_share_of_white(detector):
         found = detector.propose_bytes(given)
         torch.testing.assert_close(found.boxes, expected.boxes, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-4, atol=1e-5)
-    with pytest.raises(InputError, match="canvas: expected bytes"):
-        detector.propose_bytes(canvas / 255)
+    refused("canvas: expected bytes", detector.propose_bytes, canvas / 255)
 
 
 def test_detector_moves_between_devices(detector, device):

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from semfov import Detections, InputError
+from semfov import Detections
+from tests.refusals import refused
 
 
 def detections(counts: list[int], classes: int = 3, seed: int = 0) -> Detections:
@@ -40,8 +41,7 @@ def test_stack_pads_to_the_longest():
     ],
 )
 def test_refuses_tensors_of_inconsistent_shapes(boxes, scores, mask):
-    with pytest.raises(InputError):
-        Detections(boxes, scores, mask)
+    refused(".", Detections, boxes, scores, mask)
 
 
 def test_batches_are_indexed_by_image_and_may_be_empty():
@@ -54,5 +54,4 @@ def test_batches_are_indexed_by_image_and_may_be_empty():
     assert d.boxes.dtype == torch.float64
     assert d.count.tolist() == [0, 0]
     assert d.labels.shape == (2, 0)
-    with pytest.raises(InputError, match="at least one"):
-        Detections.stack([])
+    refused("at least one", Detections.stack, [])

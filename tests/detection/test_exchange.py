@@ -16,6 +16,7 @@ from torchvision.ops import box_iou
 
 from semfov import Detections, InputError
 from semfov.detection.exchange import category_ids
+from tests.refusals import refused
 
 CLASSES = ("person", "cup", "tvmonitor")
 
@@ -154,8 +155,7 @@ def test_category_names_may_be_spelled_differently():
 def test_inconsistent_arguments_are_refused_by_name():
     two = Detections.stack([some(), some()])
     for call in (two.to_supervision, two.to_torchvision, lambda: two.to_coco(1, [1, 2, 3])):
-        with pytest.raises(InputError, match=r"one image, such as detections\[0\], got a batch of shape \(2,\)"):
-            call()
+        refused(r"one image, such as detections\[0\], got a batch of shape \(2,\)", call)
     assert same(Detections.from_supervision(two[0].to_supervision(), 3), some())
     seen = some()
     for call, message in (
@@ -167,8 +167,7 @@ def test_inconsistent_arguments_are_refused_by_name():
         (lambda: Detections.from_supervision(supervision.Detections(np.zeros((1, 4))), 3), "class_id"),
         (lambda: Detections.from_torchvision({"boxes": seen.boxes[0]}, 3), "'labels'"),
     ):
-        with pytest.raises(InputError, match=message):
-            call()
+        refused(message, call)
     boxes = torch.zeros(1, 4)
     for labels, scores, message in (([0], [0.5], "labels"), ([4], [0.5], "labels"), ([1], [1.5], "scores"),
                                  ([1], [float("nan")], "scores"), ([1], [0.5, 0.5], "scores"),
@@ -180,5 +179,4 @@ def test_inconsistent_arguments_are_refused_by_name():
 
 def test_to_supervision_without_the_package_names_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "supervision", None)
-    with pytest.raises(InputError, match="pip install supervision"):
-        some().to_supervision()
+    refused("pip install supervision", some().to_supervision)

@@ -7,6 +7,7 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector, detector_name, load_detector
 from semfov.detection.placement import resize
 from semfov.detection.yolo import _RUNTIMES
+from tests.refusals import refused, unusable
 
 
 def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
@@ -29,7 +30,7 @@ def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("model", "options", "refused"),
+    ("model", "options", "said"),
     [
         ("yolov3-tiny", {"treshold": 0.1}, "treshold: .* for yolov3-tiny.*; did you mean threshold="),
         ("yolov3-tiny", {"processor": {}}, "processor: .* for yolov3-tiny, got an unknown one; known: weights"),
@@ -40,10 +41,9 @@ def test_cfg_weights_and_options(small_cfg, small_weights, tmp_path):
         (torch.nn.Linear, {}, "detector: expected a model of torchvision, transformers or Ultralytics"),
     ],
 )
-def test_options_that_a_detector_does_not_have_are_refused_before_it_is_loaded(model, options, refused):
+def test_options_that_a_detector_does_not_have_are_refused_before_it_is_loaded(model, options, said):
     model = model if isinstance(model, str) else model(1, 1)
-    with pytest.raises(InputError, match=f"^{refused}"):
-        load_detector(model, **options)
+    refused(f"^{said}", load_detector, model, **options)
 
 
 def test_class_names_keep_the_order_of_the_scores(small_cfg, small_weights):
@@ -53,8 +53,7 @@ def test_class_names_keep_the_order_of_the_scores(small_cfg, small_weights):
     for given in (["cat", "dog"], "cat, dog", {1: "dog", 0: "cat"}, {"0": "cat", "1": "dog"}):
         assert classes(given) == ("cat", "dog")
     for given, said in (({"cat", "dog"}, "got a set, which has no order"), ({1: "cat", 2: "dog"}, "numbers from 0")):
-        with pytest.raises(InputError, match=f"classes: expected names in the order of the scores.*{said}"):
-            classes(given)
+        refused(f"classes: expected names in the order of the scores.*{said}", classes, given)
 
 
 @pytest.mark.parametrize(
@@ -67,23 +66,17 @@ def test_class_names_keep_the_order_of_the_scores(small_cfg, small_weights):
     ],
 )
 def test_what_newcomers_name_is_refused_with_the_remedy(name, said):
-    with pytest.raises(InputError, match=said):
-        load_detector(name)
+    refused(said, load_detector, name)
     with pytest.raises(InputError, match="device: expected a device of PyTorch, such as cpu or cuda, got 'gpu'"):
         load_detector("yolov3-tiny", device="gpu")
 
 
 def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_path):
-    with pytest.raises(InputError, match=r"expected a cfg and its weights"):
-        load_detector("x.weights")
-    with pytest.raises(InputError, match="weights: expected the path"):
-        load_detector(small_cfg)
-    with pytest.raises(DataError, match=r"cannot read the cfg"):
-        load_detector(tmp_path / "missing.cfg", weights="x")
-    with pytest.raises(DataError, match=r"expected 248007048 bytes .* got"):
-        load_detector("yolov3", weights=small_weights)
-    with pytest.raises(InputError, match="classes: expected 2 names, got 80"):
-        load_detector(small_cfg, weights=small_weights, stride=None)
+    refused(r"expected a cfg and its weights", load_detector, "x.weights")
+    refused("weights: expected the path", load_detector, small_cfg)
+    unusable(r"cannot read the cfg", load_detector, tmp_path / "missing.cfg", weights="x")
+    unusable(r"expected 248007048 bytes .* got", load_detector, "yolov3", weights=small_weights)
+    refused("classes: expected 2 names, got 80", load_detector, small_cfg, weights=small_weights, stride=None)
     with pytest.raises(DataError, match="cannot read the class names"):
         load_detector(small_cfg, weights=small_weights, classes=tmp_path / "missing.names")
 
@@ -151,8 +144,7 @@ def test_names_are_the_same_in_upper_and_lower_case():
 @pytest.mark.parametrize("load", [load_detector, check_detector])
 @pytest.mark.parametrize("name", ["mine.pt", "folder/mine.pth"])
 def test_pickles_are_refused_with_the_command_that_exports_them(load, name):
-    with pytest.raises(InputError, match=rf"yolo export model={name} format=onnx;.*weights='{name}'"):
-        load(name)
+    refused(rf"yolo export model={name} format=onnx;.*weights='{name}'", load, name)
 
 
 class Cells(nn.Module):
@@ -209,7 +201,5 @@ def test_networks_of_ultralytics(cells):
 
 def test_unknown_names_and_modules_are_refused_with_the_known_ones():
     for name in ["yolov3-tinny", "nothing"]:
-        with pytest.raises(InputError, match=f"unknown detector '{name}'; .*yolov3-tiny"):
-            load_detector(name)
-    with pytest.raises(InputError, match=r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear"):
-        load_detector(nn.Linear(1, 1))
+        refused(f"unknown detector '{name}'; .*yolov3-tiny", load_detector, name)
+    refused(r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear", load_detector, nn.Linear(1, 1))

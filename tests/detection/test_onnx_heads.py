@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from semfov.detection import onnx_heads as heads
 from semfov.detection.onnx_heads import HEADS, Signature, recognise
 from semfov.errors import InputError
+from tests.refusals import refused
 
 both = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 canvases = st.tuples(st.integers(8, 130), st.integers(8, 130))
@@ -96,12 +97,9 @@ def test_decoders_are_differentiable_and_compile():
 
 
 def test_wrong_shapes_are_refused_by_name():
-    with pytest.raises(InputError, match="84 rows, one for each cell of a 64 x 64 canvas"):
-        heads._decode_yolox(noise(1, 83, 8), (64, 64))
-    with pytest.raises(InputError, match="bins"):
-        heads._decode_distances(noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
-    with pytest.raises(InputError, match="boxes"):
-        heads.decode_detr(noise(1, 5, 3), noise(1, 5, 5), (64, 64))
+    refused("84 rows, one for each cell of a 64 x 64 canvas", heads._decode_yolox, noise(1, 83, 8), (64, 64))
+    refused("bins", heads._decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
+    refused("boxes", heads.decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
 
 def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None, **metadata):
@@ -176,8 +174,7 @@ def test_models_without_score_vectors_or_of_other_tasks_are_refused():
         signature((1, 300, 7)),
         signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
     ]:
-        with pytest.raises(InputError, match="export"):
-            recognise(outputs)
+        refused("export", recognise, outputs)
     for task in ["segment", "pose", "obb", "classify"]:
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
             recognise(signature((1, 116, 8400), classes=80, task=task))
@@ -202,8 +199,7 @@ def test_end_to_end_rows_are_one_hot_vectors():
     assert torch.equal(found.classes, torch.tensor([[[0, 0, 0.9], [0.2, 0, 0], [0, 0, 0]]]))
     with pytest.raises(InputError, match="classes: expected a name for each class of the rows, got 2, and class 2"):
         heads._decode_end_to_end(rows, 2)
-    with pytest.raises(InputError, match="rows: expected a whole number"):
-        heads._decode_end_to_end(rows + 0.5, 9)
+    refused("rows: expected a whole number", heads._decode_end_to_end, rows + 0.5, 9)
 
 
 @pytest.mark.parametrize(

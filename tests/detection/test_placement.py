@@ -8,7 +8,7 @@ from PIL import Image
 
 from semfov.detection import letterbox
 from semfov.detection.placement import resize
-from semfov.errors import InputError
+from tests.refusals import refused
 
 sides = st.integers(1, 90)
 
@@ -92,5 +92,4 @@ def test_resize_is_reproducible_on_one_thread_and_agrees_on_two(size, threads):
     ids=["bytes", "no batch", "no pixels"],
 )
 def test_refuses_what_is_no_batch_of_images(image, message):
-    with pytest.raises(InputError, match=message):
-        letterbox(image, (32, 32))
+    refused(message, letterbox, image, (32, 32))

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection.preprocessing import Preprocessing
-from semfov.errors import InputError
+from tests.refusals import refused
 
 numbers = st.floats(0.1, 200)
 
@@ -65,8 +65,7 @@ def test_canvases_of_bytes_are_exact_and_checked():
     image = Preprocessing(channels="bgr", scale=255.0).of_bytes(canvas)
     assert torch.equal(image, torch.arange(256.0).expand(1, 3, 1, -1))
     for canvas in [torch.zeros(1, 3, 4, 4), torch.zeros(3, 4, 4).byte(), torch.zeros(1, 4, 4, 3).byte()]:
-        with pytest.raises(InputError, match=r"canvas: expected bytes of shape \(B, 3, H, W\)"):
-            Preprocessing().of_bytes(canvas)
+        refused(r"canvas: expected bytes of shape \(B, 3, H, W\)", Preprocessing().of_bytes, canvas)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +88,7 @@ def test_canvases_of_bytes_are_exact_and_checked():
     ],
 )
 def test_refuses_invalid_settings(settings):
-    with pytest.raises(InputError, match=next(iter(settings)) if "channels" not in settings else "channel order"):
-        Preprocessing().merged(settings)
+    refused(next(iter(settings)) if "channels" not in settings else "channel order", Preprocessing().merged, settings)
 
 
 def test_merging_keeps_the_other_settings():

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import Candidates, score_vectors
-from semfov.errors import InputError
+from tests.refusals import refused
 
 EXACT = {"atol": 1e-12, "rtol": 0}
 
@@ -67,5 +67,4 @@ def test_compiles_to_a_single_graph():
     ("policy", "message"), [("residul", "'residual'"), ("own", "expects a head with a background score")]
 )
 def test_refuses_unsuitable_policies(policy, message):
-    with pytest.raises(InputError, match=message):
-        score_vectors(candidates([0.5]), policy)
+    refused(message, score_vectors, candidates([0.5]), policy)

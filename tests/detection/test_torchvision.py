@@ -7,10 +7,11 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBo
 from torchvision.models.detection.ssd import SSD
 from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
-from semfov import DataError, InputError, Selection, load_detector
+from semfov import DataError, Selection, load_detector
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.torchvision import _output_count, _TorchvisionDetector, load_torchvision
 from semfov.io.files import sha256
+from tests.refusals import refused, unusable
 
 NAMES = ("cat", "dog", "cup")
 LITE = "ssdlite320_mobilenet_v3_large"
@@ -238,8 +239,7 @@ def test_weights_can_be_named_in_several_ways(monkeypatch):
     monkeypatch.setattr("semfov.detection.torchvision._download", stop)
     enum = models.get_model_weights(LITE)
     for weights in ("DEFAULT", "COCO_V1", f"{enum.__name__}.COCO_V1", enum.COCO_V1):
-        with pytest.raises(DataError, match="stop"):
-            load_torchvision(LITE, weights=weights)
+        unusable("stop", load_torchvision, LITE, weights=weights)
     assert chosen == [enum.COCO_V1] * 4
 
 
@@ -254,11 +254,9 @@ def test_published_weights_are_verified_and_hold_only_tensors(monkeypatch, tmp_p
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     path = hub / models.get_model_weights(LITE).DEFAULT.url.split("/")[-1]
     torch.save({"a": torch.zeros(1)}, path)
-    with pytest.raises(DataError, match="damaged"):
-        load_torchvision(LITE)
+    unusable("damaged", load_torchvision, LITE)
     torch.save({"a": Unsafe()}, path)
-    with pytest.raises(DataError, match="expected only tensors"):
-        load_torchvision(LITE)
+    unusable("expected only tensors", load_torchvision, LITE)
 
 
 @pytest.mark.parametrize("kind", ["plain.pth", "nested.pth", "plain.safetensors"])
@@ -278,12 +276,10 @@ def test_weights_can_be_loaded_from_a_state_dict_file(lite, tmp_path, kind):
 
 def test_missing_and_unsuitable_files_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(models, "get_model", lambda *_, **__: MODELS["SSD"]())
-    with pytest.raises(DataError, match="no such file"):
-        load_torchvision(LITE, weights=tmp_path / "missing.pth", classes=NAMES)
+    unusable("no such file", load_torchvision, LITE, weights=tmp_path / "missing.pth", classes=NAMES)
     for content in ({"a": torch.zeros(1)}, {"a": Unsafe()}, [1, 2]):
         torch.save(content, tmp_path / "other.pth")
-        with pytest.raises(DataError, match=r"other\.pth"):
-            load_torchvision(LITE, weights=tmp_path / "other.pth", classes=NAMES)
+        unusable(r"other\.pth", load_torchvision, LITE, weights=tmp_path / "other.pth", classes=NAMES)
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -295,8 +291,7 @@ def test_a_model_in_memory_is_a_detector(kind):
     assert torch.equal(detector(image).scores, other(image).scores)
     assert _output_count(model) == 4
     assert len(detector.digest) == 64
-    with pytest.raises(InputError, match="classes: expected the names of the model's outputs after the first"):
-        load_detector(model)
+    refused("classes: expected the names of the model's outputs after the first", load_detector, model)
 
 
 def test_models_may_have_the_outputs_of_coco_or_none_for_background():
@@ -317,10 +312,7 @@ def test_invalid_options_are_refused():
         ("fcos_resnet50_fpn", {"weights": None, "classes": NAMES, "colour": 1}, "colour"),
         (LITE, {"weights": None, "classes": NAMES, "first": 0}, "first"),
     ):
-        with pytest.raises(InputError, match=message):
-            load_torchvision(name, **options)
-    with pytest.raises(InputError, match="expected Faster R-CNN"):
-        _TorchvisionDetector(nn.Linear(1, 1), NAMES)
+        refused(message, load_torchvision, name, **options)
+    refused("expected Faster R-CNN", _TorchvisionDetector, nn.Linear(1, 1), NAMES)
     detector = _TorchvisionDetector(MODELS["FCOS"](), NAMES[:2])
-    with pytest.raises(InputError, match="classes: expected 3 names"):
-        detector.propose(torch.rand(1, 3, 64, 64))
+    refused("classes: expected 3 names", detector.propose, torch.rand(1, 3, 64, 64))

@@ -6,7 +6,7 @@ import torch
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.detection.yolo import YoloV3, decode_yolo
-from semfov.errors import InputError
+from tests.refusals import refused
 
 ANCHORS = [(10.0, 14.0), (23.0, 27.0)]
 
@@ -69,16 +69,14 @@ def test_proposals_of_all_heads_are_concatenated(make_small):
 
 
 def test_refuses_invalid_settings_and_channels(small_cfg):
-    with pytest.raises(InputError, match="raw: expected a multiple of 2 anchors"):
-        decode_yolo(torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
+    refused("raw: expected a multiple of 2 anchors", decode_yolo, torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
     for options, message in [
         ({"classes": ("cat",)}, "classes: expected 2 names, got 1"),
         ({"input_size": (30, 32)}, "input_size: expected a multiple of 8"),
         ({"input_size": (0, 32)}, "input_size: expected a multiple of 8"),
         ({"stride": 6}, "stride: expected None or a multiple of 8"),
     ]:
-        with pytest.raises(InputError, match=message):
-            YoloV3(Darknet(read_cfg(small_cfg)), **({"classes": ("cat", "dog")} | options))
+        refused(message, YoloV3, Darknet(read_cfg(small_cfg)), **{"classes": ("cat", "dog")} | options)
 
 
 def test_settings_contain_runtime_digest_and_cfg(make_small, small_cfg):

@@ -21,6 +21,7 @@ from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.glances import on_lattice, overview
 from semfov.zoom.lattice import Lattice
 from tests.envs.agents import WindowAgent
+from tests.refusals import refused
 
 KINDS = {task: partial(ZoomEnv, task) for task in ("search", "exploration")}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
@@ -86,8 +87,7 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
 @pytest.mark.weights
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
-    with pytest.raises(InputError, match="unknown task 'explore'"):
-        ZoomEnv("explore", zoom_scenery, price=0.5)
+    refused("unknown task 'explore'", ZoomEnv, "explore", zoom_scenery, price=0.5)
     env = ZoomEnv("exploration", zoom_scenery, price=0.5, find=10.0)
     agent = WindowAgent(env)
     _, info = env.reset(seed=0)
@@ -124,8 +124,7 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     assert reward == -0.01
     assert np.array_equal(same["belief"], observation["belief"])
     assert later_info["passes"] == 3
-    with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\)"):
-        env.step(np.array([0.0, 1.5, 0.0]))
+    refused(r"action: expected \(x, y, magnification\)", env.step, np.array([0.0, 1.5, 0.0]))
 
 
 @pytest.mark.weights
@@ -188,7 +187,6 @@ def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_
     for action in ([0.5, 0.2], "x", [2, 0, 0], np.full(3, np.nan), None, np.array(["a", "b", "c"])):
         assert not env.action_space.contains(np.asarray(action))
         env.reset(seed=0)
-        with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\), each from 0 to 1"):
-            env.step(action)
+        refused(r"action: expected \(x, y, magnification\), each from 0 to 1", env.step, action)
     twin = pickle.loads(pickle.dumps(env))
     assert env.reset(seed=3)[0]["target"] == twin.reset(seed=3)[0]["target"]

@@ -21,8 +21,8 @@ from eval.page.tables import agreement, by_samples, paired
 from eval.page.thresholds import CONTRASTS
 from eval.results import _WHOLE, _fill_page, _page_table, results
 from eval.search.run import SearchConfig
-from semfov.errors import DataError, InputError
 from semfov.runs.presets import label
+from tests.refusals import refused, unusable
 
 ROOT = Path(__file__).parents[2]
 
@@ -150,10 +150,8 @@ def test_the_origin_of_a_table_names_every_commit_day_and_number_of_photographs(
 
 
 def test_unknown_tables_are_refused(runs):
-    with pytest.raises(InputError, match="did you mean 'beyond-search-tiny'"):
-        _fill_page(place("beyond-search-tin search"), runs)
-    with pytest.raises(InputError, match="table"):
-        _fill_page(place("beyond-search-tiny third"), runs)
+    refused("did you mean 'beyond-search-tiny'", _fill_page, place("beyond-search-tin search"), runs)
+    refused("table", _fill_page, place("beyond-search-tiny third"), runs)
 
 
 def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
@@ -216,8 +214,7 @@ def test_one_command_writes_both_pages_and_says_which_tables_it_renewed(searched
     assert "renewed: beyond-search-tiny search, beyond-search-tiny search\n" in told
     assert "have not run: paper, paper, prediction_and_calibration.png, search_baselines.png" in told
     pages[1].unlink()
-    with pytest.raises(DataError, match=r"tables\.md cannot be read"):
-        results(config)
+    unusable(r"tables\.md cannot be read", results, config)
 
 
 def test_differences_are_paired_over_images(searched):

@@ -41,6 +41,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
 from semfov.runs.search_protocol import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
+from tests.refusals import refused, unusable
 from tests.small import once
 
 
@@ -215,8 +216,7 @@ def copy_models(home, tmp_path):
 def test_another_network_is_refused(home, tmp_path):
     folder = copy_models(home, tmp_path)
     write_network(tmp_path / "colours.onnx", bias=-3.0)
-    with pytest.raises(DataError, match=r"detector: .*expected the network .*semfov fit"):
-        ActivePerception.from_pretrained(folder)
+    unusable(r"detector: .*expected the network .*semfov fit", ActivePerception.from_pretrained, folder)
     with pytest.raises(DataError, match="expected the network"):
         ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
 
@@ -239,11 +239,9 @@ def test_a_changed_file_is_refused(home, tmp_path, name):
     folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
-    with pytest.raises(DataError, match=f"{name}: damaged or changed"):
-        ModelFolder(folder)
+    unusable(f"{name}: damaged or changed", ModelFolder, folder)
     (folder / name).unlink()
-    with pytest.raises(DataError, match=r"no such file.*semfov fit"):
-        ModelFolder(folder)
+    unusable(r"no such file.*semfov fit", ModelFolder, folder)
 
 
 def rewrite_manifest(folder, **parts):
@@ -384,21 +382,16 @@ def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_pat
     assert "predictive-raw" not in kept
     assert {"random", "non-predictive-raw", "target-evidence"} <= set(kept)
     named = SearchConfig(models=folder, policies=(PolicyConfig("non-predictive", "calibrated"),))
-    with pytest.raises(InputError, match="lacks: too few detections"):
-        with_models(named)
-    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: semfov fit"):
-        ActivePerception.published(folder)
+    refused("lacks: too few detections", with_models, named)
+    refused(r"observation model, got .* without; fit one: semfov fit", ActivePerception.published, folder)
 
 
 def test_what_has_no_models_is_refused_with_the_command_that_fits_them(home, tmp_path):
-    with pytest.raises(DataError, match=r"manifest\.json: no such file; .*semfov fit"):
-        ActivePerception.from_pretrained(tmp_path)
-    with pytest.raises(InputError, match=r"got 'mymodels'; make a folder by `semfov fit .*mymodels`"):
-        ActivePerception.from_pretrained("mymodels")
+    unusable(r"manifest\.json: no such file; .*semfov fit", ActivePerception.from_pretrained, tmp_path)
+    refused(r"got 'mymodels'; make a folder by `semfov fit .*mymodels`", ActivePerception.from_pretrained, "mymodels")
     network = str(home / "colours.onnx")
     for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
-        with pytest.raises(InputError, match=r"semfov fit \S+colours\.onnx --data\.root"):
-            make(network)
+        refused(r"semfov fit \S+colours\.onnx --data\.root", make, network)
 
 
 def test_a_known_network_is_recognised_by_its_checksum(home, monkeypatch):
@@ -432,8 +425,7 @@ def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_pat
 
 
 def test_unknown_settings_of_the_call_are_named():
-    with pytest.raises(InputError, match="got 'clases'"):
-        semfov.fit_detector("mine.onnx", "photographs", "instances.json", clases=["cat"])
+    refused("got 'clases'", semfov.fit_detector, "mine.onnx", "photographs", "instances.json", clases=["cat"])
 
 
 def test_the_requested_number_of_absent_classes_is_chosen(home):
@@ -558,8 +550,7 @@ def test_class_names_are_the_categories_of_the_annotations_where_their_number_fi
     onnx.save(model, tmp_path / "mine.onnx")
     file = write_photographs(tmp_path, 2)
     config = FitDetectorConfig(model=tmp_path / "mine.onnx", data=DataConfig(tmp_path, file)).named()
-    with pytest.raises(InputError, match=r"3 classes of mine\.onnx .*mine\.json; the annotations have 4 categories"):
-        _with_classes(config)
+    refused(r"3 classes of mine\.onnx .*mine\.json; the annotations have 4 categories", _with_classes, config)
     annotations = json.loads(file.read_text())
     annotations["annotations"].pop()  # that of the sky
     known = annotations["categories"][:3]

@@ -10,6 +10,7 @@ from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.policy_looking import _make_strategy, _Models
 from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
+from tests.refusals import refused
 from tests.small import values_of
 
 GRID, CELLS = Grid(5, 4, (50, 40)), Grid(4, 3, (80, 60))
@@ -69,8 +70,7 @@ def test_other_beliefs_are_refused(model):
     like = torch.empty(0)
     for observer in (Semantic(4), Target(TargetEvidence(4, 4, components=4))):
         belief = observer.start(1, GRID, like)
-        with pytest.raises(InputError, match=f"belief: expected MapBelief, got {type(belief).__name__}"):
-            acquisition(belief, visited)
+        refused(f"belief: expected MapBelief, got {type(belief).__name__}", acquisition, belief, visited)
 
 
 def test_closer_look_accepts_a_learned_map(model):
@@ -105,12 +105,10 @@ DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
 )
 def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected):
     """Policies for Dirichlet beliefs need an observation model or a Dirichlet belief; a learned map has neither."""
-    with pytest.raises(InputError, match=f"^scores: {expected} ?'{policy}', got '{scores}'"):
-        resolve(PolicyConfig(policy, scores), task)
+    refused(f"^scores: {expected} ?'{policy}', got '{scores}'", resolve, PolicyConfig(policy, scores), task)
     if task == "exploration":
         assert f"{policy}-{scores}" not in presets(task)
-        with pytest.raises(InputError, match="policy"):
-            resolve(f"{policy}-{scores}", task)
+        refused("policy", resolve, f"{policy}-{scores}", task)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.policy_looking import _make_strategy, _Models
 from semfov.runs.presets import label, resolve
+from tests.refusals import refused
 from tests.small import draw as rand
 
 GRID = Grid(3, 1, (90, 30))
@@ -152,10 +153,8 @@ def test_looks_are_drawn_from_the_dirichlets_by_a_seed():
 def test_models_of_the_posterior_and_no_samples_are_refused():
     with pytest.raises(InputError, match="model: expected an observation model whose Dirichlets are densities"):
         sampled_likelihoods(two_classes(expected=torch.full((2, 2, 2), 0.5, dtype=torch.float64)), 4)
-    with pytest.raises(InputError, match="samples: expected a whole number from 1 to 65,536, got 0"):
-        policies.Policy("kl", two_classes(), samples=0)
-    with pytest.raises(InputError, match="likelihoods"):
-        look_ahead_by_samples(torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)
+    refused("samples: expected a whole number from 1 to 65,536, got 0", policies.Policy, "kl", two_classes(), samples=0)
+    refused("likelihoods", look_ahead_by_samples, torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)
 
 
 def test_policies_take_the_expectation_by_their_settings():
@@ -165,8 +164,7 @@ def test_policies_take_the_expectation_by_their_settings():
             made = Policy(name, model, samples=4, calibrated=False)(1, GRID)
             assert torch.equal(made.likelihoods, sampled_likelihoods(model, 4, calibrated=False))
             assert Policy(name, model)(1, GRID).likelihoods is None
-    with pytest.raises(InputError, match="samples: expected None for policy 'random', which predicts no look, got 4"):
-        Policy("random", samples=4)
+    refused("samples: expected None for policy 'random', which predicts no look, got 4", Policy, "random", samples=4)
     settings = PolicyConfig("kl", "calibrated", samples=8)
     assert label(settings, "exploration") == "kl-calibrated, samples 8"
     for scores in ("raw", "calibrated"):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from semfov import FovealObservationModel, Grid, InputError
+from semfov import FovealObservationModel, Grid
 from semfov.gaze.acquisition import (
     BayesianSurprise,
     KLDivergence,
@@ -13,6 +13,7 @@ from semfov.gaze.acquisition import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.lookahead import sampled_likelihoods
+from tests.refusals import refused
 from tests.small import rand, values_of
 
 ACQUISITIONS = {
@@ -81,11 +82,7 @@ def test_small_divergences_are_accurate_in_single_precision(model):
 
 def test_bad_arguments(model):
     grid = WIDE
-    with pytest.raises(InputError, match="classes"):
-        values_of(KLDivergence(model, grid), torch.ones(1, 8, 4))
-    with pytest.raises(InputError, match="prior"):
-        KLDivergence(model, grid, prior=0.0)
-    with pytest.raises(InputError, match="kappa"):
-        UpperConfidenceBound(model, grid, kappa=-1.0)
-    with pytest.raises(InputError, match="margin"):
-        ProbabilityOfImprovement(model, grid, margin=1.0)
+    refused("classes", values_of, KLDivergence(model, grid), torch.ones(1, 8, 4))
+    refused("prior", KLDivergence, model, grid, prior=0.0)
+    refused("kappa", UpperConfidenceBound, model, grid, kappa=-1.0)
+    refused("margin", ProbabilityOfImprovement, model, grid, margin=1.0)

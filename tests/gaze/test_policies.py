@@ -9,6 +9,7 @@ from torch import nn
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition
 from semfov.gaze.acquisition import FUNCTIONS, AcquisitionFunction
 from semfov.gaze.policies import Policy, policy_names
+from tests.refusals import refused
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -60,17 +61,14 @@ def test_settings_reach_the_function(model, mapping):
     policy = Policy("expected-gain", mapping)
     assert policy.model is mapping
     assert policy(None, GRID).model is mapping
-    with pytest.raises(InputError, match="unknown setting of policy 'kl' 'prio'; did you mean 'prior'"):
-        Policy("kl", model, prio=1.0)
+    refused("unknown setting of policy 'kl' 'prio'; did you mean 'prior'", Policy, "kl", model, prio=1.0)
     for values in ({}, {"values": None}):
-        with pytest.raises(InputError, match="policy 'saliency': expected values of a scene, got none"):
-            Policy("saliency", **values)(None, GRID)
+        refused("policy 'saliency': expected values of a scene, got none", Policy("saliency", **values), None, GRID)
 
 
 @pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "expected-accuracy"])
 def test_a_model_without_miss_rates_is_refused(name):
-    with pytest.raises(InputError, match="miss rates"):
-        Policy(name, FovealObservationModel.identity(["cup", "cat"], [0.2]))(1, GRID)
+    refused("miss rates", Policy(name, FovealObservationModel.identity(["cup", "cat"], [0.2])), 1, GRID)
 
 
 def test_every_named_function_is_public():
@@ -115,14 +113,12 @@ def test_a_missing_model_is_an_error_when_the_policy_is_made():
             Policy(name)
             continue
         needed = "a learned map" if kind.needs_map else "an observation model"
-        with pytest.raises(InputError, match=f"policy '{name}': expected {needed}, got none"):
-            Policy(name)
+        refused(f"policy '{name}': expected {needed}, got none", Policy, name)
 
 
 @pytest.mark.parametrize("name", sorted(OWN & set(policy_names("search")) - {"random", "saliency"}))
 def test_the_error_for_a_missing_target_names_the_policy(name, model):
-    with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
-        Policy(name, model)(None, GRID)
+    refused(f"policy '{name}': expected a target", Policy(name, model), None, GRID)
 
 
 def test_settings_of_ones_own(model):
@@ -172,13 +168,10 @@ def test_a_name_that_is_taken_and_other_tasks_are_refused(name, tasks):
     [(nn.Linear, {}, "function"), (3, {}, "unknown policy"), ("kl", {"samples": True}, "samples")],
 )
 def test_what_is_no_function_and_other_numbers_of_samples_are_refused(function, options, argument, model):
-    with pytest.raises(InputError, match=f"^{argument}"):
-        Policy(function, model, **options)
+    refused(f"^{argument}", Policy, function, model, **options)
 
 
 def test_other_names_are_refused_with_a_suggestion():
-    with pytest.raises(InputError, match="unknown task 'find'; known: search, exploration"):
-        policy_names("find")
+    refused("unknown task 'find'; known: search, exploration", policy_names, "find")
     for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:
-        with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-            Policy(name)
+        refused(f"did you mean '{meant}'", Policy, name)

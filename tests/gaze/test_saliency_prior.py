@@ -14,6 +14,7 @@ from semfov.gaze.acquisition import (
     TargetPosterior,
     TwoPeaks,
 )
+from tests.refusals import refused
 from tests.small import draw as rand
 
 GRID = Grid(4, 3, (80, 60))
@@ -80,14 +81,11 @@ def test_cells_whose_value_is_not_positive_come_last():
 
 
 def test_bad_arguments():
-    with pytest.raises(InputError, match="weight"):
-        SaliencyPrior(TargetPosterior(2), SALIENCY, weight=-0.1)
-    with pytest.raises(InputError, match="saliency: expected numbers of 0 or more"):
-        SaliencyPrior(TargetPosterior(2), -SALIENCY, weight=0.3)
+    refused("weight", SaliencyPrior, TargetPosterior(2), SALIENCY, weight=-0.1)
+    refused("saliency: expected numbers of 0 or more", SaliencyPrior, TargetPosterior(2), -SALIENCY, weight=0.3)
     with pytest.raises(InputError, match="saliency: expected numbers of 0 or more"):
         SaliencyPrior(TargetPosterior(2), SALIENCY * math.nan, weight=0.3)
-    with pytest.raises(InputError, match="saliency"):
-        values(SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
+    refused("saliency", values, SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
 
 
 def test_visited_cells_are_passed_to_the_acquisition():

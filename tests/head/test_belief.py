@@ -7,7 +7,7 @@ import torch
 
 from eval.head.run import _rests_on
 from eval.head.scan import Scan
-from semfov import InputError, Panorama, rollout
+from semfov import Panorama, rollout
 from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.choice import Given
 from semfov.head import ExploreGain, PerSecond, SearchGain, Speeds
@@ -15,6 +15,7 @@ from semfov.head.belief import SceneObserver
 from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT
 from semfov.head.views import Views
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -227,7 +228,5 @@ def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
 
 def test_one_episode_at_a_time(views, models):
     observer = SceneObserver(Target(models[0]), views)
-    with pytest.raises(InputError, match="batch: expected 1, as a head has one episode at a time"):
-        observer.start(2, views.grid, torch.zeros(1))
-    with pytest.raises(InputError, match="prior: expected a probability"):
-        SceneObserver(Target(models[0]), views, prior=1.5)
+    refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
+    refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from semfov import TargetEvidence
 from semfov.belief.observers import Target
-from semfov.errors import InputError
 from semfov.head import Flat, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.gain import OUT
 from semfov.head.views import Views
+from tests.refusals import refused
 
 
 @given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
@@ -58,5 +58,4 @@ def test_turns_within_the_dead_zone_are_not_made():
 
 @pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])
 def test_invalid_speeds_are_refused(settings):
-    with pytest.raises(InputError, match=next(iter(settings))):
-        Speeds(**settings)
+    refused(next(iter(settings)), Speeds, **settings)

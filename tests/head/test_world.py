@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from semfov.errors import InputError
 from semfov.head import Flat, Panorama
 from semfov.head.views import Views
 from semfov.sensor import glimpse, perspective
+from tests.refusals import refused
 
 
 @pytest.fixture(params=["panorama", "flat"])
@@ -132,9 +132,6 @@ def test_durations_equal_brute_force(world):
 
 def test_windows_beyond_a_picture_are_refused():
     flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
-    with pytest.raises(InputError, match="pose: expected a window inside 64 × 48 pixels"):
-        flat.look_at((-16.0, 0.0), 20.0)
-    with pytest.raises(InputError, match="field: expected a window inside the picture"):
-        flat.poses(60.0)
-    with pytest.raises(InputError, match="fields: expected"):
-        Views(flat, (30.0, 20.0))
+    refused("pose: expected a window inside 64 × 48 pixels", flat.look_at, (-16.0, 0.0), 20.0)
+    refused("field: expected a window inside the picture", flat.poses, 60.0)
+    refused("fields: expected", Views, flat, (30.0, 20.0))

@@ -8,8 +8,8 @@ import torch
 from scipy.stats import bootstrap, norm
 
 from eval.bootstrap import Bootstrap
-from semfov.errors import InputError
 from semfov.metrics.presence import area_under_roc
+from tests.refusals import refused
 
 GROUPS = ["a", "b", "a", "c", "b", "b"]
 CASES = torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0, 32.0], dtype=torch.float64)
@@ -86,5 +86,4 @@ def test_the_seed_decides_the_samples_of_given_cases():
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
     for groups, samples, told in [([], 10, "groups"), ([1], 1, "samples")]:
-        with pytest.raises(InputError, match=f"{told}: expected"):
-            Bootstrap.of(mean_of(CASES), groups, samples=samples)
+        refused(f"{told}: expected", Bootstrap.of, mean_of(CASES), groups, samples=samples)

@@ -8,8 +8,8 @@ import torch
 from eval.comparison.settings import SaliencyConfig
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.run import SearchConfig, SearchRun
-from semfov.errors import InputError
 from semfov.runs.config import DataConfig, PolicyConfig, ProtocolConfig
+from tests.refusals import refused
 from tests.small import run_settings
 
 pytestmark = pytest.mark.weights
@@ -32,8 +32,7 @@ def test_policies_of_a_run_are_named_by_their_labels(config):
     }
     assert list(run.strategies) == list(run.policies)
     assert run.candidate("target-evidence", 0).strategy is run.strategies["target-evidence"]
-    with pytest.raises(InputError, match="did you mean 'random'"):
-        run.candidate("randm", 0)
+    refused("did you mean 'random'", run.candidate, "randm", 0)
 
 
 def test_a_run_has_one_store_for_each_saliency_model(config):

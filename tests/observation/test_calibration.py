@@ -6,8 +6,8 @@ import scipy.optimize
 import torch
 from torch.nn import functional as F
 
-from semfov.errors import InputError
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet, fit_discriminative
+from tests.refusals import refused
 
 CLASSES = ["cup", "cat", "dog", "bus"]
 EDGES = [0.1, 0.2]
@@ -131,5 +131,4 @@ def test_levels_without_examples_follow_the_others():
 )
 def test_bad_arguments_are_named(change, named):
     good = {"scores": torch.ones(10, 5) / 5, "distance": torch.zeros(10), "labels": torch.zeros(10, dtype=torch.int64)}
-    with pytest.raises(InputError, match=named):
-        fit_discriminative(FovealObservationModel.identity(CLASSES, EDGES), **{**good, **change})
+    refused(named, fit_discriminative, FovealObservationModel.identity(CLASSES, EDGES), **{**good, **change})

@@ -1,10 +1,9 @@
 """Miss counts against a loop over cells, and rates against their formula."""
 
-import pytest
 import torch
 
-from semfov.errors import InputError
 from semfov.observation import FovealObservationModel, MissCounts
+from tests.refusals import refused
 
 
 def draw_looks(looks, seed=0):
@@ -53,7 +52,5 @@ def test_the_likelihood_of_a_miss_is_the_rate_at_its_level():
     model = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_rate=rates)
     distance = torch.tensor([[0.1, 0.3]])
     torch.testing.assert_close(model.miss_likelihood(distance), rates.t()[None])
-    with pytest.raises(InputError, match="miss_rate"):
-        FovealObservationModel.identity(["cup"], [0.2]).miss_likelihood(distance)
-    with pytest.raises(InputError, match="miss_rate"):
-        FovealObservationModel.identity(["cup"], [0.2], miss_rate=rates)
+    refused("miss_rate", FovealObservationModel.identity(["cup"], [0.2]).miss_likelihood, distance)
+    refused("miss_rate", FovealObservationModel.identity, ["cup"], [0.2], miss_rate=rates)

@@ -6,12 +6,13 @@ import pytest
 import torch
 import yaml
 
-from semfov import InputError, Selection
+from semfov import Selection
 from semfov.fit.tempering import FitTemperingConfig
 from semfov.runs import config as settings
 from semfov.runs.command import run_command
 from semfov.runs.settings import Range, check_settings
 from tests import small
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -25,8 +26,7 @@ IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
 @pytest.mark.parametrize("image", [IMAGE * 255, IMAGE - 0.5, IMAGE.masked_fill(IMAGE > 0.99, torch.nan)])
 def test_invalid_images_are_refused_by_the_detector_and_the_eye(agent, image):
     for look in (lambda: agent.eye.detector(image[None]), lambda: agent.eye.open(image[None])):
-        with pytest.raises(InputError, match=r"^images: expected RGB in \[0, 1\]"):
-            look()
+        refused(r"^images: expected RGB in \[0, 1\]", look)
 
 
 def test_rounding_errors_just_above_one_are_accepted(agent):
@@ -35,11 +35,9 @@ def test_rounding_errors_just_above_one_are_accepted(agent):
 
 def test_invalid_selections_and_strides_are_refused():
     for wrong in [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}]:
-        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
-            Selection(**wrong)
+        refused(f"^{next(iter(wrong))}: expected a (whole )?number from 0 to ", Selection, **wrong)
     for stride in ["auto", 0, -32, 1.5, True]:
-        with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
-            small.Fixed(stride=stride)
+        refused(r"^stride: expected a whole number from 1", small.Fixed, stride=stride)
 
 
 def test_unused_settings_are_no_options_and_are_not_written(capsys):
@@ -76,10 +74,8 @@ def test_settings_out_of_their_range_are_refused_by_name(config, name, base, all
     wrong.append(allowed.above if allowed.above > -1e300 else allowed.low - 1)
     wrong += [1.5] if base is int else []
     for value in wrong:
-        with pytest.raises(InputError, match=f"^{name}: expected a (whole )?number "):
-            config(**required, **{name: value})
-        with pytest.raises(InputError, match=f"^before.{name}: expected "):
-            check_settings(config, {name: value}, "before.")
+        refused(f"^{name}: expected a (whole )?number ", config, **required, **{name: value})
+        refused(f"^before.{name}: expected ", check_settings, config, {name: value}, "before.")
     config(**required, **{name: base(allowed.high)})
 
 

@@ -30,6 +30,7 @@ from semfov.runs.policy_looking import (
 )
 from semfov.runs.presets import _valid_policies, presets, resolve
 from semfov.strategy import Strategy
+from tests.refusals import refused
 
 GRID = Grid(4, 3, (40, 30))
 FOVEA = 100 / 640
@@ -133,8 +134,7 @@ def test_presets_need_their_observation_model_and_runs_a_policy(model):
         for preset in presets(task).values():
             assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
             if _needs_observation([preset], BeliefConfig()):
-                with pytest.raises(InputError, match="observation model"):
-                    strategy(preset, task, **others)
+                refused("observation model", strategy, preset, task, **others)
             else:
                 strategy(preset, task, **others)
     for config in [SearchConfig, ExploreConfig]:
@@ -152,10 +152,8 @@ def test_strategies_follow_their_settings(model):
     assert explorer.observer.observation is model
     assert explorer.observer.misses is model
     assert isinstance(explorer.policy(None, GRID), ExpectedAccuracy)
-    with pytest.raises(InputError, match="misses"):
-        strategy("random", belief=BeliefConfig(misses=True))
-    with pytest.raises(InputError, match="scores"):
-        strategy("non-predictive-calibrated")
+    refused("misses", strategy, "random", belief=BeliefConfig(misses=True))
+    refused("scores", strategy, "non-predictive-calibrated")
 
 
 def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
@@ -181,8 +179,7 @@ def test_target_evidence_brings_its_own_belief():
     assert isinstance(sought.observer, observers.Target)
     assert sought.observer.model is evidence
     assert sought.policy.name == "non-predictive"
-    with pytest.raises(InputError, match="learned"):
-        strategy("target-evidence")
+    refused("learned", strategy, "target-evidence")
 
 
 def test_saliency_alone_keeps_the_belief_of_the_run(model):
@@ -223,5 +220,4 @@ def test_policies_that_need_a_target_position_work_with_learned_evidence(model, 
     belief = made.observer.start(2, GRID, torch.zeros(()))
     visited = torch.zeros(2, 12, dtype=torch.bool)
     assert made.policy(torch.tensor([1, 2]), GRID)(belief, visited).shape == (2, 12)
-    with pytest.raises(InputError, match="learned target evidence"):
-        strategy(PolicyConfig(name, "learned"), observation=model)
+    refused("learned target evidence", strategy, PolicyConfig(name, "learned"), observation=model)

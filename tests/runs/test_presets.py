@@ -14,6 +14,7 @@ from semfov.gaze.policies import policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import _WORDS, _valid_policies, label, presets, resolve
+from tests.refusals import refused
 
 TASKS = get_args(Task)
 ALIASES = {
@@ -104,8 +105,7 @@ def test_unknown_names_and_settings_are_refused_with_a_suggestion():
         (PolicyConfig("kl", "calibratd"), "exploration", "calibrated"),
     ]:
         for call in (resolve, label):
-            with pytest.raises(InputError, match=f"did you mean '{suggested}'"):
-                call(choice, task)
+            refused(f"did you mean '{suggested}'", call, choice, task)
     for task, settings, told in [
         ("search", {"policy": "kl"}, "policy"),
         ("exploration", {"policy": "target-evidence"}, "policy"),

@@ -5,10 +5,11 @@ import json
 import pytest
 from PIL import Image
 
-from semfov import ActivePerception, CocoScenes, DataError, InputError
+from semfov import ActivePerception, CocoScenes, DataError
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye, make_observation, make_scenes, observation_name
+from tests.refusals import refused, unusable
 
 
 @pytest.mark.parametrize(
@@ -58,8 +59,7 @@ def test_a_sensor_that_is_not_published_has_a_model_of_our_own(settings, name):
 
 
 def test_an_unknown_sensor_gets_a_suggestion(capsys):
-    with pytest.raises(InputError, match="did you mean 'published"):
-        SensorConfig(name="publishd").make()
+    refused("did you mean 'published", SensorConfig(name="publishd").make)
     with pytest.raises(SystemExit):
         run_command(print, SensorConfig, "Sensors.", ["--name", "publishd"])
     assert "published-narrow" in capsys.readouterr().err
@@ -105,8 +105,7 @@ def test_ids_are_read_from_a_file(photographs):
     data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed, min_instances=1)
     assert make_scenes(data, ("cup",)).ids == [14, 92]
     listed.write_text("92\n65\n")
-    with pytest.raises(DataError, match="each of 2 ids, got none for 1 of them: 65"):
-        make_scenes(data, ("cup",))
+    unusable("each of 2 ids, got none for 1 of them: 65", make_scenes, data, ("cup",))
 
 
 def test_ids_that_are_missing_or_cannot_be_read_are_named(photographs):
@@ -119,5 +118,4 @@ def test_ids_that_are_missing_or_cannot_be_read_are_named(photographs):
         if content is not None:
             listed.write_bytes(content)
         data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed)
-        with pytest.raises(DataError, match=r"ids\.txt: expected a text file with one id per line"):
-            make_scenes(data, ("cup",))
+        unusable(r"ids\.txt: expected a text file with one id per line", make_scenes, data, ("cup",))

@@ -9,8 +9,8 @@ from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
 from torch.utils.data import DataLoader
 
 import semfov.sensor
-from semfov.errors import InputError
 from semfov.sensor import RandomFoveation, foveate
+from tests.refusals import refused
 from tests.small import draw
 
 
@@ -125,7 +125,6 @@ def test_bad_settings_and_names():
         ({"p": 1.5}, "p: expected a probability"),
         ({"convention": "korina"}, "did you mean 'kornia'"),
     ]:
-        with pytest.raises(InputError, match=message):
-            RandomFoveation(**{"sigma": 3.0} | settings)
+        refused(message, RandomFoveation, **{"sigma": 3.0} | settings)
     with pytest.raises(AttributeError, match="RandomFixation"):
         _ = semfov.sensor.RandomFixation

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from semfov.errors import InputError
 from semfov.sensor import Foveation, foveate, laplacian_pyramid
+from tests.refusals import refused
 from tests.small import close, draw, rand
 
 CONVENTIONS = ("kornia", "opencv")
@@ -192,8 +192,7 @@ def test_module_equals_the_function():
     close(sensor(image, gaze), expected, 1e-6)
     assert sensor.extra_repr() == "sigma=6, levels=3, growth=1, convention='opencv'"
     for setting in ({"sigma": 0.0}, {"growth": 0.0}, {"levels": -1}, {"convention": "korina"}):
-        with pytest.raises(InputError, match=next(iter(setting))):
-            Foveation(**{"sigma": 3.0} | setting)
+        refused(next(iter(setting)), Foveation, **{"sigma": 3.0} | setting)
 
 
 IMAGE = torch.rand(2, 3, 8, 8)
@@ -219,8 +218,7 @@ GAZE = torch.tensor([4.0, 4.0])
 )
 def test_bad_input(arguments, message):
     arguments = {"image": IMAGE, "gaze": GAZE, "sigma": 3.0} | arguments
-    with pytest.raises(InputError, match=message.replace("(", r"\(")):
-        foveate(**arguments)
+    refused(message.replace("(", r"\("), foveate, **arguments)
 
 
 @pytest.mark.parametrize("name", ["sigma", "growth"])
@@ -245,7 +243,5 @@ def test_settings_of_another_module_stay_in_the_graph(name, kind):
 
 def test_a_plain_tensor_is_a_number():
     assert float(Foveation(torch.tensor(6.0)).sigma.detach()) == pytest.approx(6.0)
-    with pytest.raises(InputError, match=r"sigma: expected a number, got shape \(2,\)"):
-        Foveation(torch.tensor([6.0, 7.0]))
-    with pytest.raises(InputError, match="learnable: expected False"):
-        Foveation(torch.nn.Parameter(torch.tensor(6.0)), learnable=True)
+    refused(r"sigma: expected a number, got shape \(2,\)", Foveation, torch.tensor([6.0, 7.0]))
+    refused("learnable: expected False", Foveation, torch.nn.Parameter(torch.tensor(6.0)), learnable=True)

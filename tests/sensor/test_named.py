@@ -18,6 +18,7 @@ from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.sensor import SENSORS, LogPolar, Sensor, named_sensor, sensor_of
 from semfov.sensor.named import NamedSensor, SensorName
 from tests.colours import write_home
+from tests.refusals import refused
 from tests.small import once, run_settings
 from train.fit_fom import main as fit_fom
 
@@ -67,10 +68,8 @@ def test_settings_of_a_sensor_are_given_by_their_names(capsys):
     for given, name in (({"sigma": 50.0}, "sigma"), ({"levels": 3}, "levels"), ({"settings": {"width": 1.0}}, "width")):
         with pytest.raises(InputError, match=rf"settings of a LogPolar \(fovea, spacing, pooling\), got {name}"):
             SensorConfig("log-polar", **given).make()
-    with pytest.raises(InputError, match="fovea: expected a positive number"):
-        SensorConfig("log-polar", settings={"fovea": -1.0}).make()
-    with pytest.raises(InputError, match=r"sensor.fovea: expected a setting of a LogPolar, got none"):
-        LogPolar.from_settings({})
+    refused("fovea: expected a positive number", SensorConfig("log-polar", settings={"fovea": -1.0}).make)
+    refused(r"sensor.fovea: expected a setting of a LogPolar, got none", LogPolar.from_settings, {})
 
 
 def test_a_further_sensor_needs_one_registration(monkeypatch):
@@ -79,8 +78,7 @@ def test_a_further_sensor_needs_one_registration(monkeypatch):
     assert sensor_of(config.make().settings()).share == 0.25
     assert Dimmed.describe(config.make().settings()) == "share 0.25"
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"the settings of a Foveation or a .*, got \{'kind': 'dimmed'"):
-        sensor_of({"kind": "dimmed", "share": 0.5})
+    refused(r"the settings of a Foveation or a .*, got \{'kind': 'dimmed'", sensor_of, {"kind": "dimmed", "share": 0.5})
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.errors import InputError
 from semfov.sensor import foveate, laplacian_pyramid, pyramid, pyrdown, pyrup
+from tests.refusals import refused
 from tests.small import draw
 
 CONVENTIONS = ("kornia", "opencv")
@@ -155,22 +155,13 @@ def test_images_in_any_memory_layout(convention):
 
 
 def test_bad_input():
-    with pytest.raises(InputError, match="image"):
-        pyrdown(torch.rand(4, 4))
-    with pytest.raises(InputError, match="image"):
-        pyrup(torch.rand(3, 4, 4), (8, 8))
+    refused("image", pyrdown, torch.rand(4, 4))
+    refused("image", pyrup, torch.rand(3, 4, 4), (8, 8))
     for call in (pyrdown, lambda image: pyrup(image, (8, 8)), lambda image: laplacian_pyramid(image, 1)):
-        with pytest.raises(InputError, match="image: expected floating-point numbers, got"):
-            call(torch.zeros(1, 3, 4, 4, dtype=torch.uint8))
-    with pytest.raises(InputError, match="convention 'openvc'; did you mean 'opencv'"):
-        pyrdown(torch.rand(1, 1, 4, 4), "openvc")
-    with pytest.raises(InputError, match="convention"):
-        pyrup(torch.rand(1, 1, 4, 4), (8, 8), "openvc")
-    with pytest.raises(InputError, match="shape: expected 8 or 7 for 4 pixels, got 9"):
-        pyrup(torch.rand(1, 1, 4, 4), (8, 9), "opencv")
-    with pytest.raises(InputError, match="levels"):
-        laplacian_pyramid(torch.rand(1, 1, 4, 4), -1)
-    with pytest.raises(InputError, match="at least one pixel"):
-        laplacian_pyramid(torch.rand(1, 1, 0, 4), 1)
-    with pytest.raises(InputError, match="image"):
-        laplacian_pyramid(torch.rand(4, 4), 1)
+        refused("image: expected floating-point numbers, got", call, torch.zeros(1, 3, 4, 4, dtype=torch.uint8))
+    refused("convention 'openvc'; did you mean 'opencv'", pyrdown, torch.rand(1, 1, 4, 4), "openvc")
+    refused("convention", pyrup, torch.rand(1, 1, 4, 4), (8, 8), "openvc")
+    refused("shape: expected 8 or 7 for 4 pixels, got 9", pyrup, torch.rand(1, 1, 4, 4), (8, 9), "opencv")
+    refused("levels", laplacian_pyramid, torch.rand(1, 1, 4, 4), -1)
+    refused("at least one pixel", laplacian_pyramid, torch.rand(1, 1, 0, 4), 1)
+    refused("image", laplacian_pyramid, torch.rand(4, 4), 1)

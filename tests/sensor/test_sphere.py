@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semfov.errors import InputError
 from semfov.head.sphere import _angle_between
 from semfov.sensor.sphere import Camera, Regions, panorama_directions, panorama_points
+from tests.refusals import refused
 
 yaws = st.floats(-720, 720)
 pitches = st.floats(-90, 90)
@@ -114,5 +114,4 @@ def test_what_a_camera_does_not_see():
     points, inside = camera(0, 0, 60).points(torch.tensor([[0.0, 0, -1], [1, 0, 0]], dtype=torch.float64))
     assert not inside.any()
     assert points.isinf().all()
-    with pytest.raises(InputError, match="field: expected degrees between 0 and 180"):
-        camera(0, 0, 180)
+    refused("field: expected degrees between 0 and 180", camera, 0, 0, 180)

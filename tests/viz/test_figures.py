@@ -10,7 +10,7 @@ import torch
 from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import Axes3D
 
-from semfov import Detections, Grid, InputError, Scanpath
+from semfov import Detections, Grid, Scanpath
 from semfov.decision import Decision
 from semfov.viz import (
     COLOURS,
@@ -23,6 +23,7 @@ from semfov.viz import (
     plot_reliability,
     plot_scanpath,
 )
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -111,10 +112,8 @@ def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
     np.testing.assert_allclose(drawn, image.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
     assert len(draw(plot_belief(kept)).axes[0].images) == 2
     assert len(draw(plot_foveated_strip(kept)).axes) == 3
-    with pytest.raises(InputError, match="image: expected the photograph"):
-        plot_scanpath(scanpath)
-    with pytest.raises(InputError, match="stimulus"):
-        plot_foveated_strip(scanpath)
+    refused("image: expected the photograph", plot_scanpath, scanpath)
+    refused("stimulus", plot_foveated_strip, scanpath)
 
 
 def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
@@ -137,11 +136,9 @@ def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
 
 def test_belief_refuses_unknown_fixations_and_targets(scanpath):
     for arguments, named in [((3,), "fixation"), ((-4,), "fixation")]:
-        with pytest.raises(InputError, match=named):
-            plot_belief(scanpath, *arguments)
+        refused(named, plot_belief, scanpath, *arguments)
     for path, target in ((scanpath, 3), (replace(scanpath, target=None), None)):
-        with pytest.raises(InputError, match="target"):
-            plot_belief(path, target=target)
+        refused("target", plot_belief, path, target=target)
 
 
 def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
@@ -245,8 +242,7 @@ def test_episode_has_one_scale_and_a_limited_number_of_panels(scanpath, image):
     assert len(figure.axes) == 1 + 2 * 2 + 1  # the last is the scale
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title().startswith("p(cup)")]
     assert {image.get_clim() for image in maps} == {(0, 1)}
-    with pytest.raises(InputError, match="views"):
-        plot_episode(scanpath, image, [image])
+    refused("views", plot_episode, scanpath, image, [image])
 
 
 def test_reliability_of_a_calibrated_model_lies_on_the_diagonal():

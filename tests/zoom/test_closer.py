@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov import DataError, Detections, InputError, WindowEye, ZoomAgent
+from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
@@ -15,6 +15,7 @@ from semfov.io.storage import read, write_file
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
 from semfov.zoom.glances import Glance, Glances, on_lattice
+from tests.refusals import refused, unusable
 from tests.zoom.conftest import Squares
 
 AT = Thresholds(confirm=0.6, give_up=0.01, place=0.2)
@@ -227,8 +228,7 @@ def test_the_limits_of_a_search_hold(detector, picture):
     for passes in (1, 2, 3):
         path = agent.search(picture, "red", passes=passes, confirm=1.0, give_up=0.0)
         assert path.passes <= passes
-    with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
-        agent.search(picture, "red", closer=-1)
+    refused("closer: expected a whole number from 0 to 100", agent.search, picture, "red", closer=-1)
 
 
 def test_evidence_without_verification_decides_as_before(detector, picture):
@@ -261,5 +261,4 @@ def test_the_verification_is_saved_with_the_evidence(tmp_path):
     assert GlimpseEvidence.from_pretrained(tmp_path / "old.safetensors").verification is None
     for parts in ((old, record), (tensors, json.loads(json.dumps(record)) | {"verification": None})):
         write_file(tmp_path / "half.safetensors", *parts)
-        with pytest.raises(DataError, match="not a complete model of evidence"):
-            GlimpseEvidence.from_pretrained(tmp_path / "half.safetensors")
+        unusable("not a complete model of evidence", GlimpseEvidence.from_pretrained, tmp_path / "half.safetensors")

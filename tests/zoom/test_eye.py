@@ -8,6 +8,7 @@ from PIL import Image
 from semfov import InputError, WindowEye
 from semfov.sensor.glimpse import glimpse, windows_at
 from semfov.zoom.eye import BORDER
+from tests.refusals import refused
 
 
 def test_canvas_is_the_antialiased_glimpse_inside_its_border(detector):
@@ -137,14 +138,10 @@ def test_cut_boxes_are_those_that_reach_the_border_of_the_canvas_inside_the_pict
 
 def test_settings_include_the_treatment_of_cut_boxes(detector):
     assert WindowEye(detector).settings() != WindowEye(detector, cut="drop").settings()
-    with pytest.raises(InputError, match="unknown treatment of cut boxes"):
-        WindowEye(detector, cut="hide")
-    with pytest.raises(InputError, match="finest: expected a positive"):
-        WindowEye(detector, finest=0)
+    refused("unknown treatment of cut boxes", WindowEye, detector, cut="hide")
+    refused("finest: expected a positive", WindowEye, detector, finest=0)
     eye = WindowEye(detector)
-    with pytest.raises(InputError, match="fixations: expected"):
-        eye.look(eye.open(torch.zeros(3, 64, 64)), torch.zeros(1, 4))
-    with pytest.raises(InputError, match="fixations: expected finite"):
-        eye.look(eye.open(torch.zeros(3, 64, 64)), torch.full((1, 3), torch.nan))
+    refused("fixations: expected", eye.look, eye.open(torch.zeros(3, 64, 64)), torch.zeros(1, 4))
+    refused("fixations: expected finite", eye.look, eye.open(torch.zeros(3, 64, 64)), torch.full((1, 3), torch.nan))
     with pytest.raises(InputError, match="fixations: expected positive magnifications"):
         eye.look(eye.open(torch.zeros(3, 64, 64)), torch.tensor([[3.0, 4.0, -1.0]]))

@@ -9,6 +9,7 @@ from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgen
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.objects import without_replaced
+from tests.refusals import refused
 from tests.zoom.test_closer import Fickle, evidence
 
 
@@ -172,22 +173,15 @@ def test_the_first_frame_decides_how_a_stream_is_looked_at(raw, picture):
 
 
 def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
-    with pytest.raises(InputError, match=r"how: expected 'fovea', 'windows' or 'auto' for a stream; .* got head"):
-        raw.live("red", how="head")
-    with pytest.raises(InputError, match=r"target: expected one class, or None; .* how='windows'"):
-        raw.live(["red", "blue"], how="fovea")
-    with pytest.raises(InputError, match=r"start: expected None for frames that are looked at by windows"):
-        raw.live("red", how="windows", start=3)
+    refused(r"how: expected 'fovea', 'windows' or 'auto' for a stream; .* got head", raw.live, "red", how="head")
+    refused(r"target: expected one class, or None; .* how='windows'", raw.live, ["red", "blue"], how="fovea")
+    refused(r"start: expected None for frames that are looked at by windows", raw.live, "red", how="windows", start=3)
     live = raw.live("red", start=3)
-    with pytest.raises(InputError, match="start: expected None"):
-        live.step(picture)
+    refused("start: expected None", live.step, picture)
     running = raw.live(how="windows")
     running.step(picture)
     with pytest.raises(
         InputError, match=r"frame: expected 1024 × 768 pixels, the size of the first frame, got 1024 × 700"
     ):
         running.step(picture[:, :700])
-    with pytest.raises(
-        InputError, match=r"frame: expected a picture, got None \(OpenCV gives None after the last frame"
-    ):
-        running.step(None)
+    refused(r"frame: expected a picture, got None \(OpenCV gives None after the last frame", running.step, None)

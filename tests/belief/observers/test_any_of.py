@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from semfov import Grid, InputError, TargetEvidence
+from semfov import Grid, TargetEvidence
 from semfov.belief.observers import AnyOf, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.strategy import _weights_by_class
+from tests.refusals import refused
 
 GRID = Grid(5, 4, (100, 60))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
@@ -85,8 +86,7 @@ def test_a_look_is_weighed_once_for_each_class_or_once_for_all(inner, looks):
 
 def test_bad_input(inner):
     for weights in ({}, {1: 0.0}, {1: 1.5}, {1: -0.1, 2: 1.0}):
-        with pytest.raises(InputError, match="weights"):
-            AnyOf(inner, weights)
+        refused("weights", AnyOf, inner, weights)
     classes = ("cup", "wine glass")
     assert _weights_by_class({"Cups": 1, 2: 0.5}, classes) == {1: 1, 2: 0.5}
     for target, message in (
@@ -95,5 +95,4 @@ def test_bad_input(inner):
         ({"cat": 1}, "unknown class"),
         ({99: 1.0}, "^target:"),
     ):
-        with pytest.raises(InputError, match=message):
-            _weights_by_class(target, classes)
+        refused(message, _weights_by_class, target, classes)

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from semfov import Detections, FovealObservationModel, Grid, InputError
+from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import fusion, likelihoods
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.semantic import SemanticLook
+from tests.refusals import refused
 
 GRID = Grid(5, 4, (100, 80))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
@@ -102,12 +103,9 @@ def test_models_are_submodules_of_the_observer():
 
 def test_invalid_settings_are_refused(looks):
     for options in [{"memory": "best"}, {"fusion": "max"}, {"prior": 0}]:
-        with pytest.raises(InputError):
-            Semantic(3, **options)
-    with pytest.raises(InputError, match="tempering"):
-        likelihoods(looks, FIXATIONS, GRID, tempering=0)
-    with pytest.raises(InputError, match="tempering"):
-        Semantic(4, tempering=0).weigh(looks, FIXATIONS, GRID)
+        refused(".", Semantic, 3, **options)
+    refused("tempering", likelihoods, looks, FIXATIONS, GRID, tempering=0)
+    refused("tempering", Semantic(4, tempering=0).weigh, looks, FIXATIONS, GRID)
 
 
 @pytest.mark.parametrize("footprint", ["overlap", "soft"])

@@ -5,6 +5,7 @@ import pytest
 
 from semfov.data.fixations import read_export
 from semfov.errors import DataError
+from tests.refusals import unusable
 
 SIZE = (1920, 1080)
 TOBII = "\t".join(
@@ -146,13 +147,10 @@ def test_fixations_of_both_eyes_are_those_of_one(tmp_path, names):
 def test_what_is_missing_is_named(tmp_path):
     text, _, _ = FILES["Pupil Cloud"]
     (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(DataError, match="Pupil Cloud does not give; give picture="):
-        read_export(tmp_path / "a.csv", size=(1600, 1200))
-    with pytest.raises(DataError, match="Pupil Cloud does not give; give size="):
-        read_export(tmp_path / "a.csv", picture="scene.mp4")
+    unusable("Pupil Cloud does not give; give picture=", read_export, tmp_path / "a.csv", size=(1600, 1200))
+    unusable("Pupil Cloud does not give; give size=", read_export, tmp_path / "a.csv", picture="scene.mp4")
     (tmp_path / "b.csv").write_text("picture,x,y\na.jpg,1,2\n")
-    with pytest.raises(DataError, match="expected the columns of a table of Tobii Pro Lab"):
-        read_export(tmp_path / "b.csv")
+    unusable("expected the columns of a table of Tobii Pro Lab", read_export, tmp_path / "b.csv")
     (tmp_path / "c.csv").write_text(f"{CLOUD},fixation x [px],fixation y [px]\ns1,r1,1,10,20,250,,\n")
     with pytest.raises(DataError, match="expected fixations of Pupil Cloud, got none"):
         read_export(tmp_path / "c.csv", size=(1600, 1200), picture="scene.mp4")

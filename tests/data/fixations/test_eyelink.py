@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from semfov.data.fixations import read_eyelink
-from semfov.errors import DataError, InputError
+from tests.refusals import refused, unusable
 
 HEAD = """** CONVERTED FROM D:\\data\\ann.edf using edfapi 4.2.1
 ** DATE: Wed Nov 25 10:00:00 2026
@@ -62,16 +62,13 @@ def test_points_are_counted_from_the_first_corner_of_the_frame(tmp_path):
 )
 def test_what_is_no_recording_is_refused(tmp_path, content, said):
     (tmp_path / "a.asc").write_text(content)
-    with pytest.raises(DataError, match=said):
-        read_eyelink(tmp_path / "a.asc")
+    unusable(said, read_eyelink, tmp_path / "a.asc")
 
 
 def test_other_arguments_are_refused(tmp_path):
     (tmp_path / "a.asc").write_text(HEAD + "MSG\t1 TRIALID 1\nEFIX L 1 2 1 5 5 5\n")
-    with pytest.raises(DataError, match="expected fixations of the right eye"):
-        read_eyelink(tmp_path / "a.asc", eye="right")
-    with pytest.raises(InputError, match="eye: expected 'left', 'right' or None"):
-        read_eyelink(tmp_path / "a.asc", eye="both")
+    unusable("expected fixations of the right eye", read_eyelink, tmp_path / "a.asc", eye="right")
+    refused("eye: expected 'left', 'right' or None", read_eyelink, tmp_path / "a.asc", eye="both")
 
 
 def test_names_of_pictures_may_be_in_the_encoding_of_windows(tmp_path):

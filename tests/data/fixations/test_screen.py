@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data.fixations import Fixations, Letterbox, coco_name, read_ruarte
-from semfov.errors import InputError
+from tests.refusals import refused
 
 sides = st.integers(1, 3000)
 
@@ -35,8 +35,7 @@ def test_letterbox_and_resizing_equal_values_computed_by_hand():
     larger = Fixations("a.jpg", "1", [[0.0, 23.0]], (32, 24), box=(0, 0, 32, 24)).resized((1680, 1050))
     assert larger.box == (0, 0, 1680, 1050)
     np.testing.assert_allclose(larger.points, [[25.75, 1027.625]])
-    with pytest.raises(InputError, match=r"^picture:"):
-        Letterbox((1680, 1050), (0, 5))
+    refused(r"^picture:", Letterbox, (1680, 1050), (0, 5))
 
 
 @pytest.mark.shared

@@ -10,7 +10,7 @@ from PIL import Image
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
 from semfov.data.fixations.reading import PictureSizes
-from semfov.errors import DataError
+from tests.refusals import unusable
 
 SIZE = (800, 600)
 
@@ -198,5 +198,4 @@ def test_a_file_tells_its_reader(tmp_path):
         ('{"a": [', "as JSON.*it was read as a file of OSIE"),
     ):
         (tmp_path / "e.json").write_text(text)
-        with pytest.raises(DataError, match=said):
-            read_fixations(tmp_path / "e.json")
+        unusable(said, read_fixations, tmp_path / "e.json")

@@ -6,8 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import Grid, InputError
+from semfov import Grid
 from semfov.gaze.saliency import cell_saliency
+from tests.refusals import refused
 
 
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(1, 8), st.integers(1, 8))
@@ -42,8 +43,7 @@ def test_gradients_and_compilation() -> None:
     ],
 )
 def test_bad_input(shape: tuple[int, ...], columns: int, rows: int, reduction: str, named: str) -> None:
-    with pytest.raises(InputError, match=named):
-        cell_saliency(torch.zeros(shape), columns, rows, reduction)
+    refused(named, cell_saliency, torch.zeros(shape), columns, rows, reduction)
 
 
 def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():
@@ -52,5 +52,4 @@ def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():
     expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
     for reduction in ("mean", "max"):
         assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
-    with pytest.raises(InputError, match="saliency"):
-        cell_saliency(torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)
+    refused("saliency", cell_saliency, torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)

@@ -1,12 +1,11 @@
 """What a fovea has shown so far, against a loop over pixels."""
 
 import numpy as np
-import pytest
 import torch
 
-from semfov import InputError
 from semfov.detection import Detections, FeatureMaps, Placement
 from semfov.gaze.saliency import features_so_far
+from tests.refusals import refused
 from tests.small import draw as rand
 
 PLACE = Placement((80, 60), (0.5, 0.5), (2.0, 4.0))
@@ -43,7 +42,5 @@ def test_a_shorter_path_is_as_if_alone():
     for name in seen.maps:
         assert torch.equal(both.maps[name][1], alone.maps[name][0])
         assert torch.equal(both.maps[name][1], seen.maps[name][1])
-    with pytest.raises(InputError, match="scanpath"):
-        features_so_far(seen, fixations, torch.full((1, 2, 2), torch.nan))
-    with pytest.raises(InputError, match="fixations"):
-        features_so_far(seen, fixations[:3], short)
+    refused("scanpath", features_so_far, seen, fixations, torch.full((1, 2, 2), torch.nan))
+    refused("fixations", features_so_far, seen, fixations[:3], short)

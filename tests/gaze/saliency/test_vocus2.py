@@ -8,9 +8,9 @@ import pytest
 import torch
 from skimage import color
 
-from semfov.errors import InputError
 from semfov.gaze.saliency import VOCUS2, vocus2_saliency
 from semfov.gaze.saliency.vocus2 import _twin_pyramids
+from tests.refusals import refused
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
@@ -123,14 +123,10 @@ def test_compilation() -> None:
     ],
 )
 def test_bad_settings(settings: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion|color space"):
-        VOCUS2(**settings)
-    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion|color space"):
-        vocus2_saliency(torch.rand(1, 3, 8, 8), **settings)
+    refused(r"sigma|layers|scales|fusion|color space", VOCUS2, **settings)
+    refused(r"sigma|layers|scales|fusion|color space", vocus2_saliency, torch.rand(1, 3, 8, 8), **settings)
 
 
 def test_bad_image() -> None:
-    with pytest.raises(InputError, match="image"):
-        VOCUS2()(torch.zeros(2, 3, 8, 8, 8))
-    with pytest.raises(InputError, match="channels"):
-        _twin_pyramids(torch.zeros(1, 3, 0, 8))
+    refused("image", VOCUS2(), torch.zeros(2, 3, 8, 8, 8))
+    refused("channels", _twin_pyramids, torch.zeros(1, 3, 0, 8))

@@ -8,9 +8,10 @@ import torch
 from eval.ivsn import main as search
 from eval.ivsn.fit import _objects_of, _TemplateSums, main
 from eval.ivsn.templates import ClassTemplates
-from semfov import EmbeddedScenes, InputError, load_detector
+from semfov import EmbeddedScenes, load_detector
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _yolov3_tiny
+from tests.refusals import refused
 from tests.small import Fixed
 
 
@@ -28,8 +29,7 @@ def test_features_are_the_input_of_the_last_convolution():
     assert features.shape == (2, 512, 2, 3)
     # The first layers process one image at a time in a full pass, so rounding differs.
     torch.testing.assert_close(features, seen[0], rtol=1e-4, atol=1e-5)
-    with pytest.raises(InputError, match="image"):
-        network.features(torch.rand(1, 3, 30, 30))
+    refused("image", network.features, torch.rand(1, 3, 30, 30))
 
 
 def test_templates_from_sums_equal_means():
@@ -93,5 +93,4 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
 
 
 def test_a_detector_without_access_to_its_features_is_refused():
-    with pytest.raises(InputError, match=r"access to its features.*fixed"):
-        Fixed().head_input(torch.zeros(1, 3, 32, 32))
+    refused(r"access to its features.*fixed", Fixed().head_input, torch.zeros(1, 3, 32, 32))

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 from torchvision.models import vgg16
 
 from eval.ivsn.published import IVSN
-from semfov.errors import DataError, InputError
+from tests.refusals import refused, unusable
 
 
 @pytest.fixture(scope="module")
@@ -70,16 +70,12 @@ def test_weights_from_a_file(ivsn, tmp_path):
     save_file({"features.0.weight": torch.zeros(3)}, tmp_path / "part")
     (tmp_path / "damaged").write_bytes(b"\x00" * 9)
     for name in ("part", "damaged", "missing"):
-        with pytest.raises(DataError, match=name):
-            IVSN.vgg16(tmp_path / name)
+        unusable(name, IVSN.vgg16, tmp_path / name)
 
 
 def test_invalid_arguments_are_refused():
     identity = IVSN(nn.Identity(), nn.Identity(), picture=8, target=1)
     image, target = pictures()
-    with pytest.raises(InputError, match="image"):
-        identity(image[:, :2], target)
-    with pytest.raises(InputError, match="target"):
-        identity(image, target.expand(2, -1, -1, -1))
-    with pytest.raises(InputError, match="target's features"):
-        IVSN(nn.Identity(), nn.Identity(), picture=8, target=2)(image, target)
+    refused("image", identity, image[:, :2], target)
+    refused("target", identity, image, target.expand(2, -1, -1, -1))
+    refused("target's features", IVSN(nn.Identity(), nn.Identity(), picture=8, target=2), image, target)

@@ -10,6 +10,7 @@ from semfov import Grid, InputError
 from semfov.data.fixations import Fixations, Letterbox, write_table
 from semfov.metrics.scanpath import cell_labels, compare_scanpath, edit_distance, multimatch, sequence_score
 from tests import small
+from tests.refusals import refused
 
 SIZE = (800, 600)
 
@@ -58,8 +59,7 @@ def test_a_person_is_nearer_to_people_than_a_random_scanpath_in_any_size():
 
 def test_other_pictures_and_fixations_in_another_unit_are_told():
     mine, *others = people(3)
-    with pytest.raises(InputError, match=r"^people: expected fixations of at least one person"):
-        compare_scanpath(mine, [])
+    refused(r"^people: expected fixations of at least one person", compare_scanpath, mine, [])
     with pytest.raises(InputError, match=r"^people: expected fixations in one picture"):
         compare_scanpath(mine, [*others, Fixations("b.jpg", "1", mine.points, SIZE)])
     shifted = Fixations("a.jpg", "1", mine.points * 3, SIZE)
@@ -96,8 +96,7 @@ def test_what_cannot_be_compared_is_refused():
         ({"size": (1680, 1050)}, "people: expected frames with the proportions of 800 × 600"),
     ):
         theirs = [replace(each, target="fork") for each in others] if "target" in changes else others
-        with pytest.raises(InputError, match=said):
-            compare_scanpath(replace(mine, **changes), theirs)
+        refused(said, compare_scanpath, replace(mine, **changes), theirs)
         with pytest.raises(InputError, match="people: expected"):
             compare_scanpath(mine, [replace(others[0], **changes), replace(others[1], target="fork")])
     placed = replace(mine, points=Letterbox((1680, 1050), SIZE).to_screen(mine.points), size=(1680, 1050))

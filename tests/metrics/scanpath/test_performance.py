@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from semfov.errors import InputError
 from semfov.metrics.scanpath import (
     found_at,
     mean_performance,
@@ -16,6 +15,7 @@ from semfov.metrics.scanpath import (
     scanpath_ratio,
     tfp_auc,
 )
+from tests.refusals import refused
 
 searches = st.lists(st.tuples(st.integers(-1, 12), st.sampled_from("abc")), min_size=1, max_size=30)
 
@@ -94,8 +94,7 @@ def test_invalid_arguments_are_refused_by_name():
         (lambda: found_at([1, 2], (0, 0, 1, 1)), "points"),
         (lambda: found_at(np.zeros((0, 2)), (0, 0, 1, 1)), "points"),
     ]:
-        with pytest.raises(InputError, match=f"^{argument}:"):
-            call()
+        refused(f"^{argument}:", call)
     for call, named in [
         (lambda: found_at([[5, 5]], [8, 4, 4, 8]), "box: expected x1 <= x2 and y1 <= y2"),
         (lambda: found_at([[5, 5]], [4, 4, 8]), r"box: expected \(x1, y1, x2, y2\), got shape \(3,\)"),
@@ -103,5 +102,4 @@ def test_invalid_arguments_are_refused_by_name():
         (lambda: found_at([[float("nan"), 5]], [4, 4, 8, 8]), "points: expected finite numbers"),
         (lambda: scanpath_ratio([[0, 0], [5, 5]], [8, 8, 4, 4]), "box: expected x1 <= x2 and y1 <= y2"),
     ]:
-        with pytest.raises(InputError, match=named):
-            call()
+        refused(named, call)

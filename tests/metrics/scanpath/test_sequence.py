@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.cluster import MeanShift
 
-from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, cluster_labels, edit_distance, merge_close, sequence_score
 from semfov.metrics.scanpath.sequence import fitted_clusters
+from tests.refusals import refused
 
 sequences = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
 
@@ -69,13 +69,10 @@ def test_consecutive_fixations_closer_than_half_a_window_are_merged():
 
 
 def test_empty_sequences_and_points_outside_the_picture_are_refused_by_name():
-    with pytest.raises(InputError, match=r"^points: .*got 2 outside it"):
-        cell_labels([[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
+    refused(r"^points: .*got 2 outside it", cell_labels, [[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
     for figure in [sequence_score, edit_distance]:
-        with pytest.raises(InputError, match=r"^ours:"):
-            figure([], [1])
-        with pytest.raises(InputError, match=r"^theirs:"):
-            figure([1], [])
+        refused(r"^ours:", figure, [], [1])
+        refused(r"^theirs:", figure, [1], [])
 
 
 def test_labels_in_an_array_equal_labels_in_a_list():
