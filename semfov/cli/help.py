@@ -289,6 +289,8 @@ _COMMANDS = {
     "ActivePerception.raw": "--agent raw",
     " or semfov.fit_detector": "",
     "find_all": "`semfov find`",
+    "name them by columns={…}": "give them these names in its first line",
+    "use read_table with columns={…}": "name its columns picture, subject, x, y, width and height in its first line",
 }
 """What the command calls that messages name as Python does."""
 
@@ -302,6 +304,8 @@ def in_command_words(message: str, options: Iterable[str]) -> str:
     'give its path as --weights'
     >>> in_command_words("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"])
     '--recursive, or --detector.classes cat,dog'
+    >>> in_command_words("name them by columns={…} or give size=", ["size"])
+    'give them these names in its first line or give --size'
     """
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)

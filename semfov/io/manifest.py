@@ -11,7 +11,7 @@ from typing import Any, Self
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, inside, sha256, write_text
 from semfov.io.schema import CLASSES, Anything, Array, Flag, Maybe, Number, Object, Schema, Text
-from semfov.io.storage import checksum
+from semfov.io.storage import check_version, checksum
 from semfov.version import __version__
 
 FILE = "manifest.json"
@@ -104,6 +104,7 @@ class Manifest:
         recorded = record.pop("sha256", None)
         if recorded != checksum({}, record):
             raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
+        check_version(path, record)
         try:
             _SCHEMA.check({}, record)
         except InputError as error:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import Tensor
 from semfov.errors import DataError
 from semfov.io.files import check_regular, write_bytes
 from semfov.io.schema import Schema
+from semfov.version import __version__
 
 # A single key, because the order of several keys would differ from one write to the next.
 _KEY = "semfov"
@@ -55,7 +57,16 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")
     if recorded != checksum(tensors, record):
         raise DataError(f"{path}: damaged, its sha256 is not the one it was written with; fetch it again")
+    check_version(path, record)
     return tensors, record
+
+
+def check_version(path: str | PathLike[str], record: Mapping[str, Any]) -> None:
+    """Refuse a file of a later version; that of a correction (its third number) has the same form."""
+    written = str(record.get("version", ""))
+    theirs, ours = ([int(n) for n in re.findall(r"\d{1,9}", each)[:2]] for each in (written, __version__))
+    if theirs > ours:
+        raise DataError(f"{path}: written by semfov {written}, which is newer than this one, {__version__}; update it")
 
 
 def _refuse_constant(name: str) -> None:

@@ -442,6 +442,8 @@ def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path)
     }.items():
         write_file(other, tensors, {**values, name: changed})
         unusable(f"expected a complete {kind}", type(record).load, other)
+    write_file(other, tensors, {**values, "version": "99.0.1", "more": 1})
+    unusable(r"written by semfov 99\.0\.1, which is newer than this one", type(record).load, other)
     for name in tensors.keys() - {name for name, field in record._format.schema.tensors.items() if field.optional}:
         write_file(other, {key: value for key, value in tensors.items() if key != name}, values)
         unusable(name, type(record).load, other)

@@ -115,9 +115,9 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
     ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
     targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
     check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
+    for each in viewed:
+        check_viewed(each, "people", ours.size, own)
     size = viewed[0].size
-    for each in (ours, *viewed):
-        check_viewed(each, "people", size, own)
     records = [each.resized(size) for each in (ours, *viewed)]
     warn_outside("fixations", records)
     mine, *theirs = [each.points for each in records]
