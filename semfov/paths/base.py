@@ -539,10 +539,13 @@ class GazeRecord(Record):
         """
         sentences, looks = self._sentences, self.passes
         if self.closer and self.found:
-            return sentences["closer found"]
+            # Windows as large as the picture: the first look is a closer look already.
+            box = None if self.decision is None else self.decision.box
+            showing = [look.number for look in self.closer if box is not None and look.box.equal(box)]
+            return sentences["first found" if showing == [0] else "closer found"]
         if self.ending == "decision" and self.decision is not None:
-            outcome = self.decision.outcome
-            return sentences.get(f"closer {outcome}" if self.closer else outcome, sentences[outcome])
+            outcome, closer = self.decision.outcome, any(look.number != 0 for look in self.closer)
+            return sentences.get(f"closer {outcome}" if closer else outcome, sentences[outcome])
         if self.ending == "shifts":
             return f"All {len(self) - 1} gaze shifts were made."
         if self.ending == "passes":

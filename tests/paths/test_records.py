@@ -186,6 +186,17 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     assert "cup" in shown or "cat" in shown
 
 
+def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
+    path = zoom_path()
+    whole = dataclasses.replace(path.closer[0], number=0)
+    first = dataclasses.replace(path, closer=(whole,))
+    assert first.why_it_ended() == "The first look shows the target closely enough."
+    doubt = dataclasses.replace(first, decision=Decision("undecided", 0.5))
+    assert doubt.why_it_ended() == "No remaining look is worth a pass, but the target is probably there."
+    both = dataclasses.replace(doubt, closer=(whole, *path.closer))
+    assert both.why_it_ended() == "No closer look was sure enough, but the target is probably there."
+
+
 @pytest.mark.parametrize("make", RECORDS)
 def test_every_record_is_written_as_tables_and_as_json(make, tmp_path):
     """Read back by the modules csv and json, and by pandas."""
