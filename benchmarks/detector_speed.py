@@ -19,8 +19,8 @@ from benchmarks.machine import photograph
 from benchmarks.tables import number, spread, table
 from benchmarks.timing import Run, Spread, interleaved
 from semfov.detection import Detector
-from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.load import load_yolo
+from semfov.detection.yolo import Runtime
 
 RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "torch")
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
-from semfov.detection.darknet_onnx import Graph
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection
+from semfov.detection.yolo import Graph
 from semfov.zoom.eye import BORDER
 from semfov.zoom.hints import DETECTION_SCORE
 

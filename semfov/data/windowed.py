@@ -9,13 +9,124 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.dlpack import from_dlpack
 
 from semfov.data.images import warn_of_range
-from semfov.data.reduction import OVERSAMPLING, PixelBox, ReducedCopies, bytes_of, first_for, reduction_for
 from semfov.data.tone import White, black_and_white, sample_windows
 from semfov.errors import check
+
+PixelBox = tuple[int, int, int, int]
+
+_STRIP = 1 << 23
+"""Pixels that are read at once for a copy."""
+
+FIRST = 4
+"""Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
+
+_LARGEST = 1 << 25
+"""Most pixels of a copy, so that all copies together take at most 134 MB."""
+
+OVERSAMPLING = 1.5
+"""Pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works."""
+
+
+def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
+    """Largest factor by which a window may be reduced that is resampled afterwards.
+
+    >>> [reduction_for(ratio) for ratio in (0, 2.9, 3, 9, 12.3)]
+    [1, 1, 2, 4, 8]
+    """
+    reduction = 1
+    while ratio >= 2 * oversampling * reduction:
+        reduction *= 2
+    return reduction
+
+
+def _first_for(size: tuple[int, int]) -> int:
+    """Factor by which the largest copy of a picture is reduced, so that it has at most `_LARGEST` pixels.
+
+    >>> _first_for((20_000, 15_000)), _first_for((40_000, 40_000))
+    (4, 8)
+    """
+    first = FIRST
+    while size[0] * size[1] > _LARGEST * first**2:
+        first *= 2
+    return first
+
+
+def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bytes `(3, h, w)` resampled to a size `(h', w')` with the antialiased bilinear filter, `(1, 3, h', w')`."""
+    # torch takes twice as long where the rows of a window are not adjacent in memory.
+    canvas = pixels.permute(1, 2, 0).contiguous()[None].permute(0, 3, 1, 2)
+    if canvas.shape[-2] > size[0]:
+        # torch shortens rows first. Columns first takes two thirds of the time, because that step is the faster one.
+        canvas = F.interpolate(canvas, (size[0], canvas.shape[-1]), mode="bilinear", antialias=True)
+    return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
+
+
+def bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
+    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared; they are not to be written to."""
+    try:
+        # Other than `from_numpy`, it takes arrays that may not be written to.
+        shared = from_dlpack(pixels if min(pixels.strides) >= 0 else pixels.copy())
+    except BufferError:  # NumPy 1 lends only what may be written to
+        shared = torch.from_numpy(pixels.copy())
+    return shared.permute(2, 0, 1)
+
+
+class _ReducedCopies:
+    """Copies of a picture, each reduced by a power of two. A copy is made when it is first needed, and kept.
+
+    A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
+    borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
+
+    Shapes: read `(h, w, 3)`.
+    """
+
+    def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:
+        self.size, self.first = size, _first_for(size)
+        self._read = read
+        self._copies: dict[int, Tensor] = {}
+
+    def window(self, box: PixelBox, reduction: int) -> Tensor:
+        """Read a window from a copy; → `(3, h, w)`."""
+        copy = self._copy(reduction)
+        high, wide = copy.shape[1:]
+        x1, y1, x2, y2 = box
+        left, top = min(x1 // reduction, wide - 1), min(y1 // reduction, high - 1)
+        return copy[:, top : max(-(-y2 // reduction), top + 1), left : max(-(-x2 // reduction), left + 1)]
+
+    def _copy(self, reduction: int) -> Tensor:
+        """The picture reduced by a factor, `(3, h, w)`, channels last in memory."""
+        if reduction not in self._copies:
+            if reduction == self.first:
+                self._copies[reduction] = self._largest()
+            else:
+                larger = self._copy(reduction // 2)
+                high, wide = (max(1, length // 2) for length in larger.shape[1:])
+                self._copies[reduction] = resized(larger[:, : 2 * high, : 2 * wide], (high, wide))[0]
+        return self._copies[reduction]
+
+    def _largest(self) -> Tensor:
+        """The largest copy, made strip by strip."""
+        first = self.first
+        wide, high = (max(1, length // first) for length in self.size)
+        width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
+        rows = max(1, _STRIP // self.size[0] // first)
+        copy = torch.empty(high, wide, 3, dtype=torch.uint8)
+        for top in range(0, high, rows):
+            bottom = min(top + rows, high)
+            # The filter reaches over the borders of a strip by less than one pixel of the copy.
+            low, end = max(top - 1, 0), min(bottom + 1, high)
+            strip = bytes_of(self._read((0, low * first, width, min(end * first, height))))
+            part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
+            copy[top:bottom] = part.permute(1, 2, 0)
+        return copy.permute(2, 0, 1)
+
 
 RASTERS = (".vrt", ".jp2")
 """Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
@@ -23,8 +134,7 @@ RASTERS = (".vrt", ".jp2")
 ChosenBands = int | Sequence[int] | None
 """The number of a band of a TIFF or a raster, or three for red, green and blue, from 1; None for those of the file."""
 
-TILED = (".tif", ".tiff")
-BY_WINDOWS = (*TILED, *RASTERS)
+BY_WINDOWS = (".tif", ".tiff", *RASTERS)
 """Ends of the names of files that may be read by windows, and whose bands can be chosen."""
 
 _LARGE = 1 << 24
@@ -74,11 +184,11 @@ class LargePicture(ABC):
     @cached_property
     def _first(self) -> int:
         """Least factor by which windows are read reduced."""
-        return first_for(self.size)
+        return _first_for(self.size)
 
     @cached_property
-    def _copies(self) -> ReducedCopies:
-        return ReducedCopies(self.size, self.pixels)
+    def _copies(self) -> _ReducedCopies:
+        return _ReducedCopies(self.size, self.pixels)
 
 
 def chosen_bands(

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import torch
 
-from semfov.detection.darknet_onnx import network_model
 from semfov.detection.detector import Detector
 from semfov.detection.onnx_file import METADATA_KEY
-from semfov.detection.yolo import YoloV3
+from semfov.detection.yolo import YoloV3, network_model
 from semfov.errors import InputError, SemfovError
 from semfov.io.files import write_bytes
 
@@ -49,10 +48,10 @@ def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
     """Largest absolute difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
     from semfov.detection.onnx import load_onnx
 
-    exported = load_onnx(path)
+    _exported = load_onnx(path)
     noise = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        ours, theirs = (each.propose(each.fit(noise)[0]) for each in (detector, exported))
+        ours, theirs = (each.propose(each.fit(noise)[0]) for each in (detector, _exported))
     side = max(detector.input_size)
     pairs = (
         (ours.boxes / side, theirs.boxes / side),

@@ -13,12 +13,11 @@ from torch import nn
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.darknet import Darknet, read_weights
 from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
-from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.detector import Detector
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
-from semfov.detection.yolo import YoloV3
+from semfov.detection.yolo import Runtime, YoloV3
 from semfov.errors import DataError, InputError, check, check_options, lookup
 from semfov.io.files import check_regular, read_text
 

@@ -1,17 +1,312 @@
-"""YOLOv3 (Redmon and Farhadi 2018) as a `Detector`."""
+"""YOLOv3 (Redmon and Farhadi 2018) as a `Detector`, computed by torch or, as an ONNX model, by onnxruntime."""
 
-from collections.abc import Sequence
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd import forward_ad
 
-from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_onnx import OnnxTwin, Runtime, network_digest
+from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, recorded
+from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
-from semfov.errors import InputError, check
+from semfov.detection.weights import cache_folder
+from semfov.errors import DataError, InputError, check, values_known
+from semfov.io.files import sha256, write_bytes
+
+Runtime = Literal["auto", "torch", "onnxruntime"]
+
+_VERSION = 1
+"""Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
+
+_OPSET = 17
+_IR_VERSION = 8
+"""IR version from the time of opset 17; some runtimes that could run the model refuse newer versions."""
+
+_OUTPUTS = ("boxes", "objectness", "classes")
+
+
+class Graph:
+    """A graph under construction: its nodes and constants. Methods that add a node return the name of its output."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: dict[str, Any] = {}
+
+    def add(self, op: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
+        """Add a node, and return the name of its output, or the list of names of several outputs."""
+        from onnx import helper
+
+        start = f"{op.lower()}_{len(self.nodes)}"
+        names = [start] if outputs == 1 else [f"{start}_{index}" for index in range(outputs)]
+        self.nodes.append(helper.make_node(op, list(inputs), names, **attributes))
+        return start if outputs == 1 else names
+
+    def name_last(self, name: str) -> None:
+        """Rename the output of the last node to `name`."""
+        self.nodes[-1].output[0] = name
+
+    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        """Add a constant; floating-point numbers become float32 unless they are a float64 tensor."""
+        from onnx import numpy_helper
+
+        tensor = torch.as_tensor(values)
+        single = tensor.is_floating_point() and not isinstance(values, Tensor)
+        tensor = tensor.float() if single or tensor.dtype == torch.float16 else tensor
+        name = f"constant_{len(self.constants)}"
+        self.constants[name] = numpy_helper.from_array(tensor.detach().cpu().contiguous().numpy(), name)
+        return name
+
+
+class _NetworkGraph(Graph):
+    """The graph of a Darknet network, in float32."""
+
+    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        """Add a constant; floating-point numbers become float32, whatever torch's default dtype is."""
+        tensor = torch.as_tensor(values)
+        return super().constant(tensor.float() if tensor.is_floating_point() else tensor)
+
+    def activation(self, kind: str, source: str) -> str:
+        """Add an activation of Darknet."""
+        if kind == "linear":
+            return source
+        if kind == "leaky":
+            return self.add("LeakyRelu", source, alpha=0.1)
+        if kind == "relu":
+            return self.add("Relu", source)
+        if kind == "mish":
+            return self.add("Mul", source, self.add("Tanh", self.add("Softplus", source)))
+        gate = self.add("Sigmoid", source)
+        return self.add("Mul", source, gate) if kind == "swish" else gate
+
+    def layer(self, layer: Any, *sources: str) -> str:
+        """Add a layer of a Darknet network."""
+        if isinstance(layer, Convolution):
+            return self.activation(layer.activation, self._convolution(layer, sources[0]))
+        if isinstance(layer, MaxPool):
+            before, after = layer.padding // 2, layer.padding - layer.padding // 2
+            return self.add(
+                "MaxPool",
+                sources[0],
+                kernel_shape=[layer.size] * 2,
+                strides=[layer.stride] * 2,
+                pads=[before, before, after, after],
+            )
+        if isinstance(layer, nn.Upsample):
+            scale = float(layer.scale_factor)  # type: ignore[arg-type]
+            scales = self.constant([1.0, 1.0, scale, scale])
+            return self.add("Resize", sources[0], "", scales, mode="nearest", nearest_mode="floor",
+                            coordinate_transformation_mode="asymmetric")  # fmt: skip
+        if isinstance(layer, Route):
+            chunks = [
+                source if layer.groups == 1 else self.add("Split", source, outputs=layer.groups, axis=1)[layer.group]
+                for source in sources
+            ]
+            return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
+        if isinstance(layer, Shortcut):
+            return self.activation(layer.activation, self.add("Add", *sources))
+        return sources[0]
+
+    def _convolution(self, layer: Convolution, source: str) -> str:
+        vertical, horizontal = (int(side) for side in layer.padding)
+        return self.add(
+            "Conv",
+            source,
+            self.constant(layer.weight),
+            self.constant(layer.bias),  # type: ignore[arg-type]
+            strides=list(layer.stride),
+            pads=[vertical, horizontal, vertical, horizontal],
+            group=layer.groups,
+        )
+
+    def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
+        """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
+        anchors, channels = len(head.anchors), 5 + head.classes
+        shape = self.constant([0, anchors, channels, -1])
+        cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
+        lengths = self.constant([2, 2, 1, head.classes])
+        shift, size, objectness, classes = self.add("Split", cells, lengths, outputs=4, axis=3)
+        centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
+        corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
+        centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
+        half = self.add("Mul", self.add("Exp", size), self.constant(torch.tensor(head.anchors) / 2))
+        boxes = self.add("Concat", self.add("Sub", centre, half), self.add("Add", centre, half), axis=3)
+        return (
+            self.add("Reshape", boxes, self.constant([0, -1, 4])),
+            self.add("Reshape", self.add("Sigmoid", objectness), self.constant([0, -1])),
+            self.add("Reshape", self.add("Sigmoid", classes), self.constant([0, -1, head.classes])),
+        )
+
+    def _corners(self, source: str) -> str:
+        """Add the column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
+        size = self.add("Shape", source)
+        rows, columns = (self.add("Gather", size, self.constant(axis)) for axis in (2, 3))
+        count = self.add("Mul", rows, columns)
+        cell = self.add("Range", self.constant(0), count, self.constant(1))
+        column, row = self.add("Mod", cell, columns), self.add("Div", cell, columns)
+        axes = self.constant([1, 2])
+        pair = [self.add("Unsqueeze", each, axes) for each in (column, row)]
+        return self.add("Cast", self.add("Concat", *pair, axis=2), to=1)
+
+
+def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()) -> Any:
+    """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None).
+
+    The maps of `layers` are further outputs, `layer_0`, `layer_1`, ….
+    """
+    try:
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
+    graph, names = _build(network)
+    for layer in layers:
+        graph.add("Identity", names[layer])
+        graph.name_last(f"layer_{layer}")
+    batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
+    boxes, classes = None if size else "boxes", network.heads[0].classes
+    shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
+    return helper.make_model(
+        helper.make_graph(
+            graph.nodes,
+            name,
+            [helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])],
+            [
+                *(helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in _OUTPUTS),
+                *(helper.make_tensor_value_info(f"layer_{layer}", TensorProto.FLOAT, None) for layer in layers),
+            ],
+            list(graph.constants.values()),
+        ),
+        producer_name="semfov",
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+    )
+
+
+def _build(network: Darknet) -> tuple[_NetworkGraph, dict[int, str]]:
+    """The whole graph, from `images` to `_OUTPUTS`, and the names of the outputs of all layers."""
+    graph = _NetworkGraph()
+    names = {-1: "images"}
+    heads = []
+    for index, layer in enumerate(network.layers):
+        names[index] = graph.layer(layer, *(names[source] for source in network.sources[index]))
+        if isinstance(layer, Head):
+            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
+    for name, outputs in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
+        graph.add("Concat", *outputs, axis=1)
+        graph.name_last(name)
+    return graph, names
+
+
+class _OnnxTwin:
+    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
+
+    The ONNX model is made when it is first needed (`_exported`). A session has as many threads as torch has at that
+    time. Every process opens its own session, because the threads of a pool do not survive a fork.
+    """
+
+    def __init__(self, digest: str) -> None:
+        self.digest = digest
+        self._versions: tuple[object, ...] | None = None
+        self._same = False
+        self._opened: dict[tuple[int, ...], tuple[tuple[int, int], OnnxSession]] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _OnnxTwin, (self.digest,)
+
+    def obstacle(self, network: Darknet) -> str | None:
+        """The reason, in words, why onnxruntime cannot run the network as it is now; None if it can."""
+        parameters = list(network.parameters())
+        dtype, devices = parameters[0].dtype, {parameter.device.type for parameter in parameters}
+        if devices != {"cpu"}:
+            return f"a network on {', '.join(sorted(devices))}"
+        if dtype != torch.float32:
+            return f"a network of {dtype}"
+        if network.channels != 3:
+            return f"a network that takes {network.channels} channels"
+        versions = tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
+        if versions != self._versions:
+            self._versions, self._same = versions, _network_digest(network) == self.digest
+        return None if self._same else "weights that were changed after loading"
+
+    def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
+        """The reason, in words, why onnxruntime cannot run the network on a canvas; None if it can."""
+        if not values_known(canvas, *network.parameters()) or torch.jit.is_tracing():  # type: ignore[attr-defined]
+            return "graphs that are traced, and function transforms"
+        tensors = [canvas, *network.parameters()]
+        if any(type(tensor) not in (Tensor, nn.Parameter) for tensor in tensors):
+            return "subclasses of tensors"
+        reverse = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+        if reverse or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+            return "gradients"
+        if canvas.device.type != "cpu":
+            return f"a canvas on {canvas.device}"
+        return self.obstacle(network)
+
+    def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
+        """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
+        return self.with_features(network, canvas, {})[0]
+
+    def with_features(
+        self, network: Darknet, canvas: Tensor, layers: Mapping[str, int]
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """The same, and the maps of layers by name, in one run."""
+        network.check_image(canvas)
+        outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
+        candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+        return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
+
+    def _session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
+        key = (os.getpid(), torch.get_num_threads())
+        if layers not in self._opened or self._opened[layers][0] != key:
+            self._opened[layers] = key, self._open(network, layers)
+        return self._opened[layers][1]
+
+    def _open(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
+        try:
+            path = _exported(network, cache_folder() / "exported", layers)
+        except DataError:  # the cache cannot be written to
+            with tempfile.TemporaryDirectory() as folder:
+                return OnnxSession(_exported(network, Path(folder), layers), open_ended=False)
+        return OnnxSession(path, open_ended=False)
+
+
+def _network_digest(network: Darknet) -> str:
+    """Compute the sha256 of a network's cfg and of its parameters as float32."""
+    digest = hashlib.sha256(network.cfg_digest().encode())
+    for parameter in network.parameters():
+        digest.update(parameter.detach().float().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def _exported(network: Darknet, folder: Path, layers: Sequence[int] = ()) -> Path:
+    """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
+    source = json.dumps([_network_digest(network), _VERSION, torch.__version__, *layers])
+    key = hashlib.sha256(source.encode()).hexdigest()[:16]
+    whole = _whole(folder.glob(f"{key}.*.onnx"))
+    if whole is not None:
+        return whole
+    content = network_model(network, "darknet", layers=layers).SerializeToString()
+    path = folder / f"{key}.{hashlib.sha256(content).hexdigest()}.onnx"
+    write_bytes(path, content)
+    return path
+
+
+def _whole(paths: Iterable[Path]) -> Path | None:
+    """The first file that can be read and whose sha256 is the one in its name."""
+    for path in sorted(paths):
+        with suppress(OSError):
+            if sha256(path) == path.name.split(".")[1]:
+                return path
+    return None
 
 
 def decode_yolo(
@@ -82,7 +377,7 @@ class YoloV3(Detector):
         super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)
         self.network = network
         self.runtime = runtime
-        self._twin = None if runtime == "torch" else OnnxTwin(network_digest(network))
+        self._twin = None if runtime == "torch" else _OnnxTwin(_network_digest(network))
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""

@@ -22,11 +22,11 @@ from semfov.fit.evidence import EvidenceFit
 from semfov.fit.gaze_model import fit_gaze_model, gaze_report
 from semfov.fit.map import MapFit
 from semfov.fit.observation import ObservationFit
-from semfov.fit.parts.base import PartFit, PartInputs, PartResult
-from semfov.fit.parts.windows import WindowsFit
+from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.tempering import TemperingFit
 from semfov.fit.verification import VerificationFit
+from semfov.fit.windows import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import PARTS, Manifest, Part, place_of
 from semfov.runs.config import WHERE, DataConfig, DetectorConfig

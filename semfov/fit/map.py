@@ -24,7 +24,7 @@ from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.parts.base import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
+from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy

@@ -16,7 +16,7 @@ from semfov.data.scene import Scenes
 from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, in_words, section
 from semfov.fit.outputs import split
-from semfov.fit.parts.base import IOU, PartFit, PartInputs, PartResult
+from semfov.fit.part import IOU, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative

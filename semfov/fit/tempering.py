@@ -15,7 +15,7 @@ from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, in_words, percent_of, section
-from semfov.fit.parts.base import FOOTPRINT, IOU, PartFit, PartInputs, PartResult
+from semfov.fit.part import FOOTPRINT, IOU, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
 from semfov.runs.progress import track

@@ -19,7 +19,7 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, in_words
 from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import training_of
-from semfov.fit.parts.base import PartFit, PartInputs, PartResult
+from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
-from semfov.data.reduction import resized
-from semfov.data.windowed import LargePicture
+from semfov.data.windowed import LargePicture, resized
 from semfov.errors import DataError, InputError, check
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds

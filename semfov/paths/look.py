@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.reduction import reduction_for
-from semfov.data.windowed import LargePicture
+from semfov.data.windowed import LargePicture, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
 

@@ -9,8 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from semfov.data.reduction import resized
-from semfov.data.windowed import LargePicture
+from semfov.data.windowed import LargePicture, resized
 from semfov.detection.placement import Placement, resize
 from semfov.errors import check, check_shape
 from semfov.eye import Eye

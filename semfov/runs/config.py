@@ -6,8 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
-from semfov.detection.darknet_onnx import Runtime
 from semfov.detection.scores import BackgroundPolicy
+from semfov.detection.yolo import Runtime
 from semfov.errors import lookup
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Whole, Workers

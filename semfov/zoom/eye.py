@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
-from semfov.data.reduction import resized
-from semfov.data.windowed import LargePicture
+from semfov.data.windowed import LargePicture, resized
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import select
@@ -67,7 +66,7 @@ class WindowEye(nn.Module):
 
     A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
     pixels. In pictures of more than 16 million pixels those of coarse windows are rounded to pixels of a reduced copy
-    (`semfov.data.reduction`). Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from
+    (`semfov.data.windowed`). Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from
     the pixels inside them alone.
 
     Where the border of a window cuts an object, only a part of the object is visible, and its box encloses that part.

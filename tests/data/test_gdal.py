@@ -14,8 +14,7 @@ from PIL import Image
 
 from semfov import SemfovError, read_image
 from semfov.data.gdal import _mosaic_text
-from semfov.data.large import open_large, picture_size
-from semfov.data.raster import RasterPicture
+from semfov.data.large import _RasterPicture, open_large, picture_size
 from semfov.paths.georeference import georeference
 from tests.data.test_large import pixels
 from tests.data.test_raster import rasterio, write
@@ -91,8 +90,8 @@ def test_text_is_no_photograph(rasterio, private, address, text, suffix):
     ):
         path = private.parent / f"public/photo{suffix}"
         path.write_text(text(str(name), 0) if text is mosaic else text.format(relative=0, name=name))
-        for read in (open_large, picture_size, read_image, RasterPicture):
-            if read is not RasterPicture or suffix in (".tif", ".tiff", ".jp2", ".vrt"):
+        for read in (open_large, picture_size, read_image, _RasterPicture):
+            if read is not _RasterPicture or suffix in (".tif", ".tiff", ".jp2", ".vrt"):
                 with pytest.raises(SemfovError):
                     read(path)
     assert not requests
@@ -116,12 +115,12 @@ def test_reduced_copies_are_those_of_the_file(rasterio, private, address, place)
         elif place == "ovr":
             path.with_name("photo.tif.ovr").write_text(raw)
         if place == "tag":
-            unusable("with overviews of its own", RasterPicture, path)
+            unusable("with overviews of its own", _RasterPicture, path)
             mosaics = path.with_name("mosaic.vrt")
             mosaics.write_text(mosaic("photo.tif", size=(64, 64)))
-            unusable(r"photo\.tif: expected a raster with overviews of its own", RasterPicture, mosaics)
+            unusable(r"photo\.tif: expected a raster with overviews of its own", _RasterPicture, mosaics)
         else:
-            picture = RasterPicture(path)
+            picture = _RasterPicture(path)
             assert not picture._has_overviews
             assert picture._window((0, 0, 64, 64), 2).max() == picture._window((0, 0, 64, 64), 2).min() == 7
     assert not requests
@@ -209,7 +208,7 @@ def test_a_raster_has_its_driver_and_a_limit_of_size(tmp_path, monkeypatch):
     Image.fromarray(pixels()).save(tmp_path / "a.png")
     for name, driver in (("a.tif", "GTiff"), ("a.TIFF", "GTiff"), ("a.jp2", "JP2OpenJPEG"), ("a.vrt", "VRT")):
         (tmp_path / name).write_text(mosaic("a.png"))
-        unusable(r"at most 1,048,576 pixels along a side, got 2147483648 × 2", RasterPicture, tmp_path / name)
+        unusable(r"at most 1,048,576 pixels along a side, got 2147483648 × 2", _RasterPicture, tmp_path / name)
         assert opened.pop() == "closed"
         assert opened.pop() == driver
     assert not opened
@@ -228,7 +227,7 @@ def test_names_are_no_addresses(rasterio, private, monkeypatch):
     monkeypatch.chdir(folder)
     for name in ("GTIFF_DIR:1:a.tif", "zip+file!a.tif", "a?b=c#d.tif", "gzip:a.tif"):
         write(rasterio, folder / name, pixels())
-        assert RasterPicture(name).size == (230, 150)
+        assert _RasterPicture(name).size == (230, 150)
         assert georeference(name) is not None
 
 

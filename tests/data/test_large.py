@@ -14,9 +14,7 @@ import torch
 from PIL import Image
 
 from semfov import InputError, read_image
-from semfov.data.large import _ArrayPicture, _MemoryPicture, open_large
-from semfov.data.raster import RasterPicture
-from semfov.data.tiff import TiffPicture
+from semfov.data.large import _ArrayPicture, _MemoryPicture, _RasterPicture, _TiffPicture, open_large
 from tests.refusals import refused, unusable
 
 
@@ -50,10 +48,10 @@ def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch
                 assert torch.equal(picture.read(box, reduction), open_large(array).read(box, reduction))
 
 
-@pytest.mark.parametrize("reader", [TiffPicture, RasterPicture])
+@pytest.mark.parametrize("reader", [_TiffPicture, _RasterPicture])
 def test_threads_read_windows_of_one_picture_at_once(tmp_path, reader):
     """Each gets the pixels of its window, and afterwards warnings and logs are what they were."""
-    if reader is RasterPicture:
+    if reader is _RasterPicture:
         pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
     array, logs = pixels(512, 512), [logging.getLogger(name) for name in ("PIL", "tifffile")]
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb", compression="zlib")
@@ -101,7 +99,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     array[1000:1100, 2000:2100] = 77
     tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
     del array
-    picture = TiffPicture(tmp_path / "large.tif")
+    picture = _TiffPicture(tmp_path / "large.tif")
     tracemalloc.start()
     window = picture.read((1900, 900, 2316, 1316))
     peak = tracemalloc.get_traced_memory()[1]
@@ -160,7 +158,7 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
     tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb")
     monkeypatch.setitem(sys.modules, "tifffile", None)
     assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)
-    unusable("pip install tifffile", TiffPicture, tmp_path / "a.tif")
+    unusable("pip install tifffile", _TiffPicture, tmp_path / "a.tif")
 
 
 def test_signed_numbers_of_eight_bits_need_their_black_and_white(tmp_path):

@@ -8,9 +8,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from semfov.data.large import _ArrayPicture, open_large, picture_size
-from semfov.data.raster import RasterPicture
-from semfov.data.tiff import TiffPicture
+from semfov.data.large import _ArrayPicture, _RasterPicture, _TiffPicture, open_large, picture_size
 from semfov.errors import DataError
 from semfov.paths.georeference import georeference
 from tests.data.test_large import pixels
@@ -48,10 +46,10 @@ def test_windows_have_the_pixels_of_the_array(rasterio, tmp_path, box):
     planes = write(rasterio, tmp_path / "planes.tif", array, interleave="band")
     wide = write(rasterio, tmp_path / "wide.tif", array.astype(np.uint16) * 257)
     for path in (planes, wide, write(rasterio, tmp_path / "copies.tif", array, (2, 4))):
-        picture = RasterPicture(path)
+        picture = _RasterPicture(path)
         assert picture.size == picture_size(path) == (230, 150)
         assert torch.equal(picture.read(box), expected)
-    grey = RasterPicture(write(rasterio, tmp_path / "grey.tif", array[..., :1]))
+    grey = _RasterPicture(write(rasterio, tmp_path / "grey.tif", array[..., :1]))
     assert torch.equal(grey.read(box), expected[:1].expand(3, -1, -1))
 
 
@@ -62,7 +60,7 @@ def test_channels_are_the_bands_with_their_names(rasterio, tmp_path):
     with rasterio.open(path, "r+") as file:
         meaning = rasterio.enums.ColorInterp
         file.colorinterp = meaning.undefined, meaning.blue, meaning.green, meaning.red, meaning.undefined
-    for reader in (RasterPicture, TiffPicture):
+    for reader in (_RasterPicture, _TiffPicture):
         assert np.array_equal(reader(path).pixels((5, 6, 50, 40)), array[6:40, 5:50])
 
 
@@ -73,7 +71,7 @@ def test_coarse_windows_come_from_the_overviews(rasterio, large, tmp_path):
     with rasterio.open(path, "r+", overview_level=1) as file:  # reduced by 4
         file.write(np.full((3, 64, 96), 50, np.uint8))
     picture = open_large(path)
-    assert isinstance(picture, RasterPicture)
+    assert isinstance(picture, _RasterPicture)
     assert picture.reduction(6) == 4
     assert set(picture.read((64, 32, 192, 160), 4).flatten().tolist()) == {50}
     assert set(picture.read((64, 32, 192, 160), 8).flatten().tolist()) == {200}
@@ -85,7 +83,7 @@ def test_coarse_windows_show_the_place_they_are_of(rasterio, large, tmp_path):
     down, across = np.indices((240, 250))
     array = np.stack([across, down, across], -1).astype(np.uint8)
     with_copies = open_large(write(rasterio, tmp_path / "a.tif", array, (2, 4, 8)))
-    without = RasterPicture(write(rasterio, tmp_path / "b.tif", array))
+    without = _RasterPicture(write(rasterio, tmp_path / "b.tif", array))
     for box in ((16, 8, 80, 72), (0, 0, 248, 240)):
         expected = _ArrayPicture(array).read(box, 8)
         assert torch.equal(without.read(box, 8), expected)
@@ -117,23 +115,23 @@ def test_objects_of_a_mosaic_of_files_have_its_coordinates(rasterio, tmp_path):
 
 
 def test_other_tiffs_are_read_as_before(rasterio, tmp_path):
-    assert not isinstance(open_large(write(rasterio, tmp_path / "a.tif", pixels())), RasterPicture)
+    assert not isinstance(open_large(write(rasterio, tmp_path / "a.tif", pixels())), _RasterPicture)
     planes = write(rasterio, tmp_path / "b.tif", pixels(), interleave="band")
     assert np.array_equal(open_large(planes).pixels((5, 6, 50, 40)), pixels()[6:40, 5:50])
 
 
 def test_what_is_no_picture_is_refused(rasterio, tmp_path):
     with pytest.raises(DataError, match=r"expected bands of 8 or 16 bits, got float32; give white="):
-        RasterPicture(write(rasterio, tmp_path / "a.tif", pixels().astype(np.float32)))
+        _RasterPicture(write(rasterio, tmp_path / "a.tif", pixels().astype(np.float32)))
     palette = write(rasterio, tmp_path / "b.tif", pixels()[..., :1], photometric="palette")
     with rasterio.open(palette, "r+") as file:
         file.write_colormap(1, {0: (0, 0, 0, 255), 1: (255, 0, 0, 255)})
-    unusable("got a palette", RasterPicture, palette)
+    unusable("got a palette", _RasterPicture, palette)
     (tmp_path / "c.vrt").write_text("no raster")
     unusable("expected the XML text of a mosaic", open_large, tmp_path / "c.vrt")
     unusable("no such file", open_large, tmp_path / "d.jp2")
     copies = write(rasterio, tmp_path / "e.tif", pixels(), (2, 4))
-    refused("box: expected a window inside 230 × 150 pixels", RasterPicture(copies).read, (0, 0, 231, 150), 4)
+    refused("box: expected a window inside 230 × 150 pixels", _RasterPicture(copies).read, (0, 0, 231, 150), 4)
 
 
 def test_a_missing_rasterio_is_named(tmp_path, monkeypatch):

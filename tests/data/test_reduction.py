@@ -7,16 +7,15 @@ import torch
 from PIL import Image
 from torch.nn import functional
 
-from semfov.data.large import _ArrayPicture
-from semfov.data.reduction import ReducedCopies, resized
-from semfov.data.tiff import TiffPicture
+from semfov.data.large import _ArrayPicture, _TiffPicture
+from semfov.data.windowed import _ReducedCopies, resized
 from tests.data.test_large import pixels
 
 
 @pytest.fixture
 def strips(monkeypatch):
     """Small pictures are large, and are read in strips of 20 or 24 rows."""
-    monkeypatch.setattr("semfov.data.reduction._STRIP", 4700)
+    monkeypatch.setattr("semfov.data.windowed._STRIP", 4700)
     monkeypatch.setattr("semfov.data.windowed._LARGE", 4700)
 
 
@@ -42,7 +41,7 @@ def test_bytes_are_resampled_as_by_floats_and_as_by_pillow(size):
 
 def test_a_copy_made_in_strips_equals_the_whole_picture_reduced(strips):
     array = pixels(128, 192)
-    copies = ReducedCopies((192, 128), lambda box: array[box[1] : box[3], box[0] : box[2]])
+    copies = _ReducedCopies((192, 128), lambda box: array[box[1] : box[3], box[0] : box[2]])
     quarter = resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
     assert torch.equal(copies.window((0, 0, 192, 128), 4), quarter)
     assert torch.equal(copies.window((16, 8, 96, 72), 4), quarter[:, 2:18, 4:24])
@@ -81,7 +80,7 @@ def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
         rows.append(box[3] - box[1])
         return array[box[1] : box[3], box[0] : box[2]]
 
-    copies = ReducedCopies((192, 128), read)
+    copies = _ReducedCopies((192, 128), read)
     for reduction in (16, 4, 8, 16):
         copies.window((0, 0, 64, 64), reduction)
     assert 128 <= sum(rows) <= 128 * 1.5
@@ -100,12 +99,12 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)
-    assert torch.equal(TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
+    assert torch.equal(_TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
 
 
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):
     """Copies have at most 1600 pixels here."""
-    monkeypatch.setattr("semfov.data.reduction._LARGEST", 1600)
+    monkeypatch.setattr("semfov.data.windowed._LARGEST", 1600)
     array, rows = pixels(256, 384), []
 
     class Counting(_ArrayPicture):

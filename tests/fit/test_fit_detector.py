@@ -30,7 +30,7 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.detector import _seconds_of_looks, _thin_classes, _with_classes
 from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
-from semfov.fit.parts.base import PartInputs, PartResult
+from semfov.fit.part import PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import VerificationFit, _VerifiedSearch, scores
 from semfov.io.files import sha256
@@ -164,7 +164,7 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
-    "parts.windows": "_fit_mosaics",
+    "windows": "_fit_mosaics",
 }
 
 
