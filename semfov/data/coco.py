@@ -18,7 +18,7 @@ from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_image
-from semfov.data.scene import Annotation, Coverage, Scene, legal_targets
+from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check
 from semfov.io.files import check_regular, json_sha256, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
@@ -171,7 +171,7 @@ def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
     return image
 
 
-class CocoScenes:
+class CocoScenes(Scenes):
     """Photographs with COCO annotations, selected by the criteria of the published experiments.
 
     An image is kept if it has at least `min_instances` boxes (of any category) and at least one legal target. A legal
@@ -212,6 +212,8 @@ class CocoScenes:
         scene = scenes[0]
         scene.image, scene.boxes, [scenes.classes[target - 1] for target in scenes.targets(0)]
     """
+
+    ids: list[Any]
 
     def __init__(
         self,
@@ -262,14 +264,11 @@ class CocoScenes:
                 f"annotations {annotations}: none of {len(packed.ids)} images has at least {min_instances} boxes "
                 f"and a class that covers at most {max_target_area} of it; relax min_instances or max_target_area"
             )
-        self.ids: list[Any] = [packed.ids[row] for row in self._rows]
+        self.ids = [packed.ids[row] for row in self._rows]
         self._files = [Path(root, packed.names[row]) for row in self._rows]
         settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
         names = [packed.names[row] for row in self._rows]
         self.fingerprint = json_sha256([settings, names, _file_sizes(root, self._files)])
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 
 import torch
 
 from semfov.data.images import read_image
-from semfov.data.scene import Annotation, Scene
+from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.errors import DataError
 from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 
-class Pictures:
+class Pictures(Scenes):
     """Photographs by the names of their files, as `Scenes` without objects."""
+
+    ids: list[str]
 
     def __init__(self, root: str | PathLike[str], names: Iterable[str], classes: tuple[str, ...]) -> None:
         self.root = Path(root)
@@ -29,14 +32,11 @@ class Pictures:
                 f"{missing[0]}; check the folder and the names"
             )
 
-    @property
-    def fingerprint(self) -> str:
+    @cached_property
+    def fingerprint(self) -> str:  # type: ignore[override]
         """sha256 of the names and contents of the files."""
         what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]
         return json_sha256(what)
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     def __getitem__(self, index: int) -> Scene:
         image = read_image(self._path(self.ids[index]))

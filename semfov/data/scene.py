@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -63,8 +63,13 @@ class Scene:
         return self.image.shape[-1], self.image.shape[-2]
 
 
-class Scenes(Protocol):
-    """The interface of a set of scenes, in ascending order of their ids; only `__getitem__` decodes images.
+class Scenes(ABC):
+    """Base of sets of scenes, in ascending order of their ids; only `__getitem__` decodes images.
+
+    Attributes:
+        classes: names of the detector's classes 1..K.
+        ids: ids of the scenes, ascending.
+        fingerprint: sha256 of everything that the scenes depend on, for the keys of caches and for manifests.
 
     >>> from semfov.data import EmbeddedScenes
     >>> scenes: Scenes = EmbeddedScenes(("person", "cat"), count=2)
@@ -72,22 +77,18 @@ class Scenes(Protocol):
     (2, ('person', 'cat'), (640, 480))
     """
 
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the detector's classes 1..K."""
+    classes: tuple[str, ...]
+    ids: list[int] | list[str]
+    fingerprint: str
 
-    @property
-    def ids(self) -> list[int] | list[str]:
-        """Ids of the scenes, ascending."""
+    def __len__(self) -> int:
+        return len(self.ids)
 
-    @property
-    def fingerprint(self) -> str:
-        """sha256 of everything that the scenes depend on, for the keys of caches and for manifests."""
+    @abstractmethod
+    def __getitem__(self, index: int) -> Scene:
+        """Decode a scene."""
 
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int) -> Scene: ...
-
+    @abstractmethod
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a scene depend on, the key of a scene in caches.
 
@@ -98,6 +99,7 @@ class Scenes(Protocol):
             64 hexadecimal digits.
         """
 
+    @abstractmethod
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a scene, without decoding its image.
 
@@ -109,7 +111,7 @@ class Scenes(Protocol):
         """
 
     def targets(self, index: int) -> list[int]:
-        """List the classes of a scene that may be searched for.
+        """List the classes of a scene that may be searched for: those that cover at most a fifth of it.
 
         Args:
             index: position of the scene in the set.
@@ -117,6 +119,7 @@ class Scenes(Protocol):
         Returns:
             Class indices 1..K, ascending.
         """
+        return legal_targets(self.annotation(index))
 
 
 def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum") -> float:
@@ -182,39 +185,16 @@ def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage
     return [label for label in present if box_coverage(boxes[labels == label], size, coverage) <= max_area]
 
 
-class ComposedScenes(ABC):
+class ComposedScenes(Scenes):
     """Base of sets whose scenes are composed by a seed: a scene depends only on the seed and on its number."""
+
+    ids: list[int]
 
     def __init__(self, classes: tuple[str, ...], count: int, seed: int) -> None:
         check(count >= 1, "count", "at least 1", count)
         check(seed >= 0, "seed", "at least 0", seed)
         self.classes, self._seed = classes, seed
         self.ids = list(range(count))
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    @abstractmethod
-    def annotation(self, index: int) -> Annotation:
-        """Return the objects of a scene, without composing its image.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            The objects.
-        """
-
-    def targets(self, index: int) -> list[int]:
-        """List the classes that may be searched for, ascending: those that cover at most a fifth of the scene.
-
-        Args:
-            index: position of the scene in the set.
-
-        Returns:
-            Class indices 1..K.
-        """
-        return legal_targets(self.annotation(index))
 
     def _generator(self, index: int, *part: int) -> np.random.Generator:
         """The random numbers of a scene, or of a part of it."""
@@ -226,14 +206,11 @@ class ComposedScenes(ABC):
         return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)
 
 
-class ChosenScenes:
+class ChosenScenes(Scenes):
     """Scenes that are chosen from one or more sets of the same classes: each a set, and the position in it."""
 
     def __init__(self, chosen: Sequence[tuple[Scenes, int]], ids: list[int] | list[str], fingerprint: str) -> None:
         self._chosen, self.classes, self.ids, self.fingerprint = chosen, chosen[0][0].classes, ids, fingerprint
-
-    def __len__(self) -> int:
-        return len(self._chosen)
 
     def __getitem__(self, index: int) -> Scene:
         """Decode a scene."""

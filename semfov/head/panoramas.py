@@ -1,7 +1,5 @@
 """Panoramas composed of photographs on a sphere, by seed; the direction of every object is known."""
 
-import hashlib
-import json
 import math
 from typing import NamedTuple
 
@@ -10,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
 from semfov.errors import check
+from semfov.io.files import json_sha256
 from semfov.sensor.sphere import Camera, Regions, panorama_directions
 
 _VERSION = 1  # increase it whenever the same seed would give another picture
@@ -31,7 +30,7 @@ class _Patch(NamedTuple):
     box: tuple[float, float, float, float]
 
 
-class Panoramas:
+class Panoramas(ComposedScenes):
     """Equirectangular panoramas of photographs around the viewer.
 
     Each photograph lies on a plane that touches the sphere. It is as large as its slot of 4:3 allows, with its
@@ -74,19 +73,11 @@ class Panoramas:
             check(fits, "rings", "pairs of a latitude from -90 to 90 degrees and a number of slots", rings)
         check(0 < slot < 180, "slot", "an angle between 0 and 180 degrees", slot)
         check(width >= 2 and width % 2 == 0, "width", "an even number of pixels", width)
-        check(count >= 1, "count", "at least 1", count)
-        check(seed >= 0, "seed", "at least 0", seed)
+        super().__init__(scenes.classes, count, seed)
         self.scenes, self.rings, self.slot, self.fill = scenes, rings, slot, fill
-        self.classes = scenes.classes
-        self.ids = list(range(count))
         self.size = width, width // 2
-        self._seed = seed
         what = [_VERSION, scenes.fingerprint, rings, slot, width, count, seed, fill]
-        self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-
-    def __len__(self) -> int:
-        """Number of panoramas."""
-        return len(self.ids)
+        self.fingerprint = json_sha256(what)
 
     def patches(self, index: int) -> list[_Patch]:
         """The photographs of a panorama, ring by ring.
@@ -97,7 +88,7 @@ class Panoramas:
         Returns:
             One patch for each slot.
         """
-        generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
+        generator = self._generator(index)
         slots, count = sum(number for _, number in self.rings), len(self.scenes)
         rounds = -(-slots // count)
         order = np.concatenate([generator.permutation(count) for _ in range(rounds)])[:slots].tolist()
@@ -118,9 +109,7 @@ class Panoramas:
         canvas = torch.full((3, self.size[1], self.size[0]), self.fill)
         for patch in self.patches(index):
             self._put(canvas, patch)
-        annotation = self.annotation(index)
-        name = f"panorama {self.ids[index]}, seed {self._seed}"
-        return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
+        return self._scene(index, "panorama", canvas)
 
     def _put(self, canvas: Tensor, patch: _Patch) -> None:
         """Project a photograph onto the panorama."""
@@ -179,17 +168,6 @@ class Panoramas:
         crowd = torch.cat([annotation.crowd for annotation in annotations])
         return Annotation(self.regions(index).panorama_boxes(self.size), labels, crowd, self.size)
 
-    def targets(self, index: int) -> list[int]:
-        """Classes of a panorama that may be searched for: those that cover no more than a fifth of it.
-
-        Args:
-            index: number of the panorama.
-
-        Returns:
-            Class indices, ascending.
-        """
-        return legal_targets(self.annotation(index))
-
     def digest(self, index: int) -> str:
         """SHA-256 hash of everything that the pixels of a panorama depend on.
 
@@ -200,4 +178,4 @@ class Panoramas:
             64 hexadecimal digits.
         """
         patches = [(self.scenes.digest(patch.scene), patch.pose, patch.box) for patch in self.patches(index)]
-        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, patches]).encode()).hexdigest()
+        return json_sha256([_VERSION, self.size, self.fill, patches])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from semfov.data.classes import class_index
 from semfov.data.fixations import Fixations, Letterbox, coco_name
 from semfov.data.images import read_image
-from semfov.data.scene import Annotation, Scene
+from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.detection.placement import resize
 from semfov.errors import InputError
 from semfov.io.files import sha256
@@ -22,7 +23,7 @@ GREY = 0.5
 """Grey value of the screen around the picture."""
 
 
-class Screens:
+class Screens(Scenes):
     """Screens with one picture each, as scenes whose only object is the target (a `Scenes`).
 
     Args:
@@ -32,6 +33,8 @@ class Screens:
             if the detector does not know its target class.
         classes: classes of the detector.
     """
+
+    ids: list[str]
 
     def __init__(self, folders: Sequence[Path], searches: Mapping[str, Fixations], classes: tuple[str, ...]) -> None:
         self.classes = classes
@@ -43,14 +46,11 @@ class Screens:
         self.ids = list(self._files)
         self.searches = {name: searches[name] for name in self.ids}
 
-    @property
-    def fingerprint(self) -> str:
+    @cached_property
+    def fingerprint(self) -> str:  # type: ignore[override]
         """sha256 of pictures, screens and targets."""
         what = [(self.digest(i), self.searches[n].target, self.searches[n].box) for i, n in enumerate(self.ids)]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     def __getitem__(self, index: int) -> Scene:
         name, annotation = self.ids[index], self.annotation(index)
