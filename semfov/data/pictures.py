@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cached_property
 from os import PathLike
 from pathlib import Path
 
@@ -32,7 +31,7 @@ class Pictures(Scenes):
                 f"{missing[0]}; check the folder and the names"
             )
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:  # type: ignore[override]
         """sha256 of the names and contents of the files."""
         what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]

@@ -48,10 +48,10 @@ def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
     """Largest absolute difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
     from semfov.detection.onnx import load_onnx
 
-    _exported = load_onnx(path)
+    exported = load_onnx(path)
     noise = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        ours, theirs = (each.propose(each.fit(noise)[0]) for each in (detector, _exported))
+        ours, theirs = (each.propose(each.fit(noise)[0]) for each in (detector, exported))
     side = max(detector.input_size)
     pairs = (
         (ours.boxes / side, theirs.boxes / side),

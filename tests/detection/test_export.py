@@ -20,15 +20,15 @@ def test_exported_model_equals_torch(make_small, tmp_path, static):
     detector = make_small(stride=None if static else 16)
     path = tmp_path / "small.onnx"
     export_onnx(detector, path, static=static)
-    _exported = load_onnx(path)
-    assert _exported.head == "candidates"
+    exported = load_onnx(path)
+    assert exported.head == "candidates"
     image = torch.rand(2, 3, 50, 90, generator=torch.Generator().manual_seed(0))
-    ours, theirs = detector.propose(detector.fit(image)[0]), _exported.propose(_exported.fit(image)[0])
+    ours, theirs = detector.propose(detector.fit(image)[0]), exported.propose(exported.fit(image)[0])
     torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(theirs.classes, ours.classes, rtol=0, atol=1e-5)
     torch.testing.assert_close(theirs.objectness, ours.objectness, rtol=0, atol=1e-5)
     assert _largest_difference(detector, path) <= 1e-4
-    ours, theirs = detector(image), _exported(image)
+    ours, theirs = detector(image), exported(image)
     assert ours.count.min() > 3
     torch.testing.assert_close(theirs.scores, ours.scores, rtol=0, atol=1e-4)
     torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-3, atol=1e-2)
@@ -51,12 +51,12 @@ def test_the_exported_model_contains_its_settings(make_small, tmp_path):
     model = onnx.load(path)
     onnx.checker.check_model(model, full_check=True)
     assert [output.name for output in model.graph.output] == list(_OUTPUTS)
-    _exported = load_onnx(path)
-    ours, theirs = (json.loads(json.dumps(each.settings())) for each in (detector, _exported))
+    exported = load_onnx(path)
+    ours, theirs = (json.loads(json.dumps(each.settings())) for each in (detector, exported))
     shared = (ours.keys() & theirs.keys()) - {"digest"}
     assert {"name", "background", "input_size", "stride", "fill"} <= shared
     assert {key: theirs[key] for key in shared} == {key: ours[key] for key in shared}
-    assert _exported.classes == ("cat", "dog")
+    assert exported.classes == ("cat", "dog")
 
 
 def test_other_detectors_and_unwritable_files_are_refused(make_small, tmp_path, make_onnx):
@@ -84,7 +84,7 @@ def test_command_line_exports_an_equal_model(tiny_weights, tmp_path, monkeypatch
     monkeypatch.setattr(sys, "argv", ["export", "yolov3-tiny", str(path), "--weights", str(tiny_weights)])
     main()
     assert "largest difference" in capsys.readouterr().out
-    detector, _exported = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch"), load_detector(path)
-    assert _exported.classes == COCO_CLASSES
-    assert _exported.name == "yolov3-tiny"
+    detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch"), load_detector(path)
+    assert exported.classes == COCO_CLASSES
+    assert exported.name == "yolov3-tiny"
     assert _largest_difference(detector, path) <= 1e-4

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -46,7 +45,7 @@ class Screens(Scenes):
         self.ids = list(self._files)
         self.searches = {name: searches[name] for name in self.ids}
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:  # type: ignore[override]
         """sha256 of pictures, screens and targets."""
         what = [(self.digest(i), self.searches[n].target, self.searches[n].box) for i, n in enumerate(self.ids)]
