@@ -35,7 +35,7 @@ from semfov.io.schema import is_number
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.paths import GazePrediction, GazeRecord
+from semfov.paths import GazePrediction, Record
 from semfov.paths.gaze import ScanpathLike
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
@@ -295,7 +295,7 @@ class ActivePerception(nn.Module):
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
-    ) -> GazeRecord:
+    ) -> Record:
         """Search a picture for a target class, and decide whether it is there (`record.decision`).
 
         The recommended agent looks closely at places that seem to hold the target: it enlarges a window around them to
@@ -387,7 +387,7 @@ class ActivePerception(nn.Module):
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
-    ) -> GazeRecord:
+    ) -> Record:
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
         The first look is the whole picture. Each other look is a window at the magnification with the largest expected
@@ -450,7 +450,7 @@ class ActivePerception(nn.Module):
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
-    ) -> GazeRecord:
+    ) -> Record:
         """Explore a picture: learn which classes are where, without a target.
 
         It ends at the first limit that is reached, or when no look is expected to gain at least `worth`.
@@ -594,7 +594,7 @@ class ActivePerception(nn.Module):
                 check_grid(module.metadata.get("training", {}), grid, module.title)
 
 
-def _counting(record: GazeRecord, least: float | None) -> GazeRecord:
+def _counting(record: Record, least: float | None) -> Record:
     """The record, whose objects count from `least` on; None leaves it as it is."""
     check_number(0.0 if least is None else least, "least", 0, 1)
     return record if least is None else replace(record, least=least)

@@ -72,9 +72,9 @@ def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_
     assert [moment.cell for moment in moments] == searched.cells.tolist()
     for moment, posterior, seen in zip(moments, searched.posterior, searched.detections, strict=True):
         assert torch.equal(moment.probability, posterior)
-        assert torch.equal(moment.detections.boxes, seen.boxes)
+        assert torch.equal(moment.seen.boxes, seen.boxes)
         assert torch.equal(moment.visited.nonzero()[:, 0], searched.cells[: moment.number + 1].sort().values)
-    assert set(moments[0].seconds) == {"open", "foveate", "detect", "weigh", "update belief", "choose"}
+    assert set(moments[0].seconds[0]) == {"open", "foveate", "detect", "weigh", "update belief", "choose"}
 
 
 def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration(one_thread):
@@ -235,8 +235,8 @@ def test_frames_of_opencv_give_the_same_moments():
     ]
     for moment in moments[1:]:
         assert torch.equal(moment.probability, moments[0].probability)
-        assert torch.equal(moment.detections.scores, moments[0].detections.scores)
-    assert int(moments[0].detections.labels[0, 0]) == 2
+        assert torch.equal(moment.seen.scores, moments[0].seen.scores)
+    assert int(moments[0].seen.labels[0, 0]) == 2
     refused("order of channels", agent_with(observer).live, "green", color="brg")
 
 

@@ -13,10 +13,10 @@ from semfov.data.inputs import ImageLike
 from semfov.decision import Decision
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole
-from semfov.paths import Ending, GazeRecord, Moment, RecordedLook
+from semfov.paths import Ending, Moment, Record, RecordedLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
-_Record = TypeVar("_Record", bound=GazeRecord)
+_Record = TypeVar("_Record", bound=Record)
 
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""

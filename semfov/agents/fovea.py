@@ -374,7 +374,7 @@ class FoveaEpisode(Episode[Scanpath]):
         assert self._last is not None
         assert self._looks is not None
         (step, _), grid, belief = self._last, self._looks.grid, self._last[0].belief
-        cell, detections, seconds, closer = self._present
+        (cell, detections, seconds, closer), decision = self._present, self.decision
         if self.target is None:
             probability = 1 - belief.class_probabilities()[0, :, 0]
         else:
@@ -389,18 +389,19 @@ class FoveaEpisode(Episode[Scanpath]):
         return FoveaMoment(
             classes=self.classes,
             target=self.target,
-            decision=self.decision,
+            decision=decision,
             number=self.passes - 1,
             grid=grid,
             cell=cell,
             fixation=grid.centres[cell].to(step.fixation),
-            detections=detections,
+            detections=(detections,),
             probability=probability,
             belief=belief,
             visited=step.visited[0],
             next_cell=int(step.next_cell) if self._candidate is None else self._candidate,
-            seconds=seconds,
-            closer=None if closer is None else replace(closer, fixation=0),
+            seconds=(seconds,),
+            closer=() if closer is None else (replace(closer, fixation=0, number=0),),
+            found=decision is not None and decision.outcome == "found",
             photograph=photograph,
         )
 

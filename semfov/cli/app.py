@@ -25,7 +25,7 @@ from semfov.data.classes import class_index
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError, SemfovError
-from semfov.paths import GazeRecord, Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
@@ -238,7 +238,7 @@ class _OwnLooks(NamedTuple):
 
     record: Scanpath
     advice: int
-    agent: GazeRecord
+    agent: Record
 
     @property
     def point(self) -> tuple[float, float]:

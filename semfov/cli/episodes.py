@@ -28,7 +28,7 @@ from semfov.head.world import World
 from semfov.io.files import plain_name, sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
-from semfov.paths import GazeRecord
+from semfov.paths import Record
 from semfov.paths.georeference import georeference
 from semfov.report import write_page
 from semfov.runs.config import WHERE
@@ -82,7 +82,7 @@ class PictureJob(ABC):
         }
 
     @abstractmethod
-    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Look at a picture, with the arguments that all subcommands share, and return the record."""
 
     def outcome(self, number: int) -> PictureOutcome | SemfovError:

@@ -18,7 +18,7 @@ from semfov.cli.text import looks_text, outcome_text
 from semfov.cli.truth import Truth, read_truth
 from semfov.data.classes import canonical_name
 from semfov.io.files import plain_name
-from semfov.paths import GazeRecord, Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief, plot_belief_bars
 from semfov.viz.scanpath import plot_foveated_strip
@@ -47,7 +47,7 @@ class PictureOutcome:
 
 
 def _result_row(
-    record: GazeRecord,
+    record: Record,
     name: str,
     seconds: float,
     kind: str | None,
@@ -82,7 +82,7 @@ def _result_row(
 
 
 def picture_outcome(
-    record: GazeRecord,
+    record: Record,
     opened: PictureLike,
     source: PictureSource,
     options: PictureOptions,
@@ -123,7 +123,7 @@ def picture_outcome(
     )
 
 
-def _draw_episode(record: GazeRecord, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:
+def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:
     """Draw those figures and the animation that a record of this kind has; returns the files by name."""
     if not drawings:
         return {}

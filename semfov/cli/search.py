@@ -26,7 +26,7 @@ from semfov.data.classes import class_index
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import InputError, check, check_options, lookup
 from semfov.io.files import check_writable
-from semfov.paths import GazeRecord
+from semfov.paths import Record
 from semfov.report.page import page_path
 
 
@@ -62,7 +62,7 @@ class _SearchJob(PictureJob):
         """What outcomes depend on, with the classes that word vectors tell."""
         return {**super().depends_on(), "weights": self.weights}
 
-    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Search a picture."""
         agent, options, weights = self.agent, self.options, self.weights
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
@@ -95,7 +95,7 @@ class _FindJob(PictureJob):
         self.target = None if self.targets is None else self.targets[0]
         self.title = f"all objects{': ' if self.targets else ''}{', '.join(self.targets or [])}"
 
-    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Find all objects in a picture."""
         settings = {name: getattr(self.options, name) for name in ("worth", "least", "batch")}
         return self.agent.find_all(picture, self.targets, **settings, **shared)
@@ -113,7 +113,7 @@ class _ExploreJob(PictureJob):
             detector_classes(options)
         self.agent = make_agent(options) if agent is None else agent
 
-    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> GazeRecord:
+    def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Explore a picture."""
         settings = {name: getattr(self.options, name) for name in ("seed", "worth", "least")}
         return self.agent.explore(picture, start=self.start, **settings, **shared)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
-from semfov.paths import GazeRecord, Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.semantic import named_regions
@@ -15,7 +15,7 @@ _OBJECTS_LISTED = 20
 """Largest number of objects that are listed."""
 
 
-def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
+def outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
@@ -29,7 +29,7 @@ def outcome_text(record: GazeRecord, name: str, seconds: float) -> str:
     return "\n".join(lines)
 
 
-def _decision_text(record: GazeRecord, decision: Decision) -> str:
+def _decision_text(record: Record, decision: Decision) -> str:
     """Say whether the target was found, and where."""
     what = "probability that the picture holds it:" if record.decided_by == "probability" else record.decided_by
     name, probability = record.target_name, f"{what} {decision.probability:.2f}"
@@ -42,7 +42,7 @@ def _decision_text(record: GazeRecord, decision: Decision) -> str:
     return f"found {name}{where}{edges}, {probability}"
 
 
-def _objects_lines(record: GazeRecord) -> list[str]:
+def _objects_lines(record: Record) -> list[str]:
     """A line for each of the most confident objects."""
     rows = record.object_rows()
     lines = [
@@ -69,7 +69,7 @@ def _regions_lines(scanpath: Scanpath) -> list[str]:
     return lines
 
 
-def looks_text(record: GazeRecord) -> str:
+def looks_text(record: Record) -> str:
     """The looks as a table: where, which part of the picture, what was detected, and when it ended."""
     rows = [
         [

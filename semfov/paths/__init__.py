@@ -1,6 +1,6 @@
 """Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
 
-from semfov.paths.base import GazeRecord, Record
+from semfov.paths.base import Record
 from semfov.paths.endings import Ending
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
@@ -13,7 +13,6 @@ __all__ = [
     "Ending",
     "FoveaMoment",
     "GazePrediction",
-    "GazeRecord",
     "HeadPath",
     "RecordedLook",
     "Moment",

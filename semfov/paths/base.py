@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,17 +38,27 @@ _NAMED = 5  # largest number of objects that the text form names
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Record(Conversion):
-    """Base of all records: its looks, what was looked for, what was found, and what was decided.
+    """Base of all records: its looks, what was looked for, what was found, what was decided, and why it ended.
 
     A record is the list of its looks (`looks`, or by iteration) and what its kind adds. Its objects are one set: those
     that `describe` counts, `plot` draws and `objects` returns. All points and boxes are in pixels of the picture.
 
+    `describe` and `why_it_ended` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a picture,
+    tables, fixations in the format of human data, and a file.
+
     Attributes:
         classes: names of the classes, background first.
         target: class index 1..K that was searched for; None for all classes.
+        detections: detections of each look, batches of one.
+        found: whether a search found its target.
+        closer: closer looks of a search, in order.
+        ending: reason for the end; None if it is not known, and for a frame of a stream.
+        seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
         least: score from which on objects count, in windows their probability or score (`threshold_in_words`).
+        unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
+            no probabilities.
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
         source: file of the picture; None if it does not come from a file.
         shown: the `white` and the `bands` that were shown of the file; None for neither.
@@ -62,9 +73,15 @@ class Record(Conversion):
 
     classes: tuple[str, ...]
     target: int | None
+    detections: tuple[Detections, ...]
+    found: bool = False
+    closer: tuple[CloseUp, ...] = ()
+    ending: Ending | None = None
+    seconds: tuple[Any, ...] = ()
     decision: Decision | None = None
     targets: tuple[int, ...] = ()
     least: float = LEAST
+    unseen: tuple[float, float] | None = None
     photograph: Tensor | None = None
     source: str | None = None
     shown: Mapping[str, Any] | None = None
@@ -73,6 +90,7 @@ class Record(Conversion):
     """Kind of look: of a fovea, at windows, or of a head that turns."""
 
     _format: ClassVar[Format]
+    _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
 
     @abstractmethod
     def _looks(self) -> Iterator[RecordedLook]:
@@ -93,7 +111,7 @@ class Record(Conversion):
 
     def __len__(self) -> int:
         """Number of looks, the first included."""
-        return len(self.looks)
+        return len(self.detections)
 
     def __getitem__(self, number: int) -> RecordedLook:
         """The look of a number, as iteration gives it; -1 is the last one."""
@@ -102,12 +120,7 @@ class Record(Conversion):
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
-        return len(self) + sum(look.number is None for look in self.closer_looks)
-
-    @property
-    def closer_looks(self) -> Sequence[CloseUp]:
-        """The closer looks."""
-        return ()
+        return len(self) + sum(look.number is None for look in self.closer)
 
     @property
     def target_name(self) -> str | None:
@@ -116,13 +129,14 @@ class Record(Conversion):
 
     @property
     def measure(self) -> str:
-        """What the scores of objects are, in a word: `score`, or `probability`."""
-        return "score"
+        """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
+        return "score" if self.unseen is None else "probability"
 
     @property
     def threshold_in_words(self) -> str:
-        """From what on objects count, such as `score 0.3`."""
-        return f"{self.measure} {self.least:g}"
+        """From what on objects count, such as `probability or score 0.5`; in a search only the probability counts."""
+        score = " or score" if self.decision is None and self.unseen is not None else ""
+        return f"{self.measure}{score} {self.least:g}"
 
     @property
     def decided_by(self) -> str:
@@ -168,7 +182,7 @@ class Record(Conversion):
         distances = [
             distances_to(look.detections.boxes[0], torch.tensor(look.fixation, dtype=torch.float64)) for look in self
         ]
-        return merge_fixations(looks, distances, self.closer_looks)
+        return merge_fixations(looks, distances, self.closer)
 
     @property
     def objects(self) -> Objects:
@@ -187,25 +201,40 @@ class Record(Conversion):
     @property
     def confirmable(self) -> bool:
         """Whether objects can be confirmed: by a decision or by closer looks."""
-        return self.decision is not None or len(self.closer_looks) > 0
+        return self.decision is not None or len(self.closer) > 0
 
     @property
     def refuted(self) -> list[CloseUp]:
         """The closer looks that did not confirm that the target is there."""
         boxes = [box for box, *_ in self._confirmed_places]
-        return [look for look in self.closer_looks if not any(look.box.equal(box) for box in boxes)]
+        return [look for look in self.closer if not any(look.box.equal(box) for box in boxes)]
 
     @property
     def expected(self) -> dict[str, float]:
-        """Expected number of objects by the name of their class; without a model of it, the number of `objects`."""
-        counts = Counter(self.objects.labels.tolist())
-        labels = self._sought or tuple(counts)
-        return {self.classes[label]: float(counts[label]) for label in labels}
+        """Expected number of objects by the name of their class; without a model of it, the number of `objects`.
+
+        With a model it is the sum of the probabilities of all candidates, and of what further looks are expected to
+        show, of which each class has its share of that sum. It is NaN for a class to which the detector hardly reacts
+        (`semfov.paths.ZoomPath.reacts`), and null in files.
+        """
+        return {name: mean for name, (mean, _) in self._claimed().items()}
 
     @property
     def expected_error(self) -> dict[str, float]:
-        """Standard deviation of the expected number by the name of the class; 0 without a model of it."""
-        return dict.fromkeys(self.expected, 0.0)
+        r"""Standard deviation of the expected number of objects by the name of their class; 0 without a model of it.
+
+        With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
+        has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
+        share :math:`\tau` (`spread`) of the expected number E:
+
+        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+        """
+        return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
+
+    def _claimed(self) -> dict[str, tuple[float, float]]:
+        """Mean and variance of the number of objects of each class."""
+        counts = Counter(self.objects.labels.tolist())
+        return {self.classes[label]: (float(counts[label]), 0.0) for label in self._sought or counts}
 
     @property
     def _sought(self) -> tuple[int, ...]:
@@ -215,7 +244,7 @@ class Record(Conversion):
     @property
     def _confirmed_places(self) -> list[tuple[Tensor, int, float, int]]:
         """Box, class, probability and look of the places that closer looks and the decision confirmed."""
-        decision, closer = self.decision, self.closer_looks
+        decision, closer = self.decision, self.closer
         box = decision.box if decision is not None and decision.outcome == "found" else None
         others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
         places = [(look.box, look.target, look.place, number_of(look)) for look in others]
@@ -246,9 +275,31 @@ class Record(Conversion):
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
         return f"{', '.join(names) or every} from {self.threshold_in_words}"
 
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why the search or the exploration ended.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
+        sentences, looks = self._sentences, self.passes
+        if self.closer and self.found:
+            # Windows as large as the picture: the first look is a closer look already.
+            box = None if self.decision is None else self.decision.box
+            showing = [look.number for look in self.closer if box is not None and look.box.equal(box)]
+            found = sentences["closer found"]
+            return sentences.get("first found", found) if showing == [0] else found
+        if self.ending == "decision" and self.decision is not None:
+            outcome, closer = self.decision.outcome, any(look.number != 0 for look in self.closer)
+            return sentences.get(f"closer {outcome}" if closer else outcome, sentences[outcome])
+        if self.ending == "shifts":
+            return f"All {len(self) - 1} gaze shifts were made."
+        if self.ending == "passes":
+            return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
+        return sentences.get(self.ending or "", "")
+
     def summary(self) -> str:
-        """Describe the outcome, and explain why it ended if it did."""
-        return self.describe()
+        """Describe the outcome, and explain why the search or the exploration ended."""
+        return f"{self.describe()}. {self.why_it_ended()}".rstrip()
 
     def __repr__(self) -> str:
         """The summary, the looks, and the most confident objects."""
@@ -321,6 +372,35 @@ class Record(Conversion):
             The description; None if it is not known.
         """
         return None
+
+    def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
+        """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.
+
+        Args:
+            picture: name of the picture.
+            subject: name of the observer.
+
+        Returns:
+            The fixations, with the target of a search and whether it was found.
+        """
+        points = torch.tensor([look.fixation for look in self], dtype=torch.float64).view(-1, 2).numpy()
+        found = None if self.target is None else self.found
+        return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
+
+    def compare(
+        self, people: Fixations | Record | Sequence[Fixations | Record] | str | PathLike[str]
+    ) -> Mapping[str, tuple[float, float]]:
+        """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
+
+        Args:
+            people: fixations, those of one person, or the path of a file (`semfov.data.fixations.read_fixations`).
+
+        Returns:
+            Each measure of this record and of the people among themselves; it prints as a table.
+        """
+        from semfov.metrics.scanpath.beside import compare_scanpath
+
+        return compare_scanpath(self, people)
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the looks and the objects on the picture.
@@ -420,12 +500,12 @@ class Record(Conversion):
         Returns:
             One dictionary for each look.
         """
-        closer = {number_of(look): look.place for look in self.closer_looks}
+        closer = {number_of(look): look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
         return [look_columns(look, self.classes, closer.get(look.number), brought[look.number]) for look in self]
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values.
+        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.
 
         Returns:
             Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
@@ -438,8 +518,11 @@ class Record(Conversion):
             values |= {"outcome": decision.outcome, "probability": decision.probability}
             edges = (*(self.found_at or (None, None)), *box)
             values |= dict(zip(("x", "y", "x1", "y1", "x2", "y2"), edges, strict=True))
-        error = self.expected_error if self.measure == "probability" else dict.fromkeys(self.expected)
-        values |= {"least": self.least, "expected": self.expected, "expected_error": error, "passes": self.passes}
+        error = dict.fromkeys(self.expected, math.nan) if self.unseen is None else self.expected_error
+        values["least"] = self.least
+        for key, numbers in (("expected", self.expected), ("expected_error", error)):
+            values[key] = {name: None if math.isnan(number) else number for name, number in numbers.items()}
+        values["passes"] = self.passes
         return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -452,7 +535,7 @@ class Record(Conversion):
             InputError: the name is that of a table, a page, a picture or a film.
             DataError: the file cannot be written.
         """
-        self._format.write(path, self._base(), *self._contents())
+        self._format.write(path, vars(self), *self._contents())
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -475,10 +558,6 @@ class Record(Conversion):
         made = {each.name for each in fields_of(cls) if each.init}
         return cls(**{name: value for name, value in fields.items() if name in made})
 
-    def _base(self) -> Mapping[str, Any]:
-        """The attributes that the files of all records keep."""
-        return vars(self)
-
     @abstractmethod
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON values of a file, beside those of the base."""
@@ -489,98 +568,3 @@ class Record(Conversion):
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Make the other attributes from the tensors and JSON values of a file."""
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class GazeRecord(Record):
-    """Base of the records of whole searches and explorations: the looks, the decision, and the reason for the end.
-
-    `describe` and `why_it_ended` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a picture,
-    tables, fixations in the format of human data, and a file.
-
-    Beside the attributes of `Record` it has those of its looks and of its end.
-
-    Attributes:
-        detections: detections of each look, batches of one.
-        found: whether a search found its target.
-        closer: closer looks of a search, in order.
-        ending: reason for the end; None if it is not known.
-        seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
-
-    Example::
-
-        record = agent.search("kitchen.jpg", "cup")
-        print(record.summary())
-        record.save("kitchen.safetensors")
-    """
-
-    detections: tuple[Detections, ...]
-    found: bool = False
-    closer: tuple[CloseUp, ...] = ()
-    ending: Ending | None = None
-    seconds: tuple[Any, ...] = ()
-
-    _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
-
-    def __len__(self) -> int:
-        """Number of looks, the first included."""
-        return len(self.detections)
-
-    @property
-    def closer_looks(self) -> Sequence[CloseUp]:
-        """The closer looks."""
-        return self.closer
-
-    def why_it_ended(self) -> str:
-        """Explain in one sentence why the search or the exploration ended.
-
-        Returns:
-            The sentence; empty if the reason is not known.
-        """
-        sentences, looks = self._sentences, self.passes
-        if self.closer and self.found:
-            # Windows as large as the picture: the first look is a closer look already.
-            box = None if self.decision is None else self.decision.box
-            showing = [look.number for look in self.closer if box is not None and look.box.equal(box)]
-            return sentences["first found" if showing == [0] else "closer found"]
-        if self.ending == "decision" and self.decision is not None:
-            outcome, closer = self.decision.outcome, any(look.number != 0 for look in self.closer)
-            return sentences.get(f"closer {outcome}" if closer else outcome, sentences[outcome])
-        if self.ending == "shifts":
-            return f"All {len(self) - 1} gaze shifts were made."
-        if self.ending == "passes":
-            return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
-        return sentences.get(self.ending or "", "")
-
-    def summary(self) -> str:
-        """Describe the outcome, and explain why the search or the exploration ended."""
-        return f"{self.describe()}. {self.why_it_ended()}".rstrip()
-
-    def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
-        """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.
-
-        Args:
-            picture: name of the picture.
-            subject: name of the observer.
-
-        Returns:
-            The fixations, with the target of a search and whether it was found.
-        """
-        points = torch.tensor([look.fixation for look in self], dtype=torch.float64).view(-1, 2).numpy()
-        found = None if self.target is None else self.found
-        return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
-
-    def compare(
-        self, people: Fixations | GazeRecord | Sequence[Fixations | GazeRecord] | str | PathLike[str]
-    ) -> Mapping[str, tuple[float, float]]:
-        """Compare the fixations with those of people in the same picture (`semfov.metrics.scanpath.compare_scanpath`).
-
-        Args:
-            people: fixations, those of one person, or the path of a file (`semfov.data.fixations.read_fixations`).
-
-        Returns:
-            Each measure of this record and of the people among themselves; it prints as a table.
-        """
-        from semfov.metrics.scanpath.beside import compare_scanpath
-
-        return compare_scanpath(self, people)

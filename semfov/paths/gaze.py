@@ -27,7 +27,7 @@ from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
-from semfov.paths.base import GazeRecord
+from semfov.paths.base import Record
 from semfov.paths.stimulus import reduced_copy
 from semfov.words import GAZE_WORDS, not_there
 
@@ -41,7 +41,7 @@ _REACH = 0.05
 _LONGEST = 100
 """Largest number of fixations of a drawn scanpath."""
 
-ScanpathLike = Fixations | GazeRecord | Tensor | np.ndarray | Sequence[Sequence[float]]
+ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
 
 
@@ -424,9 +424,9 @@ class GazePrediction:
 def _fixations_of(given: object, argument: str, size: tuple[int, int], source: str | None) -> Fixations:
     """The fixations of one viewer in pixels of the picture of `(width, height)`; those far outside give a warning."""
     one = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
-    if isinstance(given, GazeRecord):
+    if isinstance(given, Record):
         given = given.as_fixations(given.source or source or "")
-    elif isinstance(given, list | tuple) and any(isinstance(each, Fixations | GazeRecord) for each in given):
+    elif isinstance(given, list | tuple) and any(isinstance(each, Fixations | Record) for each in given):
         check(False, argument, one, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
     elif isinstance(given, list | tuple | np.ndarray | Tensor):
         try:

@@ -23,7 +23,7 @@ from semfov.head.sphere import Sphere
 from semfov.head.views import Views
 from semfov.head.world import World
 from semfov.io.schema import Array, Field, Number, Object, Text
-from semfov.paths.base import GazeRecord
+from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
@@ -68,10 +68,10 @@ _FORMAT = Format(
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class HeadPath(GazeRecord):
+class HeadPath(Record):
     """The record of an episode: where eye and head looked, what was seen and what was believed.
 
-    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
+    Beside the attributes of `semfov.paths.Record` it has those of its looks.
 
     Attributes:
         views: the views and fixations that were possible. Those of a path from a file have the geometry of the scene,

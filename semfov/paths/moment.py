@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.errors import check
-from semfov.io.schema import Field, Number, Object
+from semfov.io.schema import Array, Field, Number, Object
 from semfov.paths.base import Record
 from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
 from semfov.paths.look import Box, RecordedLook, cell_columns
@@ -38,12 +38,12 @@ _FOVEA = Format(
         "size": pair(POSITIVE),
         "cell": WHOLE,
         "next_cell": WHOLE,
-        "seconds": Object({}, Number(low=0)),
+        "seconds": Array(Object({}, Number(low=0)), 1),
     },
 )
 """Format of the files of moments of a fovea."""
 
-_PLAIN = "number", "cell", "next_cell", "seconds"
+_PLAIN = "number", "cell", "next_cell"
 _TENSORS = "fixation", "probability", "visited"
 
 
@@ -70,9 +70,10 @@ class Moment(Record):
         return self.looks[-1].detections
 
     @property
-    @abstractmethod
     def examined(self) -> CloseUp | None:
         """The closer look, if this frame was spent on one; otherwise None."""
+        last = self.closer[-1] if self.closer else None
+        return last if last is not None and last.number == len(self) - 1 else None
 
     @property
     @abstractmethod
@@ -133,14 +134,12 @@ class FoveaMoment(Moment):
         grid: the cells.
         cell: the fixated cell, or the one that was looked at closely.
         fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
-        detections: detections of the look, a batch of one.
         probability: `(X·Y,)`, probability that each cell holds the target, or any object in an exploration, after the
             last look that was not a closer one.
         visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
         next_cell: the cell to look at in the next frame.
-        seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input. A closer look
-            has the stage `detect` alone.
-        closer: the closer look, if this frame was spent on one; otherwise None.
+        seconds: time of the look by stage, one mapping; `open` is the fitting of the frame into the detector's input. A
+            closer look has the stage `detect` alone.
         belief: belief of one episode that gave the probability; None in a moment from a file.
 
     Example::
@@ -152,26 +151,14 @@ class FoveaMoment(Moment):
     grid: Grid
     cell: int
     fixation: Tensor
-    detections: Detections
     probability: Tensor
     visited: Tensor
     next_cell: int
-    seconds: Mapping[str, float]
-    closer: CloseUp | None = None
+    seconds: tuple[Mapping[str, float]]
     belief: Belief | None = field(default=None, compare=False)
 
     how = "fovea"
     _format = _FOVEA
-
-    @property
-    def examined(self) -> CloseUp | None:
-        """The closer look, if this frame was spent on one; otherwise None."""
-        return self.closer
-
-    @property
-    def closer_looks(self) -> Sequence[CloseUp]:
-        """The closer look of the frame, if it is one."""
-        return () if self.closer is None else (self.closer,)
 
     @property
     def next_point(self) -> tuple[float, float]:
@@ -185,17 +172,12 @@ class FoveaMoment(Moment):
         width, height = (int(side) for side in self.grid.extent)
         return width, height
 
-    @property
-    def passes(self) -> int:
-        """One pass of the detector."""
-        return 1
-
     def _looks(self) -> Iterator[RecordedLook]:
         """The look at the frame, with the whole frame as its region."""
         (x, y), (width, height) = self.fixation.tolist(), self.size
         more = {"frame": self.number, **cell_columns(self.grid, self.cell, self.probability)}
         region = (0.0, 0.0, float(width), float(height))
-        yield RecordedLook(0, (x, y), region, self.detections, sum(self.seconds.values()), None, more)
+        yield RecordedLook(0, (x, y), region, self.detections[0], sum(self.seconds[0].values()), None, more)
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """The probability of the target, or of any object, in each cell."""
@@ -212,14 +194,9 @@ class FoveaMoment(Moment):
         row, column = divmod(self.cell, self.grid.columns)
         return [f"frame {self.number}, at (column, row): ({column}, {row})"]
 
-    def _base(self) -> Mapping[str, Any]:
-        record = {"detections": (self.detections,), "closer": self.closer_looks, "ending": None}
-        found = self.decision is not None and self.decision.outcome == "found"
-        return {**vars(self), **record, "found": found}
-
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         record = {name: getattr(self, name) for name in _PLAIN} | grid_values(self.grid)
-        return {name: getattr(self, name) for name in _TENSORS}, {**record, "seconds": dict(self.seconds)}
+        return {name: getattr(self, name) for name in _TENSORS}, {**record, "seconds": [dict(self.seconds[0])]}
 
     @classmethod
     def _fields(
@@ -233,9 +210,8 @@ class FoveaMoment(Moment):
         return {
             **{name: tensors[name] for name in _TENSORS},
             **{name: record[name] for name in _PLAIN},
+            "seconds": tuple(record["seconds"]),
             "grid": grid,
-            "detections": looks[0],
-            "closer": next(iter(shared["closer"]), None),
         }
 
 
@@ -275,12 +251,6 @@ class WindowMoment(ZoomPath, Moment):
     def window(self) -> Window:
         """The window that was looked at in this frame."""
         return self.glances[-1].window
-
-    @property
-    def examined(self) -> CloseUp | None:
-        """The closer look, if this frame was spent on one; otherwise None."""
-        last = self.closer[-1] if self.closer else None
-        return last if last is not None and last.number == len(self.glances) - 1 else None
 
     def describe(self) -> str:
         """Describe objects or decision at the frame in a few words."""

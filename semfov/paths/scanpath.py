@@ -21,7 +21,7 @@ from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
-from semfov.paths.base import GazeRecord
+from semfov.paths.base import Record
 from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
@@ -87,13 +87,13 @@ class _MadeWhenRead:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Scanpath(GazeRecord):
+class Scanpath(Record):
     """Fixations of one episode in order, with the detections and the belief at each of them.
 
     A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
     animation, a table and a file.
 
-    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
+    Beside the attributes of `semfov.paths.Record` it has those of its looks.
 
     Attributes:
         grid: the cells of the image.

@@ -14,7 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
-from semfov.paths.base import GazeRecord
+from semfov.paths.base import Record
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import RecordedLook
@@ -75,12 +75,12 @@ _PROBABILITY = (
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class ZoomPath(GazeRecord):
+class ZoomPath(Record):
     """The record of a search or an exploration of a large picture.
 
     In a notebook it shows the windows that were looked at; `plot` draws them on the picture.
 
-    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
+    Beside the attributes of `semfov.paths.Record` it has those of its looks.
 
     Attributes:
         lattice: lattice of the picture.
@@ -89,8 +89,6 @@ class ZoomPath(GazeRecord):
             probability that the target is at the place.
         candidates: objects merged from all looks (`semfov.zoom.merge`). With a fitted certainty their scores are the
             probabilities that box and class are right.
-        unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
-            no probabilities.
         spread: standard deviation of the share of the expected number by which it is off because the model does not
             suit the picture (`semfov.zoom.certainty`).
         detections: detections of each look, batches of one, with boxes in picture pixels.
@@ -110,7 +108,6 @@ class ZoomPath(GazeRecord):
     glances: tuple[Glance, ...]
     values: tuple[float, ...]
     candidates: Objects = field()
-    unseen: tuple[float, float] | None = None
     spread: float = SPREAD
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
@@ -127,30 +124,6 @@ class ZoomPath(GazeRecord):
         object.__setattr__(self, "found", found)
 
     @property
-    def expected(self) -> dict[str, float]:
-        """Expected number of objects by the name of their class, those included that no look has shown yet.
-
-        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
-        each class has its share of that sum. It is NaN for a class to which the detector hardly reacts (`reacts`), and
-        null in files. Without probabilities it is the number of `objects`.
-        """
-        return super().expected if self.unseen is None else {name: mean for name, (mean, _) in self._claimed().items()}
-
-    @property
-    def expected_error(self) -> dict[str, float]:
-        r"""Standard deviation of the expected number of objects by the name of their class; 0 without probabilities.
-
-        With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
-        has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
-        share :math:`\tau` (`spread`) of the expected number E:
-
-        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
-        """
-        if self.unseen is None:
-            return super().expected_error
-        return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
-
-    @property
     def reacts(self) -> bool:
         """Whether the detector reacts to one of the classes at least, so that a number of objects can be believed.
 
@@ -159,24 +132,13 @@ class ZoomPath(GazeRecord):
         """
         return any(self._reacts_to([label]) for label in self._sought or self.candidates.labels.unique().tolist())
 
-    def to_dict(self) -> dict[str, Any]:
-        """The outcome, the objects and the looks as JSON values, without numbers that are not claimed.
-
-        Returns:
-            Values by name, as `semfov.paths.Record.to_dict` has them; None for numbers that are NaN.
-        """
-        values = super().to_dict()
-        for key in ("expected", "expected_error"):
-            values[key] = {
-                name: None if number is None or math.isnan(number) else number for name, number in values[key].items()
-            }
-        return values
-
     def _reacts_to(self, labels: Sequence[int]) -> bool:
         return len(self.objects.of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where the detector hardly reacts."""
+        if self.unseen is None:
+            return super()._claimed()
         nothing = math.nan, math.nan
         numbers = self._numbers().items()
         return {self.classes[label]: number if self._reacts_to([label]) else nothing for label, number in numbers}
@@ -220,17 +182,6 @@ class ZoomPath(GazeRecord):
         if decided and target is not None and all(float(each.show[target - 1]) < SEEN for each in self.glances):
             return self._sentences["unseen"]
         return super().why_it_ended()
-
-    @property
-    def measure(self) -> str:
-        """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
-        return "score" if self.unseen is None else "probability"
-
-    @property
-    def threshold_in_words(self) -> str:
-        """From what on objects count, such as `probability or score 0.5`; in a search only the probability counts."""
-        score = " or score" if self.decision is None and self.unseen is not None else ""
-        return f"{self.measure}{score} {self.least:g}"
 
     def _counts(self, candidates: Objects) -> Tensor:
         """Candidates from the probability `least` on, and those that a look at the whole shows with such a score."""

@@ -100,7 +100,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
     detections = _detections(path, look, view)
     brought = Counter(each["label"] for each in objects if each["look"] == number)
-    closer = next((each for each in path.closer_looks if each.number == number), None)
+    closer = next((each for each in path.closer if each.number == number), None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     turned = None
     if path.how == "head":

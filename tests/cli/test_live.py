@@ -184,9 +184,9 @@ def moment(**changes):
     seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
     made = {
         "classes": ("background", "cup"),
-        "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": seen,
+        "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": (seen,),
         "probability": belief.probability(1)[0], "decision": None, "visited": torch.zeros(8, dtype=torch.bool),
-        "next_cell": 3, "seconds": {},
+        "next_cell": 3, "seconds": ({},),
     }  # fmt: skip
     return FoveaMoment(**{**made, **changes})
 
@@ -214,9 +214,9 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     assert changed[110:190, 110].all()
     assert not changed[115:185, 115:185].any()
     # A closer look is marked around its box instead of at the fixated point.
-    closer = CloseUp(0, 1, 6, box, 0.9, 0.95)
+    closer = CloseUp(0, 1, 6, box, 0.9, 0.95, number=0)
     there = {"grid": grid, "fixation": grid.centres[6], "next_cell": 6}
-    close = draw_moment(grey, moment(**there, closer=closer), "cup").astype(int)
+    close = draw_moment(grey, moment(**there, closer=(closer,)), "cup").astype(int)
     changed = abs(close - draw_moment(grey, moment(**there), "cup")).max(-1) > 8
     assert changed[105, 110:190].all()
     assert changed[110:190, 105].all()

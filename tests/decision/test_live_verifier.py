@@ -76,15 +76,15 @@ def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
         live = agent(Lasting(*script(seed))).live("red", rate=0, seed=seed, closer=3)
         moments = [live.step(picture) for _ in range(len(searched.cells) + len(searched.closer))]
         assert [each.number for each in moments] == list(range(len(moments)))
-        plain = [each for each in moments if each.closer is None]
+        plain = [each for each in moments if each.examined is None]
         assert [each.cell for each in plain] == searched.cells.tolist()
         for moment, seen in zip(plain, searched.detections, strict=True):
-            assert torch.equal(moment.detections.boxes, seen.boxes)
-        closely = [each.closer for each in moments if each.closer is not None]
+            assert torch.equal(moment.seen.boxes, seen.boxes)
+        closely = [each.examined for each in moments if each.examined is not None]
         for one, other in zip(closely, searched.closer, strict=True):
             assert torch.equal(one.box, other.box)
             # A moment has one look of the fovea, and a search has all of them.
-            apart = {"box": None, "fixation": 0}
+            apart = {"box": None, "fixation": 0, "number": None}
             assert one.fixation == 0
             assert vars(one) | apart == vars(other) | apart
         for before, after in pairwise(moments):
@@ -111,20 +111,20 @@ def test_a_closer_look_takes_the_frame_of_a_look():
     made.eye.detector.propose = lambda canvas: passes.append(1) or propose(canvas)
     live = made.live("red", rate=0.1, start=5)
     first = live.step(spots(5, contrast=0.9))
-    assert (first.cell, first.next_cell, first.closer) == (5, 5, None)
+    assert (first.cell, first.next_cell, first.examined) == (5, 5, None)
     assert first.decision.outcome == "undecided"
     moved = torch.roll(spots(5, contrast=0.9), 6, -1)
     moment = live.step(moved)
     assert moment.cell == 5
-    torch.testing.assert_close(moment.closer.box, torch.tensor([56.0, 50, 76, 70]), atol=1.5, rtol=0)
-    torch.testing.assert_close(moment.detections.boxes[0, 0], moment.closer.box)
+    torch.testing.assert_close(moment.examined.box, torch.tensor([56.0, 50, 76, 70]), atol=1.5, rtol=0)
+    torch.testing.assert_close(moment.seen.boxes[0, 0], moment.examined.box)
     assert (moment.decision.outcome, moment.decision.cell) == ("found", 5)
-    assert moment.decision.place == moment.closer.place > 0.75
-    assert torch.equal(moment.decision.box, moment.closer.box)
+    assert moment.decision.place == moment.examined.place > 0.75
+    assert torch.equal(moment.decision.box, moment.examined.box)
     assert moment.belief is first.belief
-    assert set(moment.seconds) == {"detect"}
+    assert set(moment.seconds[0]) == {"detect"}
     after = live.step(moved)
-    assert after.closer is None
+    assert after.examined is None
     assert after.cell != 5
     assert after.cell == moment.next_cell
     assert after.decision.outcome == "found"
@@ -142,7 +142,7 @@ def test_evidence_fades_in_the_frame_of_a_closer_look_too():
     live = agent(Counted(3, prior=0.25), Thresholds(0.99, 0.01, 0.3)).live("red", rate=0.2, start=5)
     first = live.step(spots(5))
     assert first.next_cell == 5
-    assert live.step(GREY).closer is not None
+    assert live.step(GREY).examined is not None
     after = live.step(GREY)
     torch.testing.assert_close(after.belief.beta - 0.25, math.exp(-0.4) * (first.belief.beta - 0.25))
     again = live.step(GREY)

@@ -20,7 +20,7 @@ from semfov.metrics.scanpath.density import _people_density
 from semfov.metrics.scanpath.multimatch import multimatch
 from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
-from semfov.paths import GazeRecord
+from semfov.paths import Record
 
 _CELLS = 8
 _LONGEST = 64
@@ -60,11 +60,11 @@ class ScanpathComparison(dict[str, BesidePeople]):
         return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
 
 
-_People = Fixations | GazeRecord | Sequence[Fixations | GazeRecord] | str | PathLike[str]
+_People = Fixations | Record | Sequence[Fixations | Record] | str | PathLike[str]
 """Fixations of one person or several, records of agents, or a file (`semfov.data.fixations.read_fixations`)."""
 
 
-def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> ScanpathComparison:
+def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathComparison:
     """Compare a scanpath with those of people in the same picture, and the people with each other.
 
     - `MultiMatch shape`, `direction`, `length`, `position` (`multimatch`): 1 for equal scanpaths; NaN below three
@@ -104,9 +104,9 @@ def compare_scanpath(scanpath: GazeRecord | Fixations, people: _People) -> Scanp
         table = read_fixations(people)
         people = [each for each in table if name is None or Path(each.picture).stem == name]
         check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
-    people = [people] if isinstance(people, Fixations | GazeRecord) or not isinstance(people, Iterable) else [*people]
+    people = [people] if isinstance(people, Fixations | Record) or not isinstance(people, Iterable) else [*people]
     named = own or next((each.picture for each in people if isinstance(each, Fixations)), "")
-    viewed = [each.as_fixations(each.source or named) if isinstance(each, GazeRecord) else each for each in people]
+    viewed = [each.as_fixations(each.source or named) if isinstance(each, Record) else each for each in people]
     others = [type(each).__name__ for each in viewed if not isinstance(each, Fixations)]
     check(not others, "people", "fixations, records of an agent, or a file", f"a {others[0]}" if others else "")
     check(len(viewed) > 0, "people", "fixations of at least one person", "none")
