@@ -9,7 +9,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.cli.options import DetectorsOptions
-from semfov.cli.text import table_lines
+from semfov.cli.outcome import table_lines
 from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, cache_folder
 from semfov.gaze.saliency import FixationDensity

@@ -171,7 +171,11 @@ class _TiffPicture(LargePicture):
                     at = slice(top + rows.start - y1, top + rows.stop - y1)
                     along = slice(left + columns.start - x1, left + columns.stop - x1)
                     part = tile[rows, columns]
-                    window[at, along, place] = part[..., 0] if planes else _taken(part, channels)
+                    if planes:
+                        part = part[..., 0]
+                    elif channels != [*range(part.shape[-1])]:
+                        part = part[..., channels]
+                    window[at, along, place] = part
         return window
 
     def _tile(self, number: int, size: int) -> NDArray[Any] | None:
@@ -217,11 +221,6 @@ class _TiffPicture(LargePicture):
             return None
         red, green, blue = self._bytes(np.full((1, 1, len(self._channels)), value, self._page.dtype))[0, 0].tolist()
         return red, green, blue
-
-
-def _taken(tile: NDArray[Any], channels: list[int]) -> NDArray[Any]:
-    """The channels of a tile, without a copy where they are all."""
-    return tile if channels == [*range(tile.shape[-1])] else tile[..., channels]
 
 
 def _is_converted(path: str | PathLike[str]) -> bool:
@@ -450,17 +449,14 @@ def open_large(
     if not isinstance(source, str | PathLike):
         return _MemoryPicture(source, color=color, white=white)
     check_local(source, "picture")
-    opened = _raster if kind in RASTERS else _tiff if kind in BY_WINDOWS else _photograph
-    picture = opened(source, white, bands)
+    if kind in BY_WINDOWS:
+        picture = (_raster if kind in RASTERS else _tiff)(source, white, bands)
+    else:
+        picture = _PhotographPicture(source, white)
     if white is not None or bands is not None:
         values = white if white is None or isinstance(white, str) else black_and_white(white, np.zeros(0))
         picture.shown = {"white": values, "bands": bands}
     return picture
-
-
-def _photograph(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
-    """A photograph that is decoded as a whole, and has no bands to choose from."""
-    return _PhotographPicture(path, white)
 
 
 def _raster(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:

@@ -3,7 +3,7 @@
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -176,27 +176,23 @@ class OnnxSession:
             timer.cancel()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, self._settings(self.further)
+        return self._again(self.further), ()
 
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
-        return _reopen(*self._settings(further))
+        return self._again(further)()
 
-    def _settings(self, further: Sequence[str]) -> tuple[Any, ...]:
-        return self.path, self.threads, self.device, self.providers, self.spinning, self.open_ended, further
-
-
-def _reopen(
-    path: Path,
-    threads: int,
-    device: torch.device,
-    providers: Sequence[Provider] | None,
-    spinning: bool,
-    open_ended: bool,
-    further: Sequence[str],
-) -> OnnxSession:
-    settings: dict[str, Any] = {"threads": threads, "device": device, "providers": providers, "spinning": spinning}
-    return OnnxSession(path, **settings, open_ended=open_ended, further=further)
+    def _again(self, further: Sequence[str]) -> "partial[OnnxSession]":
+        return partial(
+            OnnxSession,
+            self.path,
+            threads=self.threads,
+            device=self.device,
+            providers=self.providers,
+            spinning=self.spinning,
+            open_ended=self.open_ended,
+            further=further,
+        )
 
 
 @cache

@@ -413,11 +413,6 @@ def _decisions(
     return {name: _rates(each) for name, each in results.items()}
 
 
-def _by_detection(step: Step, target: int, grid: Grid) -> Tensor:
-    """Decide as agents without fitted models: the target is found by a detection with score 0.5 in the fixated cell."""
-    return confirms(step.detections, grid, step.cell, target, 0.5).long()
-
-
 class EvidenceFit(PartFit):
     """Train the target evidence, and choose its thresholds."""
 
@@ -467,8 +462,12 @@ class EvidenceFit(PartFit):
             f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
         rules: dict[str, tuple[Strategy, _Rule]] = {
-            "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
-            "raw": (ways["raw"], _by_detection),
+            "fitted": (learned, lambda step, target, grid: decide(step, target, thresholds)),
+            # Agents without fitted models find the target by a detection with score 0.5 in the fixated cell.
+            "raw": (
+                ways["raw"],
+                lambda step, target, grid: confirms(step.detections, grid, step.cell, target, 0.5).long(),
+            ),
         }
         decided = _decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
         shifts = (1, at, protocol.shifts)
@@ -497,7 +496,3 @@ class EvidenceFit(PartFit):
         )
         save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
         return PartResult(self.write(fit.model, gain.better, why), report, ["search.png"])
-
-
-def _by_thresholds(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> torch.Tensor:
-    return decide(step, target, thresholds)

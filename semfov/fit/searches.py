@@ -65,10 +65,6 @@ class TargetSearch(ABC, Generic[LookType]):
     def right(self, box: Tensor) -> bool:
         """Whether the target is at a box `(4,)`."""
 
-    def last(self, index: int, room: float) -> bool:
-        """Whether no look follows the one of this index, when `room` looks of both kinds are left."""
-        return index + 1 == len(self)
-
     def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
         """The outcome after a look without closer looks, 0 to go on, and whether the target is at the place found."""
         return 0, None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -196,7 +197,9 @@ def verify(
         for index in range(len(search)):
             count += 1
             room = search.passes - count
-            verifier.see(search.look(index, count), last=search.last(index, room))
+            # Where passes are limited, a search ends with them, after the last closer look.
+            last = index + 1 == len(search) if room == math.inf else room <= 1
+            verifier.see(search.look(index, count), last=last)
             for each in verifier.look_closely(room):
                 count += not places.seen(each)
                 ends.append(count)

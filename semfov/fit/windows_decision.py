@@ -165,10 +165,6 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         """Whether a box `(4,)` is that of an annotated object of the class."""
         return self.present and float(box_iou(box[None], self.objects).max()) >= SAME
 
-    def last(self, index: int, room: float) -> bool:
-        """Whether no pass is left after a closer look."""
-        return room <= 1
-
     def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
         """The outcome by the evidence alone; the place is that of the box with the highest score."""
         state, box = self.states[index], self.boxes[index]

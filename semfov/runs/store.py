@@ -60,6 +60,7 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
     """Looks at scenes by action, with the looks at a scene in one file."""
 
     width: ClassVar[int]
+    more: Mapping[str, Field] = {}  # names, shapes and ranges of the tensors that a look has besides its detections
 
     def __init__(
         self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int | None = None
@@ -71,7 +72,7 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
             "scores": Field(("M", "C" if components is None else components), low=0, high=1),
         }
         code = modules_digest(*sources, __name__)
-        super().__init__(folder, what, code, Schema(fields | self.more()))
+        super().__init__(folder, what, code, Schema(fields | {**self.more}))
 
     def load(self, digest: str) -> dict[_Action, _StoredLook]:
         """Read the looks at a scene."""
@@ -87,10 +88,6 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
         self.write(digest, {"actions": numbers, **self.pack([looks[action] for action in actions])})
-
-    def more(self) -> dict[str, Field]:
-        """Names, shapes and ranges of the tensors that a look has besides its detections."""
-        return {}
 
     @abstractmethod
     def encode(self, action: _Action) -> Sequence[float]:

@@ -27,20 +27,17 @@ class GlanceStore(LookStore[Window, Glance]):
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
         self.classes = classes
-        super().__init__(folder, {"settings": settings}, WINDOW_SOURCES, classes + 1)
-
-    def more(self) -> dict[str, Field]:
-        """Whether boxes are cut, the highest scores, and the gists."""
-        return {
+        self.more = {
             "cut": Field(("M",), torch.bool),
-            "show": Field(("N", self.classes), torch.float32, low=0, high=1),
+            "show": Field(("N", classes), torch.float32, low=0, high=1),
             "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
             "gist.counts": Field(("N", 2), torch.int64, low=0),
             "gist.cells": Field(("P",), torch.int32, low=0),
-            "gist.scores": Field(("P", self.classes), torch.float32, low=0, high=1),
+            "gist.scores": Field(("P", classes), torch.float32, low=0, high=1),
             "gist.sizes": Field(("P",), torch.float32, low=0),
             "gist.found": Field(("Q",), torch.int32, low=0),
         }
+        super().__init__(folder, {"settings": settings}, WINDOW_SOURCES, classes + 1)
 
     def encode(self, action: Window) -> Sequence[float]:
         """The fixation, the part of the picture, the level and the cells of a window."""

@@ -18,7 +18,7 @@ from pycocotools.cocoeval import COCOeval
 from torchvision.utils import draw_bounding_boxes
 
 from semfov import Detections, Grid, InputError
-from semfov.cli.episodes import _check_places
+from semfov.cli.search import _check_places
 from semfov.data.large import open_large
 from tests import small
 from tests.refusals import refused, unusable

@@ -10,7 +10,7 @@ import scipy.ndimage
 import torch
 
 from semfov import Grid
-from semfov.cli.text import _regions_lines
+from semfov.cli.outcome import _regions_lines
 from semfov.viz import plot_semantic_map
 from semfov.viz.semantic import _regions, borders, cell_entropy, named_regions
 from tests import small

@@ -7,8 +7,19 @@ sequences need `pip install semfov[human]`.
 
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
-from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
-from semfov.metrics.scanpath.maps import auc_borji, auc_judd, auc_shuffled, correlation, kullback_leibler, similarity
+from semfov.metrics.scanpath.maps import (
+    auc,
+    auc_borji,
+    auc_judd,
+    auc_shuffled,
+    correlation,
+    information_gain,
+    kullback_leibler,
+    log_density,
+    log_likelihood,
+    nss,
+    similarity,
+)
 from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
 from semfov.metrics.scanpath.performance import (
     found_at,

@@ -15,8 +15,8 @@ from semfov.data.fixations.record import Fixations, FixationValues
 from semfov.data.fixations.suspicions import check_viewed, warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
-from semfov.metrics.scanpath.conditional import auc, nss
 from semfov.metrics.scanpath.density import _people_density
+from semfov.metrics.scanpath.maps import auc, nss
 from semfov.metrics.scanpath.multimatch import multimatch
 from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from semfov.data.fixations.record import Fixations, FixationValues
 from semfov.data.fixations.suspicions import warn_outside
 from semfov.errors import check
-from semfov.metrics.scanpath.conditional import auc, log_likelihood, nss
-from semfov.metrics.scanpath.maps import auc_judd, correlation, kullback_leibler, similarity
+from semfov.metrics.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
 from semfov.paths.gaze import GazePrediction
 
 _BLUR = 0.03
