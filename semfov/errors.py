@@ -134,7 +134,7 @@ def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
     if name in names:
         return names[names.index(name)]
     near = get_close_matches(str(name), names, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names)}"
+    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names) or 'none'}"
     raise InputError(f"unknown {what} {name!r}; {hint}")
 
 
@@ -144,7 +144,8 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
     for name in options:
         if name not in names:
             near = [each for each in OTHER_WORDS.get(name, ()) if each in names] or get_close_matches(name, names)
-            hint = f"did you mean {' or '.join(f'{each}=' for each in near)}?" if near else f"known: {', '.join(names)}"
+            meant = " or ".join(f"{each}=" for each in near)
+            hint = f"did you mean {meant}?" if near else f"known: {', '.join(names) or 'none'}"
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 
 

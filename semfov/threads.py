@@ -31,7 +31,7 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
         if torch.compiler.is_compiling():
             return function(*args, **kwargs)
         before = torch.get_num_threads()
-        if before == 1 or max(sizes(args), default=0) >= _MANY_ELEMENTS:
+        if before == 1 or max(_sizes(args), default=0) >= _MANY_ELEMENTS:
             return function(*args, **kwargs)
         torch.set_num_threads(1)
         try:
@@ -42,15 +42,15 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
     return sparing
 
 
-def sizes(values: Iterable[object]) -> Iterator[int]:
+def _sizes(values: Iterable[object]) -> Iterator[int]:
     """Numbers of elements of the tensors among values, and in tuples and dataclasses among them."""
     for value in values:
         if isinstance(value, Tensor):
             yield value.numel()
         elif isinstance(value, tuple):
-            yield from sizes(value)
+            yield from _sizes(value)
         elif is_dataclass(value):
-            yield from sizes(vars(value).values())
+            yield from _sizes(vars(value).values())
 
 
 def available_cores() -> int:

@@ -14,7 +14,7 @@ __all__ = ["fuse", "kaplan", "product", "semba", "sum"]
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
 RULES: dict[str, _Rule] = {}
-"""The rules by name, without checks, for likelihoods from `scale_likelihood`."""
+"""The rules by name, without checks, for likelihoods from `_scale_likelihood`."""
 
 
 def _rule(rule: _Rule) -> _Rule:
@@ -24,10 +24,11 @@ def _rule(rule: _Rule) -> _Rule:
     @wraps(rule)
     def checked(beta: Tensor, likelihood: Tensor) -> Tensor:
         check_parameters(beta)
-        scaled = scale_likelihood(likelihood)
+        scaled = _scale_likelihood(likelihood)
         check_shape(likelihood, "likelihood", *beta.shape[-1:])
         return rule(beta, scaled)
 
+    rule.__qualname__ = f"{rule.__name__}.__wrapped__"  # where pickle finds the rule without checks
     return checked
 
 
@@ -154,7 +155,7 @@ def check_parameters(beta: Tensor) -> None:
     check(least > 0 and largest < math.inf, "beta", "positive, finite Dirichlet parameters", got)
 
 
-def scale_likelihood(likelihood: Tensor) -> Tensor:
+def _scale_likelihood(likelihood: Tensor) -> Tensor:
     """Check likelihoods `(..., K+1)`, and scale each row to a maximum of 1: no rule depends on a common factor."""
     check_tensor(likelihood, "likelihood")
     largest = likelihood.amax(-1, keepdim=True)
@@ -244,4 +245,4 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
 
 def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
     """Likelihoods of the detections that cover a cell, scaled; those of the others, such as padding, become 1."""
-    return scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))
+    return _scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))

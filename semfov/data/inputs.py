@@ -195,8 +195,8 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
         return points
     try:
         array = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{argument}: expected numbers (x, y), or several such pairs, got {points!r}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise InputError(f"{argument}: expected numbers (x, y), or several such pairs, got {points!r:.80}") from None
     check(array.shape[-1:] == (2,), argument, "(x, y), or several such pairs", points)
     return torch.from_numpy(array.copy())
 

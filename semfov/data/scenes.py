@@ -34,7 +34,7 @@ _DISTRIBUTIONS = {"skimage": "scikit-image", "matplotlib": "matplotlib"}
 _Box = tuple[int, int, int, int]
 
 
-class Photograph(NamedTuple):
+class _Photograph(NamedTuple):
     """A crop of a photograph from an installed package."""
 
     title: str
@@ -46,23 +46,23 @@ class Photograph(NamedTuple):
 
 
 _PHOTOGRAPHED_OBJECTS = (
-    Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
-    Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
-    Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
-    Photograph("cat", "skimage", "chelsea.png", (60, 0, 390, 300), "cat", (60, 0, 384, 300)),
-    Photograph("cup", "skimage", "coffee.png", (140, 0, 440, 330), "cup", (172, 17, 408, 312)),
-    Photograph("motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)),
+    _Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
+    _Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
+    _Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
+    _Photograph("cat", "skimage", "chelsea.png", (60, 0, 390, 300), "cat", (60, 0, 384, 300)),
+    _Photograph("cup", "skimage", "coffee.png", (140, 0, 440, 330), "cup", (172, 17, 408, 312)),
+    _Photograph("motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)),
 )
 _DISTRACTORS = (
-    Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
-    Photograph("deep field", "skimage", "hubble_deep_field.jpg", (100, 100, 700, 700)),
-    Photograph("colour wheel", "skimage", "color.png", (0, 0, 371, 370)),
-    Photograph("retina", "skimage", "retina.jpg", (0, 0, 1411, 1411)),
-    Photograph("tissue", "skimage", "ihc.png", (0, 0, 512, 512)),
-    Photograph("coins", "skimage", "coins.png", (0, 0, 384, 303)),
-    Photograph("moon", "skimage", "moon.png", (0, 0, 512, 512)),
-    Photograph("brick wall", "skimage", "brick.png", (0, 0, 512, 512)),
-    Photograph("gravel", "skimage", "gravel.png", (0, 0, 400, 400)),
+    _Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
+    _Photograph("deep field", "skimage", "hubble_deep_field.jpg", (100, 100, 700, 700)),
+    _Photograph("colour wheel", "skimage", "color.png", (0, 0, 371, 370)),
+    _Photograph("retina", "skimage", "retina.jpg", (0, 0, 1411, 1411)),
+    _Photograph("tissue", "skimage", "ihc.png", (0, 0, 512, 512)),
+    _Photograph("coins", "skimage", "coins.png", (0, 0, 384, 303)),
+    _Photograph("moon", "skimage", "moon.png", (0, 0, 512, 512)),
+    _Photograph("brick wall", "skimage", "brick.png", (0, 0, 512, 512)),
+    _Photograph("gravel", "skimage", "gravel.png", (0, 0, 400, 400)),
 )
 _TEXTURES = ("brick.png", "grass.png", "gravel.png")
 
@@ -70,7 +70,7 @@ _TEXTURES = ("brick.png", "grass.png", "gravel.png")
 class _Item(NamedTuple):
     """The place of a photograph in a scene."""
 
-    photograph: Photograph
+    photograph: _Photograph
     patch: _Box
     mirrored: bool
 
@@ -215,7 +215,7 @@ def _texture(file: str) -> NDArray[np.int64]:
     return (mirrored - grey.sum() // grey.size)[: _SIZE[1], : _SIZE[0]]
 
 
-def _cut_out(photograph: Photograph, size: tuple[int, int]) -> NDArray[np.uint8]:
+def _cut_out(photograph: _Photograph, size: tuple[int, int]) -> NDArray[np.uint8]:
     from PIL import Image
 
     pixels = Image.fromarray(_photograph(photograph.package, photograph.file))

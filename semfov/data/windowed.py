@@ -30,11 +30,11 @@ FIRST = 4
 _LARGEST = 1 << 25
 """Most pixels of a copy, so that all copies together take at most 134 MB."""
 
-OVERSAMPLING = 1.5
+_OVERSAMPLING = 1.5
 """Pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works."""
 
 
-def reduction_for(ratio: float, oversampling: float = OVERSAMPLING) -> int:
+def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
     """Largest factor by which a window may be reduced that is resampled afterwards.
 
     >>> [reduction_for(ratio) for ratio in (0, 2.9, 3, 9, 12.3)]
@@ -153,7 +153,7 @@ class LargePicture(ABC):
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         """Read a window; → `(h, w, 3)`."""
 
-    def reduction(self, ratio: float, oversampling: float = OVERSAMPLING) -> int:
+    def reduction(self, ratio: float, oversampling: float = _OVERSAMPLING) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
         many = self.size[0] * self.size[1] > _LARGE
         reduction = reduction_for(ratio, oversampling) if many else 1

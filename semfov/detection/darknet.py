@@ -131,7 +131,7 @@ _NEUTRAL = {
 }
 
 
-class Shape(NamedTuple):
+class _Shape(NamedTuple):
     """Channels of an output, and input pixels per output pixel."""
 
     channels: int
@@ -144,9 +144,9 @@ class _Builder:
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         self._pixels = size[0] * size[1]
         self._parameters = 0
-        self.shapes: list[Shape] = []
+        self.shapes: list[_Shape] = []
         self.sources: list[tuple[int, ...]] = []
-        self._here = Shape(channels, Fraction(1))
+        self._here = _Shape(channels, Fraction(1))
         self._makers: dict[str, Callable[[Section], nn.Module]] = {
             "convolutional": self._convolution,
             "maxpool": self._maxpool,
@@ -170,9 +170,9 @@ class _Builder:
         return self._makers[section.kind](section)
 
     def _note(self, channels: int, step: Fraction, *sources: int) -> None:
-        self._append(Shape(channels, step), (len(self.shapes) - 1, *sources))
+        self._append(_Shape(channels, step), (len(self.shapes) - 1, *sources))
 
-    def _append(self, shape: Shape, sources: tuple[int, ...]) -> None:
+    def _append(self, shape: _Shape, sources: tuple[int, ...]) -> None:
         """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
         if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
             raise DataError(
@@ -236,7 +236,7 @@ class _Builder:
                 f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
                 f"{counts}, got group_id={excerpt(group)} and groups={excerpt(groups)}"
             )
-        self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
+        self._append(_Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:

@@ -57,7 +57,7 @@ class OnnxDetector(Detector):
         super().__init__(
             name,
             names,
-            canvas_size(session, input_size),
+            _canvas_size(session, input_size),
             background=family.background if background is None else background,
             selection=selection,
             fill=preprocessing.fill,
@@ -227,7 +227,7 @@ def load_onnx(
         "name": published_name,
     }
     chosen = stored | {key: value for key, value in options.items() if value is not None}
-    size = canvas_size(session, chosen.get("input_size"))
+    size = _canvas_size(session, chosen.get("input_size"))
     outputs = probe(session, size)
     names = chosen.get("classes")
     if "head" not in chosen:
@@ -273,7 +273,7 @@ def load_onnx(
     )
 
 
-def canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> tuple[int, int]:
+def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> tuple[int, int]:
     """`(width, height)` of a model's canvas: its fixed size, or the wanted size of a model that takes any."""
     height, width = session.shape[2:]
     if input_size is None:

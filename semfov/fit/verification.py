@@ -213,11 +213,11 @@ def verify(
             ends=() if places.by_worth else tuple(ends),
             presence=verifier.decision(over=True).probability,
             looks=count,
-            unverified=unverified(search, thresholds),
+            unverified=_unverified(search, thresholds),
         )
 
 
-def unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _SearchEnd:
+def _unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _SearchEnd:
     """Decide along the looks of a search without closer looks; nothing is found without thresholds."""
     if thresholds is None:
         return None, len(search)
@@ -415,8 +415,8 @@ class VerificationFit(PartFit):
         fitted = fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
-        after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
-        before = scores(fitted.searches, [each.unverified for each in fitted.searches])
+        after = _scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
+        before = _scores(fitted.searches, [each.unverified for each in fitted.searches])
         gain = Difference.of(after, before)
         why = (
             f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
@@ -435,7 +435,7 @@ class VerificationFit(PartFit):
         )
 
 
-def scores(searches: Sequence[_VerifiedSearch], ends: Sequence[_SearchEnd]) -> FloatArray:
+def _scores(searches: Sequence[_VerifiedSearch], ends: Sequence[_SearchEnd]) -> FloatArray:
     """Average the scores of decisions in each photograph, with equal weight of present and of absent classes; → `(P,)`.
 
     Shapes: → `(P,)`.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from semfov.errors import check
 
-Size = int | str
+_Size = int | str
 """A number, a name such as `K` that stands for the same number in the whole file, or a sum such as `K+1` or `N-1`."""
 _Sizes = dict[str, int]
 """The numbers that names of sizes stand for, as far as they are known."""
@@ -27,7 +27,7 @@ _FLOATS = (torch.float32, torch.float64)
 class Field:
     """Requirements of a tensor in a file."""
 
-    shape: tuple[Size, ...]
+    shape: tuple[_Size, ...]
     dtype: torch.dtype | None = None
     low: float = -math.inf
     high: float = math.inf
@@ -75,7 +75,7 @@ class Number(Json):
     low: float = -math.inf
     high: float = math.inf
     above: float = -math.inf
-    size: Size | None = None
+    size: _Size | None = None
     whole: bool = False
 
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
@@ -99,7 +99,7 @@ class Array(Json):
     """Requirement of a JSON value: a list, of items of one kind or with a kind for each."""
 
     of: Json | tuple[Json, ...]
-    size: Size | None = None
+    size: _Size | None = None
     least: int = 0
     ascending: bool = False
     distinct: bool = False
@@ -197,9 +197,9 @@ class Schema:
         check(len(free) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, free))))
 
 
-def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
+def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
     """Requirements of the tensors of an `nn.Sequential` with two hidden layers, each followed by an activation."""
-    layers: Sequence[tuple[Size, Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
+    layers: Sequence[tuple[_Size, _Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
     tensors = {}
     for number, (out, into) in enumerate(layers):
         tensors[f"{name}.{2 * number}.weight"] = Field((out, into), low=-largest, high=largest)
@@ -241,7 +241,7 @@ def excerpt(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _fits(size: Size, number: int, sizes: _Sizes) -> bool:
+def _fits(size: _Size, number: int, sizes: _Sizes) -> bool:
     """Whether a number agrees with a size; a size that was unknown is known from then on."""
     if isinstance(size, int):
         return size == number

@@ -14,7 +14,7 @@ SensorName = Literal["published", "published-narrow", "gradual", "log-polar", "m
 
 
 @dataclass(frozen=True)
-class NamedSensor:
+class _NamedSensor:
     """How a named sensor is made.
 
     Attributes:
@@ -36,17 +36,17 @@ class NamedSensor:
         return {**self.settings, **changes}
 
 
-def _foveation(sigma: float, growth: float, *, published: bool = False) -> NamedSensor:
+def _foveation(sigma: float, growth: float, *, published: bool = False) -> _NamedSensor:
     settings = {"sigma": sigma, "growth": growth, "levels": 5, "convention": "kornia"}
-    return NamedSensor(Foveation, settings, published)
+    return _NamedSensor(Foveation, settings, published)
 
 
-SENSORS: dict[SensorName, NamedSensor] = {
+SENSORS: dict[SensorName, _NamedSensor] = {
     "published": _foveation(100.0, 1.0, published=True),
     "published-narrow": _foveation(50.0, 1.0, published=True),
     "gradual": _foveation(100.0, 2.0),
-    "log-polar": NamedSensor(LogPolar, {"fovea": 60.0, "spacing": 1.0, "pooling": 1.0}),
-    "multi-scale": NamedSensor(MultiScaleFovea, {"side": 160, "scales": 4}),
+    "log-polar": _NamedSensor(LogPolar, {"fovea": 60.0, "spacing": 1.0, "pooling": 1.0}),
+    "multi-scale": _NamedSensor(MultiScaleFovea, {"side": 160, "scales": 4}),
 }
 """The named sensors; lengths are in pixels of an image whose longer side is 640.
 

@@ -70,10 +70,10 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
     """
     _check(image, convention)
-    return reduce(image, convention)
+    return _reduce(image, convention)
 
 
-def reduce(image: Tensor, convention: Convention) -> Tensor:
+def _reduce(image: Tensor, convention: Convention) -> Tensor:
     """`pyrdown` without the checks."""
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
@@ -137,7 +137,7 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     _check(image, convention, levels)
     pyramid = [widened(image)]
     for _ in range(levels):
-        pyramid.append(reduce(pyramid[-1], convention))
+        pyramid.append(_reduce(pyramid[-1], convention))
     return tuple(level.to(image.dtype) for level in pyramid)
 
 
@@ -162,7 +162,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     _check(image, convention, levels)
     details, dtype, image = [], image.dtype, widened(image)
     for _ in range(levels):
-        smaller = reduce(image, convention)
+        smaller = _reduce(image, convention)
         expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
         # Allocating memory costs more than the subtraction, so it is done only where a gradient or a graph needs it.
         fresh = expanded.requires_grad or not values_known(image, expanded)

@@ -114,7 +114,7 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
         candidates.append([(x, y) for x, y in centres[order].tolist()])
         sizes.append(text_size(axes, name, _NAME_POINTS))
     width, height = grid.extent.tolist()
-    lines = LineCollection([side for _, region, _ in named for side in borders(grid, region)], colors="white")
+    lines = LineCollection([side for _, region, _ in named for side in _borders(grid, region)], colors="white")
     lines.set(linewidths=1.3, zorder=3)
     written: list[Artist] = [axes.add_collection(lines, autolim=False)]
     for (name, _, _), (x1, y1, x2, y2) in zip(named, place_within(candidates, sizes, (width, height)), strict=True):
@@ -125,7 +125,7 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
     return written
 
 
-def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
+def _borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
     """Sides of cells that bound a region."""
     cells, edges = set(region), grid.edges.tolist()
     lines = []

@@ -16,7 +16,7 @@ Order = Callable[[Sequence[Glance], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
 none ends the episode."""
 
-Guess = Callable[[Sequence[Glance], set[Window], Window], WindowChoice | None]
+_Guess = Callable[[Sequence[Glance], set[Window], Window], WindowChoice | None]
 """Guesses the window to look at after one that is being looked at, the last argument and among the windows."""
 
 
@@ -101,7 +101,7 @@ def look_by_look(
     *,
     hints: bool = True,
     forgetting: Forgetting | None = None,
-    guess: Guess | None = None,
+    guess: _Guess | None = None,
 ) -> Iterator[WindowStep[_Belief]]:
     r"""Look at the whole picture, and then at the windows of an order, until it has none left.
 

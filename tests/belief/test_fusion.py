@@ -4,6 +4,7 @@ Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of t
 """
 
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -260,3 +261,9 @@ def test_invalid_dirichlet_parameters_are_refused(value):
     for rule in (fusion.kaplan, fusion.product, fusion.sum):
         refused(r"^beta: expected positive, finite", rule, beta, torch.ones(2))
         assert rule(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
+
+
+def test_rules_with_and_without_checks_are_pickled_by_their_names():
+    for name, rule in fusion.RULES.items():
+        assert pickle.loads(pickle.dumps(rule)) is rule
+        assert pickle.loads(pickle.dumps(getattr(fusion, name))) is getattr(fusion, name)

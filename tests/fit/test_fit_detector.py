@@ -32,7 +32,7 @@ from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.part import PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.verification import VerificationFit, _VerifiedSearch, scores
+from semfov.fit.verification import VerificationFit, _scores, _VerifiedSearch
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
@@ -358,7 +358,7 @@ def test_decisions_are_scored_by_photograph():
     kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
     searches = [_VerifiedSearch(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
     ends = [(right, 2) for _, _, right in kinds]
-    np.testing.assert_allclose(scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
+    np.testing.assert_allclose(_scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 
 
 def test_experiments_take_their_settings_from_the_folder(home):

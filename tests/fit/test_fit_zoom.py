@@ -15,7 +15,7 @@ from semfov.data import Annotation, EmbeddedScenes, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig
-from semfov.fit.verification import unverified, verify
+from semfov.fit.verification import _unverified, verify
 from semfov.fit.windows_decision import _mosaic_searches, fit_closer
 from semfov.fit.windows_evidence import example_of
 from semfov.fit.windows_settings import FitZoomConfig
@@ -178,7 +178,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
         path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
-        found, count = unverified(sought, model.thresholds)
+        found, count = _unverified(sought, model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
         assert [glance.window for glance in sought.glances[:count]] == [each.window for each in path.glances]
         if found is not None:

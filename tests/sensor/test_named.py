@@ -16,7 +16,7 @@ from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.sensor import SENSORS, LogPolar, Sensor, named_sensor, sensor_of
-from semfov.sensor.named import NamedSensor, SensorName
+from semfov.sensor.named import SensorName, _NamedSensor
 from tests.colours import write_home
 from tests.refusals import refused
 from tests.small import once, run_settings
@@ -73,7 +73,7 @@ def test_settings_of_a_sensor_are_given_by_their_names(capsys):
 
 
 def test_a_further_sensor_needs_one_registration(monkeypatch):
-    monkeypatch.setitem(SENSORS, "dimmed", NamedSensor(Dimmed, {"share": 0.5}))
+    monkeypatch.setitem(SENSORS, "dimmed", _NamedSensor(Dimmed, {"share": 0.5}))
     config = SensorConfig("dimmed", settings={"share": 0.25})
     assert sensor_of(config.make().settings()).share == 0.25
     assert Dimmed.describe(config.make().settings()) == "share 0.25"
@@ -88,7 +88,7 @@ def home(tmp_path_factory):
 
 
 def test_a_registered_sensor_without_a_fovea_runs_in_a_study(home, tmp_path, monkeypatch):
-    monkeypatch.setitem(SENSORS, "dimmed", NamedSensor(Dimmed, {"share": 0.5}))
+    monkeypatch.setitem(SENSORS, "dimmed", _NamedSensor(Dimmed, {"share": 0.5}))
     data = DataConfig(home / "photographs", home / "photographs" / "instances.json", limit=1, min_instances=0)
     names = ("random-raw", "closer-look-raw")
     settings = run_settings(tmp_path, starts=1, shifts=2) | {"data": data, "policies": names}

@@ -12,7 +12,7 @@ import torch
 from semfov import Grid
 from semfov.cli.outcome import _regions_lines
 from semfov.viz import plot_semantic_map
-from semfov.viz.semantic import _regions, borders, cell_entropy, named_regions
+from semfov.viz.semantic import _borders, _regions, cell_entropy, named_regions
 from tests import small
 
 CLASSES = ("background", "cat", "cup", "dog")
@@ -116,7 +116,7 @@ def test_borders_go_around_regions():
         inside[region] = 1
         framed = np.pad(inside.reshape(6, 7), 1)
         expected = np.abs(np.diff(framed, axis=0)).sum() + np.abs(np.diff(framed, axis=1)).sum()
-        lines = borders(grid, region)
+        lines = _borders(grid, region)
         assert len(lines) == expected
         for (x1, y1), (x2, y2) in lines:
             assert abs(x2 - x1) + abs(y2 - y1) == pytest.approx(10)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +14,8 @@ from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.evidence import Evidence, farther, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
+
+_Model = TypeVar("_Model", bound=Evidence)
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,12 @@ class GatheredBelief(Belief, ABC):
     visited: Tensor
 
 
-class Gatherer(Observer):
+class Gatherer(Observer, Generic[_Model]):
     """Base of the observers with learned evidence."""
 
-    model: Evidence
-
-    def __init__(self, together: bool) -> None:
+    def __init__(self, model: _Model, *, together: bool = False) -> None:
         super().__init__()
+        self.model = model
         self.together = together
 
     def nothing(self, batch: int, grid: Grid, like: Tensor, *classes: int) -> dict[str, Tensor]:

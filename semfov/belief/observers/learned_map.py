@@ -37,7 +37,7 @@ class MapBelief(GatheredBelief):
         return pick(self.probabilities, torch.as_tensor(target))
 
 
-class LearnedMap(Gatherer):
+class LearnedMap(Gatherer[MapEvidence]):
     """Observer with learned evidence for all classes (`MapEvidence`), in which the closest look at a cell counts most.
 
     Args:
@@ -50,12 +50,6 @@ class LearnedMap(Gatherer):
     >>> belief.class_probabilities().shape, belief.visited.nonzero().tolist()
     (torch.Size([1, 16, 3]), [[0, 1]])
     """
-
-    model: MapEvidence
-
-    def __init__(self, model: MapEvidence, *, together: bool = False) -> None:
-        super().__init__(together)
-        self.model = model
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> MapBelief:
         """The same probability for every class in every cell, and no evidence."""

@@ -42,7 +42,7 @@ class TargetBelief(GatheredBelief):
         return self.anywhere
 
 
-class Target(Gatherer):
+class Target(Gatherer[TargetEvidence]):
     """Observer with learned evidence for a target (`TargetEvidence`), in which the closest look at a cell counts most.
 
     Args:
@@ -56,12 +56,7 @@ class Target(Gatherer):
     (torch.Size([1, 16]), [[0, 1]])
     """
 
-    model: TargetEvidence
     by_target = True
-
-    def __init__(self, model: TargetEvidence, *, together: bool = False) -> None:
-        super().__init__(together)
-        self.model = model
 
     @property
     def thresholds(self) -> Thresholds | None:

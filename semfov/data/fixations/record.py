@@ -8,6 +8,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -110,9 +111,13 @@ def _check_size(name: str, size: Any) -> None:
 def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
     """Real numbers of any common type as an array of doubles."""
     given = values.detach().cpu() if isinstance(values, Tensor) else values
+    if isinstance(given, Tensor) and given.dtype == torch.bfloat16:
+        given = given.float()  # NumPy has no such numbers
     try:
         array = np.asarray(given)
         numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
+    except OverflowError:
+        raise InputError(f"{argument}: expected finite numbers, got one that is larger than any float") from None
     except (TypeError, ValueError, RuntimeError):
         numbers = None
     if numbers is None:

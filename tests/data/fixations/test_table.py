@@ -249,10 +249,12 @@ def test_columns_of_one_name_are_refused_in_files_and_frames(tmp_path):
 
 
 def test_a_record_takes_lists_and_tensors_and_refuses_what_is_no_size():
-    for points in ([[1, 2.5]], torch.tensor([[1, 2.5]]), ((1, 2.5),)):
+    halves = torch.tensor([[1, 2.5]], dtype=torch.bfloat16)
+    for points in ([[1, 2.5]], torch.tensor([[1, 2.5]]), ((1, 2.5),), halves):
         assert Fixations("a.jpg", "1", points, (80, 60), [200]).resized((160, 120)).points.tolist() == [[2.5, 5.5]]
     for given, said in (
         (([["a", "b"]], (80, 60)), "points: expected real numbers in rows of one length, got list"),
+        (([[1, 10**400]], (80, 60)), "points: expected finite numbers, got one that is larger than any float"),
         (([1, 2], (80, 60)), r"points: expected \(n, 2\)"),
         (([[1, 2]], "80x60"), "size: expected a width and a height above 0, got 80x60"),
         (([[1, 2]], (80, float("nan"))), "size: expected a width and a height above 0"),
