@@ -53,7 +53,7 @@ def test_the_rule_of_semba_divides_only_the_second_term(likelihood, data):
     beta = np.array(data.draw(st.lists(positive, min_size=len(likelihood), max_size=len(likelihood))))
     scores = np.array(likelihood)
     expected = beta * (1 + scores / sum(scores * beta) / (1 + min(scores) / sum(scores * beta)))
-    scaled = fusion.scale_likelihood(torch.from_numpy(scores))
+    scaled = fusion._scale_likelihood(torch.from_numpy(scores))
     after = fusion.RULES["semba"](torch.from_numpy(beta), scaled)
     torch.testing.assert_close(after, torch.from_numpy(expected))
     if min(likelihood) == 0:  # then the two forms are equal
@@ -123,7 +123,7 @@ def test_extreme_likelihoods_stay_finite():
     for rule in fusion.RULES.values():
         beta = torch.full((3,), 0.5)
         for _ in range(300):
-            beta = rule(beta, fusion.scale_likelihood(likelihood))
+            beta = rule(beta, fusion._scale_likelihood(likelihood))
         assert torch.isfinite(beta).all()
         assert (beta > 0).all()
 
