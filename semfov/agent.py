@@ -549,7 +549,7 @@ class ActivePerception(nn.Module):
 
         Args:
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
-            how: the kind of look, `fovea` or `windows`; `auto` looks at windows of large frames, and for a list.
+            how: the kind of look, `fovea` or `windows`; `auto` looks at windows (`semfov.live.LivePerception`).
             rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1, and 0.03 for windows.
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.

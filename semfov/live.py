@@ -23,14 +23,14 @@ _WINDOW_RATE = 0.03
 class LivePerception:
     """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
 
-    The first frame decides (`how="auto"`): frames that are at least four times as long as the detector's input are
-    looked at by windows, others by a fovea.
+    With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
+    detector's input where the agent has no evidence for photographs, or where a first cell is given.
 
     Args:
         fovea: the part of an agent that looks by a fovea.
         windows: the part of the agent that looks at windows.
         target: class 1..K to search for; None explores.
-        targets: classes 1..K whose objects are all to be found, which windows do; none: of all classes.
+        targets: classes 1..K whose objects are all to be found, which windows do; empty for `target`.
         how: the kind of look, `fovea`, `windows` or `auto`.
         rate: rate at which evidence fades, per frame; None takes 0.1 for a fovea and 0.03 for windows.
         start: first cell of a fovea; None draws one at random.

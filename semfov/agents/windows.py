@@ -133,7 +133,7 @@ class ZoomAgent(nn.Module):
                 evidence it is the least score of a detection; None takes 0.5.
             give_up: the search ends when no look shows the class with a probability of at least this value; None takes
                 the threshold of the evidence.
-            closer: largest number of closer looks, 0 to 100; None takes 2 in a photograph, and in a larger picture as
+            closer: largest number of closer looks, 0 to 100; None takes 3 in a photograph, and in a larger picture as
                 many as there are passes for. 0 decides without them, as does evidence without fitted verification.
 
         Returns:

@@ -169,11 +169,11 @@ usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] 
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
   --find CLASSES       classes of which all objects are to be found, with commas between them
-  --how KIND           fovea, windows (of large frames), or auto (default)
+  --how KIND           auto (default: windows of any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
-  --rate R             rate at which belief fades from frame to frame (0: never)
+  --rate R             rate at which evidence fades from frame to frame (0: never)
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
-  --closer N           most closer looks in the time until half of the belief has faded (0: none)
+  --closer N           most closer looks in the time until half of the evidence has faded (0: none)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
   --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects

@@ -183,13 +183,15 @@ class LiveOptions(AgentOptions):
         camera: number of a camera.
         target: class to search for (none: explore).
         find: class of which all objects are to be found, or several with commas, in place of a target.
-        how: kind of look: `fovea`, `windows`, or `auto` by the size of the frames.
+        how: kind of look: `fovea`, `windows`, or `auto`: windows, or a fovea where frames are small and the agent has
+            no evidence for photographs or `start` is given.
         frames: number of frames to look at (none: all of them; a camera until Ctrl-C).
-        rate: rate at which belief fades from frame to frame; 0: never (none: 0.1 for a fovea, 0.03 for windows).
-        confirm: the target counts as found when its probability reaches this value (none: that of the model).
+        rate: rate at which evidence fades from frame to frame; 0: never (none: 0.1 for a fovea, 0.03 for windows).
+        confirm: the target is found from this probability on, with closer looks that of its place (none: that of the
+            model).
         give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
-        closer: largest number of closer looks in the time until half of the belief has faded (none: 2 for a fovea, as
-            many as there are frames for windows); 0: none.
+        closer: largest number of closer looks in the time until half of the evidence has faded (none: 2 for a fovea, 3
+            for windows of small frames, as many as there are frames for those of large ones); 0: none.
         white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
         out: video to write, `.mp4` or `.avi`, or a folder for it, with gaze and belief, or windows and objects, drawn
             into each frame.

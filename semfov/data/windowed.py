@@ -151,7 +151,7 @@ class LargePicture(ABC):
 
     @abstractmethod
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        """Read a window; → `(h, w, 3)`."""
+        """Read a window, in one thread at a time but not always the same one (`zoom.episode`); → `(h, w, 3)`."""
 
     def reduction(self, ratio: float, oversampling: float = _OVERSAMPLING) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
