@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
 from semfov.runs.config import DetectorConfig, SaliencyModel
-from semfov.runs.settings import Count, Whole
+from semfov.runs.settings import Range, Whole
 from semfov.runs.setup import detector_options
 from semfov.runs.tables import plus_minus, table
 from semfov.runs.workers import prepare_worker
@@ -64,7 +65,7 @@ class ViewingConfig(ViewingData):
     detectors: tuple[str | DetectorConfig, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
     saliency: tuple[SaliencyModel, ...] = ("itti-koch", "vocus2")
     studied: Whole = 1
-    folds: Count = 5
+    folds: Annotated[int, Range(2, 1000)] = 5
     sequences: Whole = 50
     page: Path | None = None
     fit: GazeFit = field(default_factory=GazeFit)

@@ -27,7 +27,7 @@ class GazeModelFit(ViewingData):
     Args:
         layers: names of the feature maps (none: those of the shipped model, or of backbone and head at
             strides 8 to 32 that the detector has).
-        folds: number of folds for the evaluation (0: none).
+        folds: number of folds for the evaluation, 2 or more (0: none).
         fit: how the model is fitted.
     """
 
@@ -36,6 +36,11 @@ class GazeModelFit(ViewingData):
     layers: tuple[str, ...] = ()
     folds: Whole = 5
     fit: GazeFit = field(default_factory=GazeFit)
+
+    def __post_init__(self) -> None:
+        """Check that a fold leaves pictures to fit to."""
+        super().__post_init__()
+        check(self.folds != 1, f"{self.within}folds", "0, or 2 or more", self.folds)
 
 
 def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
@@ -46,15 +51,16 @@ def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
         height, width = group.size
         firsts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
         for each in (one for people in group.people for one in people if one.durations is not None):
-            times = torch.from_numpy(each.durations).float()
-            for number, log in enumerate(times[:LONGEST].clamp(min=1).log()):
+            lasting = torch.from_numpy(each.durations).float()
+            for number, log in enumerate(lasting[:LONGEST].clamp(min=1).log()):
                 logs[min(number, 4)].append(log)
-            left.append(1000 * group.seconds - times.sum())
-            lengths.append(len(times))
+            left.append(1000 * group.seconds - lasting.sum())
+            lengths.append(len(lasting))
     first = torch.stack(firsts)
-    model.start = torch.stack([first.mean(0), first.std(0)])
+    model.start = torch.stack([first.mean(0), first.std(0, correction=0)]).clamp(0, 1)
     if left:
-        model.duration = torch.stack([torch.stack([torch.stack(x).mean(), torch.stack(x).std()]) for x in logs if x])
+        times = [torch.stack(each) for each in logs if each]
+        model.duration = torch.stack([torch.stack([each.mean(), each.std(correction=0)]) for each in times])
         pauses = torch.stack([time / number for time, number in zip(left, lengths, strict=True)])
         model.pause = pauses.mean().clamp(min=0)
 
@@ -66,8 +72,10 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     groups = look(config, source)
     pictures = sum(map(len, groups))
     fewest = min(sum(len(group) for group in groups if group.source == n) for n in range(len(config.fixations)))
-    expected = f"at least {max(config.folds, 1)} pictures in each file, or fewer folds than {config.folds}"
-    check(fewest >= max(config.folds, 1), "fixations", expected, fewest)
+    least = max(config.folds, 1)
+    fewer = ", or fewer folds" * (config.folds > 0)
+    expected = f"in each file {least} or more pictures in which somebody made two fixations{fewer}"
+    check(fewest >= least, f"{config.within}fixations", expected, fewest)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
     folds = [Fold(lambda: groups, number, config.folds, config.fit) for number in range(config.folds)]
     scored = joined([kept.scores(detector.name, fold) for fold in folds])

@@ -1,6 +1,7 @@
 """The fit of where people look, on fixations that were drawn from a known density."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,16 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     _describe_viewing(model, [group])
     assert float(model.duration[0, 0]) == pytest.approx(math.log(200), abs=1e-5)
     assert float(model.pause) == pytest.approx((3000 - 1600) / 8)
+
+
+def test_a_model_of_few_people_can_be_read(tmp_path):
+    """One scanpath alone is long, and begins outside the picture."""
+    model, several = saliency.FixationDensity({"backbone8": 3}), people(0, np.array([40, 30]), count=1)
+    points = several[0].points - (500, 0)
+    _describe_viewing(model, [viewed([(picture(0)[0], [replace(several[0], points=points)])])])
+    model.save(tmp_path / "model.safetensors")
+    read = saliency.FixationDensity.from_pretrained(tmp_path / "model.safetensors")
+    assert torch.equal(read.duration[:, 1], torch.zeros(len(read.duration)))
 
 
 def test_scores_equal_the_measures_of_scanpaths(group):
@@ -213,6 +224,8 @@ def test_settings_of_gaze_without_their_fixations_are_refused():
             ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
     with pytest.raises(InputError, match=r"^gaze\.pictures: expected a folder for each of 1 files of fixations, got 0"):
         GazeModelFit(fixations=(Path("people.csv"),))
+    with pytest.raises(InputError, match=r"^gaze\.folds: expected 0, or 2 or more, got 1"):
+        GazeModelFit(folds=1)
     with pytest.raises(InputError, match=r"--gaze\.fixations FILE"):
         FitDetectorConfig(model=Path("yolov3-tiny"), gaze=GazeModelFit(seconds=(3.0,))).named()
 
