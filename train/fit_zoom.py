@@ -20,8 +20,16 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
-from semfov.fit.windows import MosaicFit, judge_windows, measures_table
-from semfov.fit.windows_evidence import Windows, ZoomExample, fit_presence, pair_windows, presence_loss
+from semfov.fit.windows import MosaicFit
+from semfov.fit.windows_evidence import (
+    Windows,
+    ZoomExample,
+    fit_presence,
+    judge_windows,
+    measures_table,
+    pair_windows,
+    presence_loss,
+)
 from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, RefitPart
 from semfov.io.files import inside
 from semfov.runs.command import command

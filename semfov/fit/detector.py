@@ -26,7 +26,7 @@ from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.tempering import TemperingFit
 from semfov.fit.verification import VerificationFit
-from semfov.fit.windows import WindowsFit
+from semfov.fit.windows_part import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import PARTS, Manifest, Part, place_of
 from semfov.runs.config import WHERE, DataConfig, DetectorConfig

@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
-import json
-import logging
 import math
 import random
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
-from statistics import median
-from typing import Any, ClassVar
+from functools import partial
+from itertools import islice
+from typing import NamedTuple
 
-import numpy as np
 import torch
+from torch import Tensor
+from torch.nn import functional as F
 
+from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scattered import Scattered
-from semfov.data.scene import ChosenScenes, Scenes
+from semfov.data.scene import Annotation, ChosenScenes, Scenes
+from semfov.decision import OUTCOMES, SAME, settle
 from semfov.errors import check
-from semfov.fit.detector_report import Difference, in_words, mean_percent, section
+from semfov.fit.descent import descend
+from semfov.fit.evidence import Bounds, choose_thresholds
 from semfov.fit.outputs import training_of
-from semfov.fit.part import PartFit, PartInputs, PartResult
-from semfov.fit.photographs import fit_photographs
-from semfov.fit.verification import mean_of
+from semfov.fit.searches import TargetSearch
+from semfov.fit.verification import (
+    VerificationResult,
+    choose_confirm,
+    examine,
+    fit,
+    verification_report,
+    verify,
+)
 from semfov.fit.windows_certainty import certainty_again, spread_again
-from semfov.fit.windows_decision import Searches, fit_closer, fit_judge, judge_searches, picture_searches
 from semfov.fit.windows_evidence import (
     SurveyExample,
     ZoomExample,
@@ -37,30 +43,226 @@ from semfov.fit.windows_evidence import (
     fit_survey,
     judge_survey,
     pair_windows,
-    presence_log_odds,
-    presence_loss,
-    rate_loss,
     windows_of,
 )
 from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, PictureKind
 from semfov.io.files import json_sha256
-from semfov.io.manifest import Part
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.metrics.averages import FloatArray
-from semfov.runs.config import SensorConfig
-from semfov.runs.looks import one_thread
+from semfov.metrics.calibration import BinarySums
+from semfov.metrics.presence import area_under_roc
+from semfov.observation.matching import box_iou
+from semfov.runs.progress import track
 from semfov.runs.scene_run import store_folder
-from semfov.runs.setup import make_detector, make_scenes, split_photographs
+from semfov.runs.search_protocol import choose_classes
+from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.tables import table
-from semfov.runs.window_looking import found_in
 from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
-from semfov.zoom.episode import WindowStep, find_everything, look_by_look
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
+from semfov.zoom.decision import SearchFacts
+from semfov.zoom.episode import WindowStep, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance, Glances
+from semfov.zoom.glances import Glance
 from semfov.zoom.networks import Survey
-from semfov.zoom.slices import ranked, usual_slices
+
+_JUDGED = (1, 4, 8, 16)
+"""Numbers of looks after which the probability of presence is evaluated."""
+
+
+class _Searches(NamedTuple):
+    """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
+
+    Shapes: best `(E, n)`, case `(E, n, 10)`, looked `(E, n)`, left `(E, n)`, there `(E,)`.
+    """
+
+    best: Tensor
+    case: Tensor
+    looked: Tensor
+    left: Tensor
+    there: Tensor
+
+    @classmethod
+    def join(cls, searches: Sequence[_Searches]) -> _Searches:
+        """Join several sets of searches."""
+        return cls(*map(torch.cat, zip(*searches, strict=True)))
+
+
+@torch.inference_mode()
+def _searches_of(
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
+    """Search every picture for some present classes and for as many absent ones, without decisions."""
+    for index, looks in enumerate(track(opened, title, "picture")):
+        annotation = pictures.annotation(index)
+        for target in choose_classes(pictures, index, annotation, config.sought, 1.0, config.seed):
+            turns = islice(look_for(looks, model, target), config.passes)
+            yield index, annotation, target, _with_facts(turns)
+        looks.save()
+
+
+def _with_facts(turns: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]:
+    """The turns of a search, each with the facts about the search after it."""
+    facts: SearchFacts | None = None
+    for turn in turns:
+        facts = facts or SearchFacts(turn.belief)
+        facts.add(turn.glance)
+        yield turn, facts
+
+
+@torch.inference_mode()
+def _picture_searches(
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+) -> _Searches:
+    """Run all searches of `_searches_of`, and collect them."""
+    rows: list[list[Tensor]] = []
+    for _, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
+        steps = [(facts.best, facts.case(turn.ahead), facts.detected, turn.ahead) for turn, facts in turns]
+        steps += [(*steps[-1][:3], 0.0)] * (config.passes - len(steps))
+        best, case, looked, left = zip(*steps, strict=True)
+        there = torch.tensor(bool((annotation.labels == target).any()))
+        rows.append([torch.tensor(best), torch.stack(case), torch.tensor(looked), torch.tensor(left), there])
+    return _Searches(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _fit_judge(model: GlimpseEvidence, searches: _Searches, steps: int, batch: int = 4096) -> None:
+    """Fit the probability that a picture contains the target, by the cross-entropy after all looks of all searches."""
+    best, case = searches.best.flatten(), searches.case.flatten(0, 1)
+    there = searches.there[:, None].expand_as(searches.best).flatten().float()
+
+    def loss_of(_: int) -> Tensor:
+        rows = torch.randint(len(best), (min(batch, len(best)),))
+        return F.binary_cross_entropy_with_logits(model.anywhere(best[rows], case[rows]), there[rows])
+
+    model.judge.requires_grad_(True)
+    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="fitting decisions")
+    model.judge.requires_grad_(False)
+
+
+@torch.no_grad()
+def _judge_searches(model: GlimpseEvidence, searches: _Searches, bounds: Bounds) -> list[str]:
+    """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them."""
+    anywhere = model.anywhere(searches.best, searches.case).sigmoid()
+    there = searches.there
+    chosen = choose_thresholds(bounds, anywhere.mT, searches.looked.mT.to(anywhere), searches.left.mT, there)
+    # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
+    model.thresholds = chosen.changed(place=0.0)
+    rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
+    last = anywhere.shape[1]
+    for number in sorted({last, *(each for each in _JUDGED if each < last)}):
+        presence = BinarySums.of(anywhere[:, number - 1], there)
+        raw = BinarySums.of(searches.best[:, number - 1], there)
+        area = area_under_roc(anywhere[:, number - 1], there) if bool(there.any() and not there.all()) else float("nan")
+        measures = (presence.nll, presence.brier, presence.ece, raw.ece)
+        rows.append([str(number), f"{area:.3f}", *(f"{measure:.3f}" for measure in measures)])
+    return table(rows)
+
+
+class _MosaicSearch(TargetSearch[WindowLook]):
+    """A search of a mosaic; objects `(M, 4)`, boxes `(4,)`."""
+
+    after = (1, 3, 5, 8, 12, 16, 24)
+
+    def __init__(
+        self,
+        mosaic: int,
+        looks: StoredGlances,
+        target: int,
+        objects: Tensor,
+        passes: int,
+        likely: float,
+        glances: Sequence[Glance],
+        states: Sequence[WindowLook],
+        boxes: Sequence[Tensor | None],
+    ) -> None:
+        places = partial(CandidateBoxes, target, likely)
+        super().__init__(
+            mosaic,
+            target,
+            places,
+            lambda box: look_closely(looks, box).detections,
+            present=len(objects) > 0,
+            passes=passes,
+        )
+        self.looks, self.objects, self.glances, self.states, self.boxes = looks, objects, glances, states, boxes
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def look(self, index: int, number: int) -> WindowLook:
+        """Return a look with the number of looks up to it."""
+        return self.states[index]._replace(number=number)
+
+    def right(self, box: Tensor) -> bool:
+        """Whether a box `(4,)` is that of an annotated object of the class."""
+        return self.present and float(box_iou(box[None], self.objects).max()) >= SAME
+
+    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
+        """The outcome by the evidence alone; the place is that of the box with the highest score."""
+        state, box = self.states[index], self.boxes[index]
+        presence, looked, left = (torch.tensor([each]) for each in (state.presence, box is not None, state.left))
+        outcome = int(settle(presence, looked, left, thresholds))
+        if OUTCOMES[outcome] != "found":
+            return outcome, None
+        assert box is not None
+        return outcome, self.right(box)
+
+
+@torch.inference_mode()
+def _mosaic_searches(
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+) -> Iterator[_MosaicSearch]:
+    """Search every picture, without closer looks (`_searches_of`)."""
+    assert model.thresholds is not None
+    for index, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
+        glances: list[Glance] = []
+        states: list[WindowLook] = []
+        boxes: list[Tensor | None] = []
+        for number, (turn, facts) in enumerate(turns, 1):
+            detections, presence = turn.glance.detections, facts.presence(turn.ahead)
+            glances.append(turn.glance)
+            states.append(WindowLook(detections, number, presence, facts.best, turn.ahead))
+            boxes.append(facts.box if facts.detected else None)
+        objects = annotation.boxes[annotation.labels == target]
+        likely = model.thresholds.confirm
+        yield _MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
+
+
+def _fit_closer(
+    model: GlimpseEvidence,
+    pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
+    config: FitZoomConfig,
+    prior: Verification | None = None,
+) -> str:
+    """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model."""
+    searches = {
+        use: [
+            search
+            for scenes, opened in pictures[use]
+            for search in _mosaic_searches(model, scenes, opened, config, title)
+        ]
+        for use, title in (("searched", "looking closely"), ("judged", "looking closely at held-out pictures"))
+    }
+    training, held_out = (examine(searches[use]) for use in ("searched", "judged"))
+    looks_of = [looks for kinds in pictures.values() for _, opened in kinds for looks in opened]
+    for looks in looks_of:
+        looks.save()
+    model.verification = None
+    if training is None or held_out is None:
+        return "None, since there are no places that hold the target, or none that do not.\n"
+    fitted = fit(training, training.fold == 0, prior)
+    assert model.thresholds is not None
+    limits = Thresholds(1.0, model.thresholds.give_up, config.place)
+    decisions = list(verify(searches["judged"], [fitted], limits, model.thresholds))
+    confirm = choose_confirm(decisions, config.false_alarms, config.surest)
+    fitted.thresholds = Thresholds(confirm, model.thresholds.give_up, config.place)
+    model.verification = fitted
+    for looks in looks_of:
+        looks.save()
+    how = f"The model was fitted to {len(training.fold)} closer looks at pictures of other photographs."
+    judged = f"{sum(len(opened) for _, opened in pictures['judged'])} pictures of held-out photographs"
+    return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), judged, how)[0]
 
 
 def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
@@ -88,8 +290,6 @@ _COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
 
 _SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
-
-_log = logging.getLogger(__name__)
 
 
 def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
@@ -218,16 +418,16 @@ class MosaicFit:
         prepare_worker()
         torch.manual_seed(config.seed)
         searches = {
-            use: Searches.join(
+            use: _Searches.join(
                 [
-                    picture_searches(model, self.pictures[kind], self.opened(kind), config, f"searching, {kind}")
+                    _picture_searches(model, self.pictures[kind], self.opened(kind), config, f"searching, {kind}")
                     for kind in kinds
                 ]
             )
             for use, kinds in self._searched().items()
         }
-        fit_judge(model, searches["searched"], config.judging)
-        rows = judge_searches(model, searches["judged"], config)
+        _fit_judge(model, searches["searched"], config.judging)
+        rows = _judge_searches(model, searches["judged"], config)
         assert model.thresholds is not None
         self._told(model, "decision", _DECIDING)
         fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
@@ -248,7 +448,7 @@ class MosaicFit:
         searched = {
             use: [(self.pictures[kind], self.opened(kind)) for kind in kinds] for use, kinds in self._searched().items()
         }
-        text = fit_closer(model, searched, self.config, prior)
+        text = _fit_closer(model, searched, self.config, prior)
         if model.verification is not None:
             self._told(model, "verification", _VERIFYING)
         return ["Closer looks:", "", text]
@@ -271,7 +471,7 @@ class MosaicFit:
     def _explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
         """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""
         fitted, judged = self._searched().values()
-        some = _some_explored(self.config.searched)
+        some = self.config.some_explored
         return [
             {kind: (self.pictures[kind], self.opened(kind)[: some.get(kind)]) for kind in dict.fromkeys(kinds)}
             for kinds in ((*fitted, *some), judged)
@@ -285,208 +485,3 @@ class MosaicFit:
     def _told(self, model: GlimpseEvidence, part: str, settings: Sequence[str]) -> None:
         """Note in the model the settings that a part depends on."""
         model.metadata[part] = {name: getattr(self.config, name) for name in settings}
-
-
-def _some_explored(searched: int) -> dict[str, int]:
-    """Number of explored mosaics that have three and nine times as many photographs, for so many others."""
-    return {"far": max(1, searched // 5), "small": max(1, searched // 10)}
-
-
-@torch.no_grad()
-def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
-    """Evaluate the model on held-out mosaics."""
-    windows = pair_windows(examples)
-    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
-    if len(later):
-        figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
-        figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
-    slots = first[windows.slot[first]]
-    odds, presence = presence_log_odds(model, windows, slots), windows.presence[slots]
-    passes: dict[str, list[int]] = defaultdict(list)
-    for mosaic in windows.mosaic[slots].unique():
-        here = windows.mosaic[slots] == mosaic
-        for target in presence[here].any(0).nonzero()[:, 0].tolist():
-            hits = presence[here, target]
-            for name, value in (("evidence", odds), ("raw score", windows.scores[slots])):
-                order = value[here, target].argsort(descending=True, stable=True)
-                passes[name].append(2 + int(hits[order].int().argmax()))
-    for name, counts in passes.items():
-        figures[f"passes to the first hit, {name}"] = sum(counts) / len(counts)
-    losses = torch.stack([rate_loss(model, example) for example in examples])
-    figures["rates, mean negative log likelihood"] = float(losses.mean())
-    lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
-    lines += [*measures_table(figures), ""]
-    return "\n".join(lines), json.dumps(figures, indent=1)
-
-
-def measures_table(figures: Mapping[str, float]) -> list[str]:
-    """Write measures as a table in Markdown."""
-    return table([["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())])
-
-
-_ENOUGH = 16
-"""Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
-_RECALL_PASSES = (4, 8, 16)
-"""Passes of the detector after which recall is reported."""
-_OF_INPUT = 1.15
-"""Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
-_FOR_MOSAICS = 360
-"""The number of mosaics grows up to this number of photographs to learn from."""
-_ALONE = 120
-"""Largest number of photographs that are searched by themselves."""
-_LOOK = 0.04
-"""Estimate of the seconds of a pass of the detector."""
-
-_Way = Callable[[Glances], Iterator[WindowStep[Any]]]
-"""A way of looking for all objects of a picture."""
-
-
-@dataclass(frozen=True)
-class _LeftOut:
-    """Settings of evidence that is not fitted."""
-
-    why: str
-
-
-class WindowsFit(PartFit):
-    """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
-
-    name: ClassVar[str] = "windows"
-
-    def __init__(self, inputs: PartInputs) -> None:
-        super().__init__(inputs)
-        photographs, held_out = len(self.run.scenes), len(inputs.held_out)
-        why = None
-        if not self.config.windows:
-            why = "not fitted, since the setting `windows` is false"
-        elif held_out < _ENOUGH:
-            why = (
-                f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
-                f"{photographs} photographs are held out"
-            )
-        self.settings: FitZoomConfig | _LeftOut
-        if why is not None:
-            self.settings, self.tasks = _LeftOut(why), {}
-            return
-        self.settings = config = self.mosaics(photographs)
-        sets = {"searched": config.searched, "judged": config.judged}
-        self.tasks = {
-            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
-            "learning what closer looks show": 0.1 * config.steps,
-            "learning the expected number of objects": 0.2 * config.steps,
-            "learning the survey": 0.4 * config.survey_steps,
-            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
-            "fitting decisions": 0.01 * config.judging,
-            "looking closely": 4 * config.searched,
-            "looking closely at held-out pictures": 4 * config.judged,
-            "looking at photographs": 25 * _LOOK * config.photographs,
-            **{f"exploring, {kind}": 2 * count for kind, count in (sets | _some_explored(config.searched)).items()},
-        }
-
-    def mosaics(self, photographs: int) -> FitZoomConfig:
-        """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
-        own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
-        training = min(photographs - held_out, _FOR_MOSAICS)
-        # The photographs are not enlarged.
-        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
-        width = min(
-            median(max(width, height * 4 / 3) for width, height in sizes),
-            _OF_INPUT * self.run.eye.detector.input_size[0],
-        )
-        return self.inputs.settings(
-            FitZoomConfig,
-            sensor=SensorConfig(),
-            mosaics=max(1, training // 5),
-            far=max(1, training // 60),
-            crowded=max(1, training // 10),
-            judged=max(8, min(held_out // 3, 30)),
-            judged_far=1,
-            kinds=(),
-            searched=max(8, training // 12),
-            sought=3,
-            passes=16,
-            photographs=min(photographs, _ALONE),
-            tile=max(16, round(width)),
-            steps=own.window_steps,
-            survey_steps=own.window_steps,
-        )
-
-    def fit(self) -> PartResult:
-        """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
-        config = self.settings
-        if isinstance(config, _LeftOut):
-            return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
-        with one_thread():
-            return self._fit(config)
-
-    def _fit(self, config: FitZoomConfig) -> PartResult:
-        fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
-        model, figures = _fit_mosaics(fit)
-        judged, opened = fit.mosaics["judged"], fit.opened("judged")
-        curves = {
-            "fitted": _photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
-            "raw": _photograph_recalls(judged, opened, _in_raw_order),
-        }
-        gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
-        at = _RECALL_PASSES[-1] - 1
-        why = (
-            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {_RECALL_PASSES[-1]} passes, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
-            f"passes {in_words(gain, 'points gained', 100)}"
-        )
-        rows = [["looks", *(f"after {n} passes" for n in _RECALL_PASSES), "mean"]]
-        rows += [
-            [name, *(mean_percent(curve[:, n - 1]) for n in _RECALL_PASSES), mean_percent(curve.mean(1))]
-            for name, curve in curves.items()
-        ]
-        text = section(
-            f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
-            f"objects of each photograph, and the mean over 1 to {_RECALL_PASSES[-1]} passes. `raw` looks at slices in "
-            "the order of the sums of the overview's raw scores, as the agent does without this part.",
-            rows,
-        )
-        return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
-
-
-def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
-    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
-    examples = fit.look(("near", "far", "crowded", "judged"))
-    model = fit.closer(examples)
-    fit.survey(model, examples)
-    lines = [judge_windows(model, examples["judged"])[0], *fit.decisions(model)]
-    shipped = [
-        GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-    ]
-    lines += fit.verification(model, mean_of([each.verification for each in shipped if each.verification is not None]))
-    lines += fit.certainty(model)
-    alone = [each.photograph.verification for each in shipped if each.photograph is not None]
-    scenes = make_scenes(fit.config.data, fit.eye.detector.classes)
-    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(alone))]
-    return model, "\n".join(lines)
-
-
-def _in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
-    """Look at slices in the order of the overview's scores, as an agent without evidence does."""
-    return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
-
-
-@torch.inference_mode()
-def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: _Way) -> FloatArray:
-    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`."""
-    hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
-    for index, glances in enumerate(opened):
-        tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
-        photograph = np.repeat(
-            [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.scene).boxes) for tile in tiles]
-        )
-        np.add.at(there, photograph, 1)
-        history: list[Glance] = []
-        turns = way(glances)
-        for number in range(_RECALL_PASSES[-1]):
-            turn = next(turns, None)
-            if turn is not None:
-                history.append(turn.glance)
-            np.add.at(hits[:, number], photograph, found_in(history, annotation).numpy())
-        glances.save()
-    return hits[there > 0] / there[there > 0, None]

@@ -1,8 +1,9 @@
 """Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find."""
 
+import json
 import random
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.detection.objects import LEAST
 from semfov.fit.descent import descend
 from semfov.observation.matching import box_iou
+from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
@@ -146,19 +148,19 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
 
 
 def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the mean cross-entropy of `presence_log_odds` over rows and classes."""
-    odds = presence_log_odds(model, windows, rows)
+    """Compute the mean cross-entropy of `_presence_log_odds` over rows and classes."""
+    odds = _presence_log_odds(model, windows, rows)
     return F.binary_cross_entropy_with_logits(odds, windows.presence[rows].to(odds))
 
 
-def presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
+def _presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
     """Compute the log-odds that closer looks show each class."""
     before = None
     if bool((windows.before[rows] >= 0).all()):
         training = model.training
         model.eval()
         with torch.no_grad():
-            before = presence_log_odds(model, windows, windows.before[rows])
+            before = _presence_log_odds(model, windows, windows.before[rows])
         model.train(training)
     return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
 
@@ -168,13 +170,13 @@ def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, b
 
     def loss_of(_: int) -> Tensor:
         chosen = random.sample(examples, min(batch, len(examples)))
-        return torch.stack([rate_loss(model, example) for example in chosen]).mean()
+        return torch.stack([_rate_loss(model, example) for example in chosen]).mean()
 
     own = [*model.rate.parameters(), model.prior, model.border]
     descend(own, loss_of, steps, 6e-3, decay=0.1, title="learning the expected number of objects")
 
 
-def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
+def _rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic."""
     strongest = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (
@@ -322,3 +324,36 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
         return torch.stack(losses).mean()
 
     descend(survey.parameters(), loss_of, steps, 2e-3, decay=0.1, title="learning the survey")
+
+
+@torch.no_grad()
+def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
+    """Evaluate the model on held-out mosaics."""
+    windows = pair_windows(examples)
+    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
+    if len(later):
+        figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
+        figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
+    slots = first[windows.slot[first]]
+    odds, presence = _presence_log_odds(model, windows, slots), windows.presence[slots]
+    passes: dict[str, list[int]] = defaultdict(list)
+    for mosaic in windows.mosaic[slots].unique():
+        here = windows.mosaic[slots] == mosaic
+        for target in presence[here].any(0).nonzero()[:, 0].tolist():
+            hits = presence[here, target]
+            for name, value in (("evidence", odds), ("raw score", windows.scores[slots])):
+                order = value[here, target].argsort(descending=True, stable=True)
+                passes[name].append(2 + int(hits[order].int().argmax()))
+    for name, counts in passes.items():
+        figures[f"passes to the first hit, {name}"] = sum(counts) / len(counts)
+    losses = torch.stack([_rate_loss(model, example) for example in examples])
+    figures["rates, mean negative log likelihood"] = float(losses.mean())
+    lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
+    lines += [*measures_table(figures), ""]
+    return "\n".join(lines), json.dumps(figures, indent=1)
+
+
+def measures_table(figures: Mapping[str, float]) -> list[str]:
+    """Write measures as a table in Markdown."""
+    return table([["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())])

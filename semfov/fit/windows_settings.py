@@ -93,3 +93,8 @@ class FitZoomConfig(FitConfig):
     survey_steps: Count = 1500
     judging: Count = 300
     out: Path = Path("runs/fit_zoom")
+
+    @property
+    def some_explored(self) -> dict[str, int]:
+        """Number of explored mosaics that have three and nine times as many photographs, for `searched` others."""
+        return {"far": max(1, self.searched // 5), "small": max(1, self.searched // 10)}

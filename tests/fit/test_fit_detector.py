@@ -164,7 +164,7 @@ FITS = {
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",
     "map": "fit_map_evidence",
-    "windows": "_fit_mosaics",
+    "windows_part": "_fit_mosaics",
 }
 
 

@@ -16,7 +16,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
 from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import _unverified, verify
-from semfov.fit.windows_decision import _mosaic_searches, fit_closer
+from semfov.fit.windows import _fit_closer, _mosaic_searches
 from semfov.fit.windows_evidence import example_of
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.observation.foveal import FovealObservationModel
@@ -185,7 +185,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
     kinds = "searched", "judged"
-    text = fit_closer(model, {kind: [(scenes, opened)] for kind in kinds}, config)
+    text = _fit_closer(model, {kind: [(scenes, opened)] for kind in kinds}, config)
     fitted = model.verification.thresholds
     assert (fitted.place, fitted.give_up) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
@@ -208,6 +208,6 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
 def test_without_right_and_wrong_places_there_is_no_verification():
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
     kinds = "searched", "judged"
-    text = fit_closer(model, {kind: [(Squares(), ())] for kind in kinds}, FitZoomConfig(passes=8))
+    text = _fit_closer(model, {kind: [(Squares(), ())] for kind in kinds}, FitZoomConfig(passes=8))
     assert text.startswith("None, since there are no places")
     assert model.verification is None

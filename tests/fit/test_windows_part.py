@@ -9,7 +9,7 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.windows import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
+from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
@@ -71,7 +71,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
         stored.setattr("semfov.data.mosaics.Mosaics.__getitem__", None)
         assert folder_of(home).fit("windows") == fitted
     assert (home / "models/windows.safetensors").read_bytes() == before
-    monkeypatch.setattr("semfov.fit.windows._fit_mosaics", None)
+    monkeypatch.setattr("semfov.fit.windows_part._fit_mosaics", None)
     folder = folder_of(home)
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
@@ -103,7 +103,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     ],
 )
 def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, settings, why):
-    monkeypatch.setattr("semfov.fit.windows._fit_mosaics", None)
+    monkeypatch.setattr("semfov.fit.windows_part._fit_mosaics", None)
     folder = folder_of(home, out=tmp_path, **settings)
     assert folder.fits["windows"].tasks == {}
     part = folder.fit("windows").part

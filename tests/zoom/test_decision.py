@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from semfov.agents import ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
-from semfov.fit.windows_decision import Searches, fit_judge, judge_searches
+from semfov.fit.windows import _fit_judge, _judge_searches, _Searches
 from semfov.metrics.calibration import calibration_error
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.decision import SearchFacts
@@ -110,7 +110,7 @@ def synthetic(count, seed):
     best = torch.rand(count, 1, generator=generator)
     odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 6] - 1
     there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
-    return Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
+    return _Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
@@ -140,7 +140,7 @@ def test_a_fitted_probability_is_calibrated():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8)
     known, _ = synthetic(4000, 1)
-    fit_judge(model, known, steps=250)
+    _fit_judge(model, known, steps=250)
     new, odds = synthetic(4000, 2)
     with torch.no_grad():
         log_odds = model.anywhere(new.best, new.case)[:, 0]
@@ -153,7 +153,7 @@ def test_a_fitted_probability_is_calibrated():
     class Bounds:
         false_alarms, surest, lost = 0.05, 1.0, 0.02
 
-    rows = judge_searches(model, new, Bounds())
+    rows = _judge_searches(model, new, Bounds())
     assert "ECE" in rows[0]
     sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
     assert sure[~new.there].double().mean() <= 0.05

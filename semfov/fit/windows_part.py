@@ -1,0 +1,200 @@
+"""The part of a model folder for large pictures: evidence by magnification, fitted on mosaics of the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from semfov.data.mosaics import Mosaics
+from semfov.fit.detector_report import Difference, in_words, mean_percent, section
+from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.photographs import fit_photographs
+from semfov.fit.verification import mean_of
+from semfov.fit.windows import MosaicFit
+from semfov.fit.windows_evidence import (
+    judge_windows,
+)
+from semfov.fit.windows_settings import FitZoomConfig
+from semfov.io.manifest import Part
+from semfov.metrics.averages import FloatArray
+from semfov.runs.config import SensorConfig
+from semfov.runs.looks import one_thread
+from semfov.runs.setup import make_scenes
+from semfov.runs.window_looking import found_in
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Glance, Glances
+from semfov.zoom.slices import ranked, usual_slices
+
+_ENOUGH = 16
+"""Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
+_RECALL_PASSES = (4, 8, 16)
+"""Passes of the detector after which recall is reported."""
+_OF_INPUT = 1.15
+"""Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
+_FOR_MOSAICS = 360
+"""The number of mosaics grows up to this number of photographs to learn from."""
+_ALONE = 120
+"""Largest number of photographs that are searched by themselves."""
+_LOOK = 0.04
+"""Estimate of the seconds of a pass of the detector."""
+
+_Way = Callable[[Glances], Iterator[WindowStep[Any]]]
+"""A way of looking for all objects of a picture."""
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """Settings of evidence that is not fitted."""
+
+    why: str
+
+
+class WindowsFit(PartFit):
+    """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
+
+    name: ClassVar[str] = "windows"
+
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        photographs, held_out = len(self.run.scenes), len(inputs.held_out)
+        why = None
+        if not self.config.windows:
+            why = "not fitted, since the setting `windows` is false"
+        elif held_out < _ENOUGH:
+            why = (
+                f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
+                f"{photographs} photographs are held out"
+            )
+        self.settings: FitZoomConfig | _LeftOut
+        if why is not None:
+            self.settings, self.tasks = _LeftOut(why), {}
+            return
+        self.settings = config = self.mosaics(photographs)
+        sets = {"searched": config.searched, "judged": config.judged}
+        self.tasks = {
+            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
+            "learning what closer looks show": 0.1 * config.steps,
+            "learning the expected number of objects": 0.2 * config.steps,
+            "learning the survey": 0.4 * config.survey_steps,
+            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
+            "fitting decisions": 0.01 * config.judging,
+            "looking closely": 4 * config.searched,
+            "looking closely at held-out pictures": 4 * config.judged,
+            "looking at photographs": 25 * _LOOK * config.photographs,
+            **{f"exploring, {kind}": 2 * count for kind, count in (sets | config.some_explored).items()},
+        }
+
+    def mosaics(self, photographs: int) -> FitZoomConfig:
+        """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
+        own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
+        training = min(photographs - held_out, _FOR_MOSAICS)
+        # The photographs are not enlarged.
+        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
+        width = min(
+            median(max(width, height * 4 / 3) for width, height in sizes),
+            _OF_INPUT * self.run.eye.detector.input_size[0],
+        )
+        return self.inputs.settings(
+            FitZoomConfig,
+            sensor=SensorConfig(),
+            mosaics=max(1, training // 5),
+            far=max(1, training // 60),
+            crowded=max(1, training // 10),
+            judged=max(8, min(held_out // 3, 30)),
+            judged_far=1,
+            kinds=(),
+            searched=max(8, training // 12),
+            sought=3,
+            passes=16,
+            photographs=min(photographs, _ALONE),
+            tile=max(16, round(width)),
+            steps=own.window_steps,
+            survey_steps=own.window_steps,
+        )
+
+    def fit(self) -> PartResult:
+        """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
+        config = self.settings
+        if isinstance(config, _LeftOut):
+            return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
+        with one_thread():
+            return self._fit(config)
+
+    def _fit(self, config: FitZoomConfig) -> PartResult:
+        fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
+        model, figures = _fit_mosaics(fit)
+        judged, opened = fit.mosaics["judged"], fit.opened("judged")
+        curves = {
+            "fitted": _photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
+            "raw": _photograph_recalls(judged, opened, _in_raw_order),
+        }
+        gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
+        at = _RECALL_PASSES[-1] - 1
+        why = (
+            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {_RECALL_PASSES[-1]} passes, "
+            f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
+            f"passes {in_words(gain, 'points gained', 100)}"
+        )
+        rows = [["looks", *(f"after {n} passes" for n in _RECALL_PASSES), "mean"]]
+        rows += [
+            [name, *(mean_percent(curve[:, n - 1]) for n in _RECALL_PASSES), mean_percent(curve.mean(1))]
+            for name, curve in curves.items()
+        ]
+        text = section(
+            f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
+            f"objects of each photograph, and the mean over 1 to {_RECALL_PASSES[-1]} passes. `raw` looks at slices in "
+            "the order of the sums of the overview's raw scores, as the agent does without this part.",
+            rows,
+        )
+        return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
+
+
+def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
+    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
+    examples = fit.look(("near", "far", "crowded", "judged"))
+    model = fit.closer(examples)
+    fit.survey(model, examples)
+    lines = [judge_windows(model, examples["judged"])[0], *fit.decisions(model)]
+    shipped = [
+        GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
+    ]
+    lines += fit.verification(model, mean_of([each.verification for each in shipped if each.verification is not None]))
+    lines += fit.certainty(model)
+    alone = [each.photograph.verification for each in shipped if each.photograph is not None]
+    scenes = make_scenes(fit.config.data, fit.eye.detector.classes)
+    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(alone))]
+    return model, "\n".join(lines)
+
+
+def _in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
+    """Look at slices in the order of the overview's scores, as an agent without evidence does."""
+    return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
+
+
+@torch.inference_mode()
+def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: _Way) -> FloatArray:
+    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`."""
+    hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
+    for index, glances in enumerate(opened):
+        tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
+        photograph = np.repeat(
+            [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.scene).boxes) for tile in tiles]
+        )
+        np.add.at(there, photograph, 1)
+        history: list[Glance] = []
+        turns = way(glances)
+        for number in range(_RECALL_PASSES[-1]):
+            turn = next(turns, None)
+            if turn is not None:
+                history.append(turn.glance)
+            np.add.at(hits[:, number], photograph, found_in(history, annotation).numpy())
+        glances.save()
+    return hits[there > 0] / there[there > 0, None]
