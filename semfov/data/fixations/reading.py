@@ -9,11 +9,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.data.fixations.exports import OURS, is_export, read_export
+from semfov.data.fixations.columns import of_source
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import of_source, read_table
+from semfov.data.fixations.table import OURS, is_export, read_export, read_table
 from semfov.data.large import picture_size
 from semfov.data.sources import picture_files
 from semfov.errors import DataError, InputError, check, check_options

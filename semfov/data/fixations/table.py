@@ -1,4 +1,4 @@
-"""Fixations as a plain table with a line for each fixation, which any program can write."""
+"""Fixations as a plain table with a line for each, which any program can write, and tables of eye trackers."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from semfov.data.fixations.columns import of_source
 from semfov.data.fixations.record import Fixations, ObjectBox
 from semfov.data.fixations.suspicions import warn_of_frames
-from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, InputError, check, lookup
-from semfov.io.files import check_regular, read_text, write_text
+from semfov.io.files import write_text
 
-Units = Literal["pixels", "fractions"]
+_Units = Literal["pixels", "fractions"]
 """Unit of the coordinates of a table: pixels, whose centres are at integers, or fractions of the sides of the frame."""
 
-Origin = Literal["top left", "bottom left", "centre", "centre, y up"]
+_Origin = Literal["top left", "bottom left", "centre", "centre, y up"]
 """Where the coordinates of a table are 0. y points down from the top left and from the centre, else up."""
 
 _COLUMNS = ("picture", "subject", "x", "y")
@@ -30,27 +30,13 @@ _SIZE = ("width", "height")
 _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
-_MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
-
-_BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
-"""What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
-
-_REMEDIES = {
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save it as CSV, or give pandas.read_excel(file)"),
-    **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "unpack it, or give pandas.read_csv(file)"),
-    ".parquet": "give pandas.read_parquet(file)",
-    ".mat": "give a table of what scipy.io.loadmat(file) reads",
-    ".edf": "convert it to .asc (edf2asc of the EyeLink Developers Kit)",
-}
-"""What to do with files that are no text, by their ends."""
-
 _LARGEST = 1e6
 """Largest coordinate and side in pixels."""
 
-Size = tuple[int, int] | Mapping[str, tuple[int, int]]
+_Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 """`(width, height)` of all frames, or of each by the name of its picture."""
 
-Line = tuple[str, Mapping[str, str]]
+_Line = tuple[str, Mapping[str, str]]
 """The place of a line in words, and its fields by our names of the columns."""
 
 
@@ -62,9 +48,9 @@ def read_table(
     source: str | PathLike[str] | Any,
     *,
     columns: Mapping[str, str] | None = None,
-    size: Size | None = None,
-    units: Units = "pixels",
-    origin: Origin = "top left",
+    size: _Size | None = None,
+    units: _Units = "pixels",
+    origin: _Origin = "top left",
 ) -> list[Fixations]:
     r"""Read fixations from a table.
 
@@ -104,9 +90,9 @@ def read_table(
     ...     read_table(path)[0].points.tolist()
     [[40.0, 30.0], [52.5, 31.0]]
     """
-    lookup(units, get_args(Units), "unit")
-    lookup(origin, get_args(Origin), "origin")
-    named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
+    lookup(units, get_args(_Units), "unit")
+    lookup(origin, get_args(_Origin), "origin")
+    named = _named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     where, header, rows = of_source(source)
     by_lower = {name.lower(): name for name in reversed(header)}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
@@ -123,104 +109,27 @@ def read_table(
             raise FrameError(f"{text} or give size=")
         raise DataError(text)
     lines = [(place, {name: row.get(named.get(name, name), "") for name in (*needed, *_MORE)}) for place, row in rows]
-    return records_of(where, lines, size, units, origin)
+    return _records_of(where, lines, size, units, origin)
 
 
-def records_of(where: str, lines: Sequence[Line], size: Size | None, units: Units, origin: Origin) -> list[Fixations]:
+def _records_of(
+    where: str, lines: Sequence[_Line], size: _Size | None, units: _Units, origin: _Origin
+) -> list[Fixations]:
     """The records of lines, with a warning of what their coordinates look like."""
     records = [_record(where, group, size, units, origin) for group in _scanpaths(where, lines)]
     return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
 
 
-def named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
+def _named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
     """The names of columns in a source by ours, of which some are known."""
     fits = columns is None or (isinstance(columns, Mapping) and all(isinstance(each, str) for each in columns.values()))
     check(fits, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
     return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
 
 
-def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
-    """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
-    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
-    if not frame and not isinstance(source, str | PathLike):
-        expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
-        raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
-    where = "the table" if frame else str(source)
-    header, rows = _of_frame(source) if frame else _of_file(Path(source))
-    return where, header, rows
-
-
-def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
-    """Names of the columns of a `pandas.DataFrame`, and its rows as text; missing values are empty."""
-    header = [str(name) for name in frame.columns]
-    _check_different("the table", header)
-    rows = []
-    for number, row in enumerate(frame.itertuples(index=False, name=None)):
-        # A column of whole numbers in which one is missing is one of floats.
-        plain = [int(each) if isinstance(each, float) and each.is_integer() else each for each in row]
-        texts = ["" if str(value) in _MISSING else str(value) for value in plain]
-        rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
-    return header, rows
-
-
-_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
-"""First bytes of pictures, whatever the names of their files say."""
-
-
-def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
-    """Names of the columns of a file, and its lines; decimal commas become points."""
-    remedy = _REMEDIES.get(path.suffix.lower())
-    if remedy is not None and path.exists():
-        raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
-    if not path.exists():
-        raise DataError(f"{path}: no such file; check the path")
-    check_regular(path)
-    with path.open("rb") as file:
-        drawn = path.suffix.lower() in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
-    if drawn or path.suffix.lower() in VIDEOS:
-        got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
-        raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
-    try:
-        text = read_text(path)
-        before = _BEFORE.match(text)
-        text = text[before.end() :] if before else text
-        first = text.partition("\n")[0]
-        separator = max(",;\t|", key=first.count)
-        table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-        lines = [(f"line {table.line_num}", line) for line in table]
-    except (OSError, UnicodeError, csv.Error) as error:
-        remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
-        raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
-    header = [(name or "").strip() for name in table.fieldnames or ()]
-    _check_different(str(path), header)
-    rows = []
-    for place, line in lines:
-        if None in line:
-            raise DataError(
-                f"{path}: {place}: expected {len(header)} fields, got more; quote fields with {separator!r}"
-            )
-        values = [(value or "").strip() for value in line.values()]
-        if separator != ",":
-            values = [value.replace(",", ".") if _is_decimal(value) else value for value in values]
-        rows.append((place, dict(zip(header, values, strict=True))))
-    return header, rows
-
-
-def _check_different(where: str, header: Sequence[str]) -> None:
-    again = sorted({name for name in header if header.count(name) > 1 and name})
-    if again:
-        raise DataError(f"{where}: expected columns of different names, got several named {', '.join(again)}")
-
-
-def _is_decimal(text: str) -> bool:
-    """Whether this is a number with a decimal comma."""
-    whole, comma, rest = text.lstrip("+-").partition(",")
-    return bool(comma) and (whole + rest.replace("e", "").replace("E", "").replace("-", "")).isdecimal()
-
-
-def _scanpaths(where: str, lines: Sequence[Line]) -> list[list[Line]]:
+def _scanpaths(where: str, lines: Sequence[_Line]) -> list[list[_Line]]:
     """The lines of each scanpath."""
-    groups: dict[tuple[str, ...], list[Line]] = {}
+    groups: dict[tuple[str, ...], list[_Line]] = {}
     previous = None
     for place, line in lines:
         who = tuple(line[name] for name in ("picture", "subject", "target", "trial"))
@@ -266,10 +175,10 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
 
 def _record(
     where: str,
-    group: Sequence[Line],
-    size: Size | None,
-    units: Units,
-    origin: Origin,
+    group: Sequence[_Line],
+    size: _Size | None,
+    units: _Units,
+    origin: _Origin,
 ) -> Fixations:
     place, line = group[0]
     if not line["picture"]:
@@ -314,7 +223,7 @@ def _record(
         raise DataError(f"{where}: {place}, {error}") from None
 
 
-def _frame(where: str, place: str, line: Mapping[str, str], size: Size | None) -> tuple[int, int]:
+def _frame(where: str, place: str, line: Mapping[str, str], size: _Size | None) -> tuple[int, int]:
     """Size of the frame of a scanpath."""
     if size is None:
         sides = [_number(where, place, line, name) for name in _SIZE]
@@ -330,7 +239,7 @@ def _frame(where: str, place: str, line: Mapping[str, str], size: Size | None) -
     return int(sides[0]), int(sides[1])
 
 
-def _placed(points: Any, frame: tuple[int, int], units: Units, origin: Origin, *, edges: bool = False) -> Any:
+def _placed(points: Any, frame: tuple[int, int], units: _Units, origin: _Origin, *, edges: bool = False) -> Any:
     """Points, or edges of pixels, in pixels from the top left, given in a unit from an origin."""
     if units == "pixels" and origin == "top left":
         return points
@@ -367,3 +276,251 @@ def _maybe(where: str, at: str, line: Mapping[str, str], name: str) -> float | N
     if not math.isfinite(value):
         raise DataError(f"{where}: {at}, {name}: expected a number, got {text[:40]!r}")
     return value
+
+
+class _Export(NamedTuple):
+    """The columns of a program's table, each by its possible names without case, spaces and signs.
+
+    Attributes:
+        program: its name.
+        point: columns of x and y.
+        duration: column of the duration, and milliseconds for one of its unit.
+        keep: a column, and the beginning of its values in the lines that count; none: all do.
+        needs: further columns that tell the table from others, and columns that it does not have.
+    """
+
+    program: str
+    point: tuple[str, str]
+    duration: tuple[tuple[str, ...], float] = (("durationms", "duration"), 1.0)
+    picture: tuple[str, ...] = ()
+    subject: tuple[str, ...] = ()
+    trial: tuple[str, ...] = ()
+    number: tuple[str, ...] = ()
+    size: tuple[str, str] | None = None
+    keep: tuple[str, tuple[str, ...]] | None = None
+    units: _Units = "pixels"
+    origin: _Origin = "top left"
+    needs: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
+
+
+_TRUE = ("true", "1")
+_PRO_LAB: dict[str, Any] = {
+    "duration": (("gazeeventdurationms", "gazeeventduration", "eyemovementeventduration"), 1.0),
+    "picture": ("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
+    "subject": ("participantname",),
+    "trial": ("recordingname",),
+    "number": ("eyemovementtypeindex",),
+    "keep": ("eyemovementtype", ("fixation",)),
+}  # fmt: skip
+_PRO_LAB_SCREEN = {**_PRO_LAB, "size": ("recordingresolutionwidth", "recordingresolutionheight")}
+_CLOUD: dict[str, Any] = {"subject": ("recordingid",), "trial": ("sectionid",), "number": ("fixationid",)}
+_PLAYER: dict[str, Any] = {"point": ("normposx", "normposy"), "units": "fractions", "origin": "bottom left"}
+
+_EXPORTS = (
+    _Export("Tobii Pro Lab", ("fixationpointxmcsnorm", "fixationpointymcsnorm"), units="fractions",
+            size=("presentedmediawidth", "presentedmediaheight"), needs=("presentedmediawidth",), **_PRO_LAB),
+    _Export("Tobii Pro Lab", ("fixationpointxdacspx", "fixationpointydacspx"), **_PRO_LAB_SCREEN),
+    _Export("Tobii Pro Lab", ("fixationpointx", "fixationpointy"), **_PRO_LAB_SCREEN),
+    _Export("Tobii Studio", ("fixationpointxmcspx", "fixationpointymcspx"), (("gazeeventduration",), 1.0),
+            ("medianame",), ("participantname",), ("recordingname",), ("fixationindex",),
+            ("mediawidth", "mediaheight"), ("gazeeventtype", ("fixation",))),
+    _Export("Pupil Cloud", ("fixationxpx", "fixationypx"), keep=("fixationdetectedinreferenceimage", _TRUE),
+            needs=("fixationdetectedinreferenceimage",), **_CLOUD),
+    _Export("Pupil Cloud", ("fixationxpx", "fixationypx"), **_CLOUD),
+    _Export("Pupil Cloud", ("fixationxnormalized", "fixationynormalized"), units="fractions",
+            keep=("fixationdetectedonsurface", _TRUE), needs=("fixationdetectedonsurface",), **_CLOUD),
+    _Export("Pupil Player", number=("fixationid",), keep=("onsurf", _TRUE), needs=("onsurf", "fixationid"), **_PLAYER),
+    _Export("Pupil Player", number=("id",), needs=("dispersion",), lacks=("onsurf",), **_PLAYER),
+    _Export("PsychoPy", ("averagegazex", "averagegazey"), (("duration",), 1000.0), subject=("sessionid",),
+            origin="centre, y up", needs=("duration",)),
+    _Export("Gazepoint", ("fpogx", "fpogy"), (("fpogd",), 1000.0), ("medianame", "mediaid"), number=("fpogid",),
+            keep=("fpogv", _TRUE), units="fractions"),
+    _Export("PyGaze", ("endx", "endy"), needs=("starttime", "endtime"), lacks=("startx",)),
+    _Export("pymovements", ("locationx", "locationy"), (("duration",), 1.0), ("stimulus", "image", "imageid", "textid"),
+            ("subjectid", "participantid", "subject"), ("trialid", "trial"), keep=("name", ("fixation",)),
+            needs=("onset", "offset")),
+    _Export("EyeLink Data Viewer", ("currentfixx", "currentfixy"), (("currentfixduration",), 1.0),
+            ("image", "imagename", "picture"), ("recordingsessionlabel", "datafile"), ("trialindex", "triallabel")),
+)  # fmt: skip
+
+OURS = ("picture", "subject", "target", "trial")
+_GONE = ("", ".", "nan", "none", "null", "na")  # lost, or not a number
+_EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
+"""Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
+
+
+def read_export(
+    source: str | PathLike[str] | Any,
+    *,
+    size: _Size | None = None,
+    picture: str | None = None,
+    subject: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: _Units | None = None,
+    origin: _Origin | None = None,
+    eye: Literal["left", "right"] | None = None,
+) -> list[Fixations]:
+    r"""Read the fixations in a table that the program of an eye tracker exports.
+
+    The names of the columns tell the program: Tobii Pro Lab and Tobii Studio; Pupil Cloud (also its reference images
+    and surfaces) and Pupil Player (also surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; PyGaze
+    (the lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`, `endx` and `endy`);
+    pymovements (events with a `location`); and EyeLink Data Viewer (fixation reports). Units, origins and durations are
+    those of the program. Lines that are no fixation, are not on the picture, or have no place are left out, and lines
+    that repeat the number of a fixation are one.
+
+    Args:
+        source: the file, or a `pandas.DataFrame`.
+        size: `(width, height)` of the frame, or of each picture by its name, where the table has none: the screen, the
+            picture, or the camera of glasses.
+        picture: name of the picture, where the table has none.
+        subject: name of the person; None takes that of the table, or of the file.
+        columns: columns of the table with our `picture`, `subject`, `target` and `trial`, such as
+            `{"picture": "condition_image"}`.
+        units: as for `read_table`, where it is not that of the program.
+        origin: likewise.
+        eye: `left` or `right`, where a column `eye` tells them; None takes the right one in viewings that have both.
+
+    Returns:
+        One record for each viewing, in the order in which they begin; convert those of a screen by
+        `Fixations.in_picture`.
+
+    Raises:
+        InputError: an argument is unknown.
+        DataError: it is no table of these programs, or has no fixation or no picture.
+        FrameError: a `DataError`, it has no frame and `size` is not given.
+
+    >>> import tempfile
+    >>> text = "id,start_timestamp,duration,norm_pos_x,norm_pos_y,dispersion\n7,1.2,240,0.5,0.75,1.1\n"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "ann.csv")
+    ...     _ = path.write_text(text)
+    ...     (record,) = read_export(path, size=(1280, 720), picture="desk.jpg")
+    >>> record.subject, record.points.tolist(), record.durations.tolist()
+    ('ann', [[639.5, 179.5]], [240.0])
+    """
+    named = _named_columns(columns, OURS)
+    check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
+    where, header, rows = of_source(source)
+    by_key = {_key(name): name for name in reversed(header)}
+    _split_location(by_key, rows)
+    export = next((each for each in _EXPORTS if _fits(each, by_key)), None)
+    if export is None:
+        programs = ", ".join(dict.fromkeys(each.program for each in _EXPORTS))
+        raise DataError(
+            f"{where}: expected the columns of a table of {programs}, got {', '.join(map(repr, header))[:300]}; "
+            "use read_table with columns={…}"
+        )
+    read = _reader(export, by_key, named, where)
+    default = {"picture": picture, "subject": subject}
+    kept: dict[object, tuple[str, dict[str, str]]] = {}
+    viewing, before = 0, None
+    for number, (place, row) in enumerate(rows):
+        line = read(row)
+        if line is None:
+            continue
+        line |= {name: given for name, given in default.items() if given is not None}
+        line["subject"] = line["subject"] or (Path(where).stem if len(header) and "." in where else "1")
+        who = tuple(line[name] for name in OURS)
+        viewing, before = viewing + (who != before), who
+        line["trial"] = f"{line['trial']} {viewing}"
+        key = line.pop("number") or None
+        kept[number if key is None else (viewing, key)] = place, line
+    if not kept:
+        raise DataError(f"{where}: expected fixations of {export.program}, got none that has a place on the picture")
+    lines = _of_one_eye(list(kept.values()), eye)
+    if not lines:
+        raise DataError(f"{where}: expected fixations of the {eye} eye, got those of the other one")
+    if not all(line["picture"] for _, line in lines):
+        raise DataError(
+            f"{where}: expected the name of the picture, which {export.program} does not give; give picture="
+        )
+    if size is None and not all(line["width"] and line["height"] for _, line in lines):
+        raise FrameError(f"{where}: expected the size of the frame, which {export.program} does not give; give size=")
+    return _records_of(where, lines, size, units or export.units, origin or export.origin)
+
+
+def _of_one_eye(lines: Sequence[tuple[str, dict[str, str]]], eye: str | None) -> list[_Line]:
+    """The lines of an eye, of the right one in viewings of both; lines that name no eye, or both, are kept."""
+    words = [re.split(r"[\W_]", line.pop("eye").lower()) for _, line in lines]
+    sides = [next((_EYES[word] for word in each if word in _EYES), "") for each in words]
+    both = {line["trial"] for (_, line), side in zip(lines, sides, strict=True) if side == "right"}
+    dropped = [
+        side != eye if eye else side == "left" and line["trial"] in both
+        for (_, line), side in zip(lines, sides, strict=True)
+    ]
+    return [line for line, side, drop in zip(lines, sides, dropped, strict=True) if not (side and drop)]
+
+
+def is_export(header: Sequence[str]) -> bool:
+    """Whether these are the columns of a table that `read_export` reads."""
+    by_key = {_key(name): name for name in header}
+    _split_location(by_key, [])
+    return any(_fits(each, by_key) for each in _EXPORTS)
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _fits(export: _Export, by_key: Mapping[str, str]) -> bool:
+    return {*export.point, *export.needs} <= {*by_key} and not {*export.lacks} & {*by_key}
+
+
+def _split_location(by_key: dict[str, str], rows: Sequence[tuple[str, dict[str, str]]]) -> None:
+    """Make two columns of one with pairs, `[x, y]`."""
+    name = by_key.get("location")
+    if name is None or "locationx" in by_key:
+        return
+    by_key |= {"locationx": "location_x", "locationy": "location_y"}
+    for _, row in rows:
+        pair = re.split(r"[,\s]+", row.get(name, "").strip("[]() "))
+        row["location_x"], row["location_y"] = pair if len(pair) == 2 else ("", "")
+
+
+def _reader(
+    export: _Export, by_key: Mapping[str, str], named: Mapping[str, str], where: str
+) -> Callable[[Mapping[str, str]], dict[str, str] | None]:
+    """A function that gives the fields of a row by our names; None for one that is no fixation."""
+
+    def column(names: Sequence[str]) -> str | None:
+        return next((by_key[name] for name in names if name in by_key), None)
+
+    fields = {name: column(getattr(export, name)) for name in ("picture", "subject", "trial", "number")}
+    fields |= {
+        "eye": column(("eye", "eyeused")),
+        "x": by_key[export.point[0]],
+        "y": by_key[export.point[1]],
+        "duration": column(export.duration[0]),
+    }
+    for name, side in zip(("width", "height"), export.size or (), strict=False):
+        fields[name] = column((side, f"{side}px"))
+    missing = [given for given in named.values() if given not in by_key.values()]
+    if missing:
+        raise DataError(f"{where}: expected the columns of columns=, got none named {', '.join(map(repr, missing))}")
+    fields |= named
+    keep = None if export.keep is None else column((export.keep[0],))
+
+    def read(row: Mapping[str, str]) -> dict[str, str] | None:
+        if keep is not None and export.keep is not None and not row[keep].lower().startswith(export.keep[1]):
+            return None
+        line = {name: "" if at is None else row.get(at, "") for name, at in fields.items()}
+        line = {**dict.fromkeys(("target", "width", "height", "found", "x1", "y1", "x2", "y2"), ""), **line}
+        if line["x"].lower() in _GONE or line["y"].lower() in _GONE:
+            return None
+        if line["duration"].lower() in _GONE:
+            line["duration"] = ""
+        elif export.duration[1] != 1:
+            line["duration"] = repr(_finite(line["duration"]) * export.duration[1])
+        return line
+
+    return read
+
+
+def _finite(text: str) -> float:
+    """The number; NaN, which is refused with its place, for other texts."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -1,0 +1,108 @@
+"""The columns and lines of tables, in files of text and in data frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from semfov.data.sources import PHOTOGRAPHS, VIDEOS
+from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular, read_text
+
+_MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
+
+_BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
+"""What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
+
+_REMEDIES = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save it as CSV, or give pandas.read_excel(file)"),
+    **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "unpack it, or give pandas.read_csv(file)"),
+    ".parquet": "give pandas.read_parquet(file)",
+    ".mat": "give a table of what scipy.io.loadmat(file) reads",
+    ".edf": "convert it to .asc (edf2asc of the EyeLink Developers Kit)",
+}
+"""What to do with files that are no text, by their ends."""
+
+
+def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
+    """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
+    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
+    if not frame and not isinstance(source, str | PathLike):
+        expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
+        raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
+    where = "the table" if frame else str(source)
+    header, rows = _of_frame(source) if frame else _of_file(Path(source))
+    return where, header, rows
+
+
+def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
+    """Names of the columns of a `pandas.DataFrame`, and its rows as text; missing values are empty."""
+    header = [str(name) for name in frame.columns]
+    _check_different("the table", header)
+    rows = []
+    for number, row in enumerate(frame.itertuples(index=False, name=None)):
+        # A column of whole numbers in which one is missing is one of floats.
+        plain = [int(each) if isinstance(each, float) and each.is_integer() else each for each in row]
+        texts = ["" if str(value) in _MISSING else str(value) for value in plain]
+        rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
+    return header, rows
+
+
+_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
+"""First bytes of pictures, whatever the names of their files say."""
+
+
+def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
+    """Names of the columns of a file, and its lines; decimal commas become points."""
+    remedy = _REMEDIES.get(path.suffix.lower())
+    if remedy is not None and path.exists():
+        raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
+    if not path.exists():
+        raise DataError(f"{path}: no such file; check the path")
+    check_regular(path)
+    with path.open("rb") as file:
+        drawn = path.suffix.lower() in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
+    if drawn or path.suffix.lower() in VIDEOS:
+        got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
+        raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
+    try:
+        text = read_text(path)
+        before = _BEFORE.match(text)
+        text = text[before.end() :] if before else text
+        first = text.partition("\n")[0]
+        separator = max(",;\t|", key=first.count)
+        table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        lines = [(f"line {table.line_num}", line) for line in table]
+    except (OSError, UnicodeError, csv.Error) as error:
+        remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
+        raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
+    header = [(name or "").strip() for name in table.fieldnames or ()]
+    _check_different(str(path), header)
+    rows = []
+    for place, line in lines:
+        if None in line:
+            raise DataError(
+                f"{path}: {place}: expected {len(header)} fields, got more; quote fields with {separator!r}"
+            )
+        values = [(value or "").strip() for value in line.values()]
+        if separator != ",":
+            values = [value.replace(",", ".") if _is_decimal(value) else value for value in values]
+        rows.append((place, dict(zip(header, values, strict=True))))
+    return header, rows
+
+
+def _check_different(where: str, header: Sequence[str]) -> None:
+    again = sorted({name for name in header if header.count(name) > 1 and name})
+    if again:
+        raise DataError(f"{where}: expected columns of different names, got several named {', '.join(again)}")
+
+
+def _is_decimal(text: str) -> bool:
+    """Whether this is a number with a decimal comma."""
+    whole, comma, rest = text.lstrip("+-").partition(",")
+    return bool(comma) and (whole + rest.replace("e", "").replace("E", "").replace("-", "")).isdecimal()
