@@ -103,7 +103,7 @@ class Policy(nn.Module):
             The acquisition function.
 
         Raises:
-            InputError: the function needs a target or a setting, and has none.
+            InputError: the function needs a target or a setting, and has none, or has one of another type.
         """
         given = {"target": target, "model": self.model, "grid": grid}
         given = {name: value for name, value in given.items() if value is not None and name in self.function.takes}
@@ -112,7 +112,11 @@ class Policy(nn.Module):
             if given.get(name) is None and parameter.default is parameter.empty:
                 needed = {"target": "a target to search for"}.get(name, f"{name} of a scene")
                 raise InputError(f"policy {self.name!r}: expected {needed}, got none")
-        return self.function(**given)
+        try:
+            return self.function(**given)
+        except TypeError as error:
+            expected = f"values that fit {', '.join(given)}"
+            raise InputError(f"policy {self.name!r}: expected {expected}, got others ({error})") from error
 
 
 def policy_names(task: Task) -> list[str]:

@@ -62,6 +62,9 @@ def test_settings_reach_the_function(model, mapping):
     assert policy.model is mapping
     assert policy(None, GRID).model is mapping
     refused("unknown setting of policy 'kl' 'prio'; did you mean 'prior'", Policy, "kl", model, prio=1.0)
+    for options in ({"prior": None}, {"prior": "high"}):
+        with pytest.raises(InputError, match="policy 'kl': expected values that fit model, grid, prior, got others"):
+            Policy("kl", model, **options)(None, GRID)
     for values in ({}, {"values": None}):
         refused("policy 'saliency': expected values of a scene, got none", Policy("saliency", **values), None, GRID)
 
