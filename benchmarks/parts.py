@@ -19,6 +19,7 @@ from benchmarks.tables import begin, command, number, page, table, write
 from benchmarks.zoom import detector_alone
 from semfov import ActivePerception, Detections, Detector, ZoomAgent, as_image
 from semfov.data.large import open_large
+from semfov.errors import check
 from semfov.eye import Eye, View
 
 FIXATIONS, PASSES = 8, 24
@@ -95,8 +96,11 @@ def main() -> None:
     _, about = begin(options)
     kinds = {"photograph": (photographs, options.photographs), "large picture": (large_pictures, options.pictures)}
     rows, figures = [], {}
-    for kind, (measure, folder) in kinds.items():
-        files = sorted(folder.glob("*.jpg"))[: options.limit]
+    found = {kind: sorted(folder.glob("*.jpg"))[: options.limit] for kind, (_, folder) in kinds.items()}
+    for kind, files in found.items():
+        check(len(files) > 0, kind, f"files *.jpg in {kinds[kind][1]}", "none")
+    for kind, files in found.items():
+        measure = kinds[kind][0]
         measure(files[:1], options.weights)  # first calls take longer
         figures[kind] = measure(files, options.weights)
         rows += figures[kind].rows(kind)

@@ -155,7 +155,7 @@ def _search_as_semba(config: _SembaConfig) -> None:
         return torch.cat([chosen[..., :-2].mean(0), torch.stack([stopped, right], -1)], -1)
 
     bootstrap = Bootstrap.of(measure, scenes)
-    head = [*(f"CP@{n}" for n in _SHIFTS), "stopped", "right of those"]
+    head = [*(f"CP@{n}" for n in _SHIFTS if n <= config.protocol.shifts), "stopped", "right of those"]
     ways = [f"{step}, {rule}" for step in _STEPS for rule in _RULES]
     rows = [["as in the code of SemBA, rule", *head]]
     rows += [[way, *_cells(bootstrap, n)] for n, way in enumerate(ways)]

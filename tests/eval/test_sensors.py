@@ -178,7 +178,21 @@ def test_cells_around_chosen_and_empty_ones_are_not_chosen(escape):
 
 
 def test_the_command_writes_its_table(home, capsys):
-    few = ["--data.limit", "3", "--sensor.settings.side", "64", "--belief.columns", "7", "--belief.rows", "5"]
+    few = [
+        "--data.limit",
+        "3",
+        "--protocol.shifts",
+        "3",
+        "--sensor.settings.side",
+        "64",
+        "--belief.columns",
+        "7",
+        "--belief.rows",
+        "5",
+    ]
     assert semba.main(given(home, "semba", *few)) == 0
-    assert "escape, semba" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "escape, semba" in shown
+    assert "CP@3" in shown
+    assert "CP@6" not in shown
     assert (home / "semba/summary.md").read_text(encoding="utf-8").startswith("7 searches in 3 photographs")
