@@ -27,7 +27,7 @@ MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
-LARGEST = {FovealObservationModel: 1_100_000, semfov.saliency.FixationDensity: 160_000}
+LARGEST = {FovealObservationModel: 1_100_000, semfov.saliency.FixationDensity: 300_000}
 SHIPPED = [(kind, path) for kind in KINDS for path in sorted(kind.shipped.glob("*.safetensors"))]
 
 
@@ -57,7 +57,7 @@ def test_the_card_of_where_people_look_says_how_the_models_were_fitted():
         assert {each: float(re.search(words, card)[1]) for each, words in said.items()} == {
             each: training[each] for each in said
         }
-        assert [training[each] for each in ("readouts", "units")] == [2, 32]
+        assert [training[each] for each in ("readouts", "units")] == [4, 32]
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)

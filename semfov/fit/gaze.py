@@ -43,13 +43,13 @@ class GazeFit(Settings):
         seed: seed of the fit.
     """
 
-    readouts: Annotated[int, Range(1, 16)] = 2
+    readouts: Annotated[int, Range(1, 16)] = 4
     units: Annotated[int, Range(1, 256)] = 32
     epochs: Count = 20
     saccade_epochs: Whole = 3
     batch: Count = 8
     rate: Positive = 3e-3
-    decay: Positive = 0.01
+    decay: Positive = 0.3
     dropout: Share = 0.2
     seed: Seed = 0
 
