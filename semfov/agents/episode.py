@@ -65,6 +65,8 @@ class Episode(ABC, Generic[_Record]):
     Attributes:
         passes: number of passes of the detector so far.
         ending: reason for the end; None while it goes on.
+        criterion: what a search needs for the decision `found`, in words, after the first look; None where nothing is
+            decided.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class Episode(ABC, Generic[_Record]):
         self.passed = 1.0
         self.passes = 0
         self.ending: Ending | None = None
+        self.criterion: str | None = None
         self._size: tuple[int, int] | None = None
 
     @abstractmethod
@@ -93,11 +96,6 @@ class Episode(ABC, Generic[_Record]):
     @abstractmethod
     def decision(self) -> Decision | None:
         """The decision of a search as it stands; None where nothing is decided."""
-
-    @property
-    def criterion(self) -> str | None:
-        """What a search needs for the decision `found`, in words; None where nothing is decided."""
-        return None
 
     @abstractmethod
     def record(self) -> _Record:

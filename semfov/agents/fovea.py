@@ -176,6 +176,8 @@ class FoveaEpisode(Episode[Scanpath]):
         usually = own if self.verification is None else self.verification.thresholds
         fading = own.give_up if rate and own is not None else None
         self.thresholds = None if usually is None else usually.changed(give_up=fading).changed(confirm, give_up)
+        if self.thresholds is not None:
+            self.criterion = f"p is {self.thresholds.confirm:g} and the gaze was at the place"
         self.ends: Callable[[Step], Tensor] | None = None
         self.to_goal = False
         columns, rows = agent.cells
@@ -219,6 +221,7 @@ class FoveaEpisode(Episode[Scanpath]):
         if self.verification is not None and self.target is not None:
             places = CandidateCells(grid, self.target, self.forgetting)
             self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
+            self.criterion = self._verifier.criterion
         # A stream has no end, so it keeps the detections of the looks of which at least half the evidence is left.
         self._recent: deque[tuple[float, Detections]] = deque(maxlen=_MOST_RECENT if self.forgetting else None)
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
@@ -343,13 +346,6 @@ class FoveaEpisode(Episode[Scanpath]):
         cell = None if self.thresholds is not None else int(step.cell)
         meant = class_meant(step.belief, self.target)
         return conclude(self._outcome, step.belief, seen, grid, meant, cell)
-
-    @property
-    def criterion(self) -> str | None:
-        """What the decision `found` needs, in words."""
-        if self._verifier is not None:
-            return self._verifier.criterion
-        return None if self.thresholds is None else f"p is {self.thresholds.confirm:g} and the gaze was at the place"
 
     def record(self) -> Scanpath:
         """The scanpath so far."""

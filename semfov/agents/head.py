@@ -54,6 +54,9 @@ class HeadAgent(nn.Module):
         search: evidence model for a target.
         explore: evidence model for a map.
 
+    Attributes:
+        classes: names of the classes, background first.
+
     Example::
 
         agent = HeadAgent.recommended("yolox-nano")
@@ -63,7 +66,7 @@ class HeadAgent(nn.Module):
 
     def __init__(self, eye: Eye, search: TargetEvidence, explore: MapEvidence) -> None:
         super().__init__()
-        self.eye = eye
+        self.eye, self.classes = eye, ("background", *eye.detector.classes)
         self.target_evidence, self.map_evidence = search, explore
 
     @classmethod
@@ -87,11 +90,6 @@ class HeadAgent(nn.Module):
         for model in models:
             model.check_compatible(eye.settings())
         return cls(eye, *models).eval().requires_grad_(False)
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first."""
-        return ("background", *self.eye.detector.classes)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
         """The views and fixations that are possible in a scene.

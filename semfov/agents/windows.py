@@ -26,7 +26,7 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import candidates, closer_window, look_closely
-from semfov.zoom.decision import WindowDecisions, decide_by_score, score_needed
+from semfov.zoom.decision import USUAL_SCORE, WindowDecisions, decide_by_score
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
@@ -59,6 +59,9 @@ class ZoomAgent(nn.Module):
         eye: resamples a window and detects in it.
         evidence: predicts from a look what closer looks will find; None for slices.
 
+    Attributes:
+        classes: names of the classes, background first.
+
     Raises:
         InputError: the evidence was made for other classes, or for another detector.
 
@@ -75,8 +78,8 @@ class ZoomAgent(nn.Module):
             kinds = len(eye.detector.classes)
             check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
             evidence.check_compatible(eye.settings())
-        self.eye = eye
-        self.evidence = evidence
+        self.eye, self.evidence = eye, evidence
+        self.classes = ("background", *eye.detector.classes)
 
     @classmethod
     def recommended(cls, name: str = "yolov3-tiny", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
@@ -99,11 +102,6 @@ class ZoomAgent(nn.Module):
         eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
         return cls(eye, evidence).eval().requires_grad_(False)
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, background first."""
-        return ("background", *self.eye.detector.classes)
 
     def search(
         self,
@@ -279,13 +277,15 @@ class WindowEpisode(Episode[ZoomPath]):
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
         self.batch, self.worth, self._least = batch, worth, least
-        self._confirm = confirm
+        self._confirm = USUAL_SCORE if confirm is None else confirm
         self._decisions: WindowDecisions | None = None
         if evidence is not None and target is not None:
             self._decisions = WindowDecisions(
                 evidence, target, self._close_up,
                 confirm=confirm, give_up=give_up, closer=closer, forgetting=self.forgetting,
             )  # fmt: skip
+        elif self.searches:
+            self.criterion = f"a detection scores {self._confirm:g}"
         self._glances: Glances | None = None
         self._last: WindowStep[Any] | None = None
         self._looks: list[_Look] = []
@@ -379,6 +379,7 @@ class WindowEpisode(Episode[ZoomPath]):
         if self._decisions is not None:
             last = turn.ahead == 0 or self.limits.room(self.passes) <= 1
             self._decisions.see(turn, self.passes, last=last)
+            self.criterion = self._decisions.criterion
         return True
 
     def _close_up(self, box: Tensor) -> Detections:
@@ -421,13 +422,6 @@ class WindowEpisode(Episode[ZoomPath]):
         if not self.searches or self.target is None:
             return None
         return decide_by_score(self.glances, self.target, self._confirm)
-
-    @property
-    def criterion(self) -> str | None:
-        """What the decision `found` needs, in words, after the first look."""
-        if self._decisions is not None:
-            return self._decisions.criterion
-        return f"a detection scores {score_needed(self._confirm):g}" if self.searches else None
 
     @property
     def belief(self) -> ZoomBelief | None:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -55,17 +55,31 @@ class CandidatePlaces(ABC, Generic[LookType]):
     presence: float
     """Probability that the picture holds the target, after the last look."""
 
+    grid: Grid | None = None
+    """The cells, where places are cells."""
+
+    _left: float
+    _fixation: int | None = None
+    _number: int | None = None
+    """The look after which the last closer look was made, or the one that it is."""
+
     def __init__(self, forgetting: Forgetting | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
+        self._frame = 0.0
+        # Each with its frame: what looks show, boxes `(2, 4)` and cells `(X·Y,)` of examined places, and their
+        # probabilities.
+        self._looks: list[tuple[float, Any]] = []
+        self._examined: list[tuple[float, Tensor, Tensor]] = []
+        self._known: list[tuple[float, float]] = []
 
     @abstractmethod
     def see(self, look: LookType) -> None:
         """Take in a look of the search."""
 
     @property
-    @abstractmethod
     def left(self) -> float:
         """Value of the best look that is left, after the last look."""
+        return self._left
 
     @abstractmethod
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
@@ -75,21 +89,26 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
         return False
 
-    @abstractmethod
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)`."""
+        boxes, covered = torch.stack([candidate.box, box]), torch.zeros(0).bool()
+        if self.grid is not None:
+            covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
+            covered[candidate.cell] = True
+        self._examined.append((self._frame, boxes, covered))
 
-    @abstractmethod
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look; box `(4,)`."""
+        self._known.append((self._frame, place))
+        return CloseUp(self._fixation, self.target, self._cell(box), box, place, presence, self._number)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
-        """Look closely at a candidate, and dismiss it; → `(7,)`."""
+        """Look closely at a candidate, unless a look showed it so, and dismiss it; → `(7,)`."""
         features, box = closer_features(
             self.presence,
             candidate.probability,
             candidate.evidence,
-            close_up(candidate.box),
+            self.detections if self.seen(candidate) else close_up(candidate.box),
             candidate.box,
             self.target,
         )
@@ -97,11 +116,24 @@ class CandidatePlaces(ABC, Generic[LookType]):
         return features, box
 
     def wait(self, frames: float = 1) -> None:
-        """Let frames pass."""
+        """Let frames pass: forget looks, and list places again, of which less than half the evidence is left."""
+        self._frame += frames
+        oldest = self._frame - self.forgetting.span
+        self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
+        self._examined = [place for place in self._examined if place[0] >= oldest]
+        self._known = [known for known in self._known if known[0] >= oldest]
 
     def move(self, look: CloseUp, box: Tensor) -> CloseUp:
-        """The record of a closer look whose target has moved to another box."""
-        return replace(look, box=box)
+        """The record of a closer look whose target has moved to another box, and its cell."""
+        return replace(look, box=box, cell=self._cell(box))
+
+    def _cell(self, box: Tensor) -> int | None:
+        return None if self.grid is None else cell_of(box, self.grid)
+
+    def _again(self, boxes: Tensor) -> Tensor:
+        """Which of boxes `(N, 4)` are of places that were examined, `(N,)` boolean."""
+        examined = torch.cat([boxes.new_zeros(0, 4), *(pair for _, pair, _ in self._examined)])
+        return (box_iou(boxes, examined) >= SAME).any(-1)
 
     def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
@@ -112,7 +144,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
 class _Seen:
     """A look of a search, whose footprints are computed once."""
 
-    frame: float
     detections: Detections
     grid: Grid
 
@@ -134,63 +165,36 @@ class CandidateCells(CandidatePlaces[Step]):
     def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
         self.grid, self._target = grid, target
-        self._frame = 0.0
-        self._looks: list[_Seen] = []
-        self._dismissed: list[tuple[float, Tensor, Tensor]] = []  # frame, boxes (2, 4) and cells (X·Y,) of each place
 
+    grid: Grid
     _step: Step
 
     def see(self, look: Step) -> None:
         """Take in a step of the search."""
-        self._step, self.detections = look, look.detections
+        self._step, self._fixation, self.detections = look, look.shift, look.detections
         self.target = class_meant(look.belief, self._target)
         self.presence = float(look.belief.presence(self._target))
-        self._looks.append(_Seen(self._frame, look.detections, self.grid))
-
-    @property
-    def left(self) -> float:
-        """Largest probability of a cell that was not fixated, given that no fixated cell holds the target."""
-        return float(self._step.belief.chance(self._target).masked_fill(self._step.visited, 0).amax())
+        self._looks.append((self._frame, _Seen(look.detections, self.grid)))
+        # Largest probability of a cell that was not fixated, given that no fixated cell holds the target.
+        self._left = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """The most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
         cells = self._step.belief.probability(self._target)[0]
-        for _, _, examined in self._dismissed:
-            cells = cells.masked_fill(examined, 0)
+        for _, _, covered in self._examined:
+            cells = cells.masked_fill(covered, 0)
         if not (last or bool(place_known(cells, self._step.visited[0], least))):
             return None
-        boxes = torch.cat([look.detections.boxes[0] for look in self._looks])
+        boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
         if not len(boxes):
             return None
-        evidence = self._scores(boxes, self.target)[:, None] * torch.cat([look.weights for look in self._looks])
+        evidence = self._scores(boxes, self.target)[:, None] * torch.cat([look.weights for _, look in self._looks])
         value = cells * evidence.amax(0)
         cell = int(value.argmax())
         if float(value[cell]) <= 0 or float(cells[cell]) < least:
             return None
         best = int(evidence[:, cell].argmax())
         return CandidatePlace(boxes[best], float(evidence[best, cell]), float(cells[cell]), cell)
-
-    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Leave out the detections of both boxes, and the cells that they cover."""
-        boxes = torch.stack([candidate.box, box])
-        covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
-        covered[candidate.cell] = True
-        self._dismissed.append((self._frame, boxes, covered))
-
-    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Make the record of the last closer look, after the last fixation."""
-        return CloseUp(self._step.shift, self.target, cell_of(box, self.grid), box, place, presence)
-
-    def wait(self, frames: float = 1) -> None:
-        """Let frames pass: drop looks, and list places again, of which less than half the evidence is left."""
-        self._frame += frames
-        oldest = self._frame - self.forgetting.span
-        self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look.frame >= oldest]
-        self._dismissed = [place for place in self._dismissed if place[0] >= oldest]
-
-    def move(self, look: CloseUp, box: Tensor) -> CloseUp:
-        """The record of a closer look whose target has moved to another box, and its cell."""
-        return replace(look, box=box, cell=cell_of(box, self.grid))
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is in the cell of a closer look."""
@@ -201,11 +205,8 @@ class CandidateCells(CandidatePlaces[Step]):
         keep = self.forgetting.keep
         scores = torch.cat(
             [
-                look.detections.mask[0] * (look.detections.scores[0, :, target] * keep ** (self._frame - look.frame))
-                for look in self._looks
+                look.detections.mask[0] * (look.detections.scores[0, :, target] * keep ** (self._frame - frame))
+                for frame, look in self._looks
             ]
         )
-        if not self._dismissed:
-            return scores
-        examined = torch.cat([boxes for _, boxes, _ in self._dismissed])
-        return scores * (box_iou(boxes, examined) < SAME).all(-1)
+        return scores * ~self._again(boxes) if self._examined else scores

@@ -68,6 +68,8 @@ class Verifier(Generic[LookType]):
         check_whole(most, "most", 1, 100)
         self.model, self.places, self.close_up = model, places, close_up
         self.thresholds, self.most = thresholds, most
+        self.criterion = f"a closer look gives p {thresholds.confirm:g} there"
+        """What the decision `found` needs, in words."""
         self.verdicts: list[_Verdict] = []
         self.candidate: CandidatePlace | None = None
         self._last = False
@@ -153,11 +155,6 @@ class Verifier(Generic[LookType]):
             return Decision(outcome if over else "undecided", presence)
         place, best = max(chances), self.best
         return Decision("found", max(presence, place), best.cell, best.box, place)
-
-    @property
-    def criterion(self) -> str:
-        """What the decision `found` needs, in words."""
-        return f"a closer look gives p {self.thresholds.confirm:g} there"
 
     @property
     def presence(self) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -25,7 +24,6 @@ from semfov.metrics.exploration import count_right
 from semfov.paths import Scanpath
 from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, reduced_copy
-from semfov.runs.search_protocol import Trial
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation
 
@@ -82,23 +80,28 @@ class _SceneLooks(Looks):
 class CellGazes(Gazes):
     """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own; cell `(B,)`.
 
-    The planes of the belief are the probabilities of the target or of all `classes`, and two more.
+    A search is over when the gaze lands on a cell that an object of the target class overlaps, an exploration when
+    every cell was fixated. The result of an exploration is the fraction of the cells with objects whose most probable
+    class is that of one of these objects. The planes of the belief are the probabilities of the target or of all
+    classes, and two more.
     """
 
     coordinates = 2
     scenery: Scenery
     memory: Memory
 
-    def __init__(
-        self, scenery: Scenery, count: int = 1, *, classes: int, together: bool = False, **options: Any
-    ) -> None:
-        self.action_space = spaces.Discrete(scenery.shape[0] * scenery.shape[1])
-        self.belief_space = spaces.Box(0, 1, (classes + 2, *scenery.shape), np.float32)
-        super().__init__(scenery, count, **options)
+    def __init__(self, scenery: Scenery, task: str, count: int = 1, *, together: bool = False, **options: Any) -> None:
+        cells = scenery.shape[0] * scenery.shape[1]
+        maps = () if task == "search" else (len(scenery.classes),)
+        self.action_space = spaces.Discrete(cells)
+        self.belief_space = spaces.Box(0, 1, (sum(maps or (1,)) + 2, *scenery.shape), np.float32)
+        super().__init__(scenery, task, count, **options)
         self.observer: Observer = scenery.together if together else scenery.observer
         self.looks = _SceneLooks(scenery.open, self.observer, count)
         self.cell = torch.zeros(count, dtype=torch.int64)
         self.size = torch.zeros(count, 2)
+        # The cells of the goal, or the right classes of all cells.
+        self._right = torch.zeros(count, cells, *maps, dtype=torch.bool)
         self._steps: list[Step] = []
         self._stimulus: Stimulus | None = None
 
@@ -108,13 +111,13 @@ class CellGazes(Gazes):
         check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
         if "episode" in options:
             scene = getattr(options["episode"], "scene", None)
-            fits = isinstance(scene, int) and 0 <= scene < scenery.count
+            fits = isinstance(scene, int) and 0 <= scene < len(scenery.pictures)
             check(fits, "episode", f"one of {type(scenery).__name__}.episodes", repr(options["episode"]))
             return options["episode"]
         if "scene" not in options:
             return scenery.draw(random)
         scene = options["scene"]
-        check_whole(scene, "scene", 0, scenery.count - 1)
+        check_whole(scene, "scene", 0, len(scenery.pictures) - 1)
         episodes = scenery.episodes(int(scene))
         check(len(episodes) > 0, "scene", "a scene with objects to look for", scene)
         return episodes[random.integers(len(episodes))]
@@ -128,11 +131,15 @@ class CellGazes(Gazes):
     @torch.inference_mode()
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
-        visited = self.memory.visited[rows]
+        visited, belief = self.memory.visited[rows], self._all_or(rows)
         here = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
-        more = torch.stack([visited, here], 1).reshape(len(rows), 2, *self.scenery.shape)
-        planes: NDArray[np.float32] = torch.cat([self._map(rows).float().clamp(0, 1), more.float()], 1).numpy()
-        return planes
+        if self.searching:  # if no fixated cell holds the target
+            maps = belief.chance(self.targets[rows]).masked_fill(visited, 0.0)[:, None]
+        else:
+            maps = belief.class_probabilities().mT
+        more = torch.stack([visited, here], 1).float()
+        planes: NDArray[np.float32] = torch.cat([maps.float().clamp(0, 1), more], 1).numpy()
+        return planes.reshape(len(rows), -1, *self.scenery.shape)
 
     def places(self, rows: Tensor) -> Tensor:
         """Fixated points `(n, 2)` as fractions of width and height."""
@@ -158,7 +165,7 @@ class CellGazes(Gazes):
         scenery, episode, boxes = self.scenery, self.episodes[0], None
         if self._stimulus is None:
             self._stimulus = Stimulus.of(scenery.eye, scenery.image(episode.scene))
-        if isinstance(episode, Trial):
+        if self.searching:
             objects = scenery.annotation(episode.scene)
             boxes = objects.boxes[objects.labels == episode.target]
         path = self.scanpath()
@@ -170,28 +177,33 @@ class CellGazes(Gazes):
         """The looks of the first episode, which are kept for pictures."""
         episode = self.episodes[0]
         grid, classes = self.scenery.grid(episode.scene), self.scenery.classes
-        searching = isinstance(episode, Trial)
         # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
-        beside: Observer | None = Semantic(len(classes)) if searching else None
+        cue, beside = (episode.cue, Semantic(len(classes))) if self.searching else (None, None)
         with torch.inference_mode():
-            return Trace(grid, classes, episode.cue if searching else None, beside, steps=self._steps).scanpath()
+            return Trace(grid, classes, cue, beside, steps=self._steps).scanpath()
 
     @torch.inference_mode()
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
         scenes = [episode.scene for episode in episodes]
-        self.targets[rows] = torch.tensor([episode.cue if isinstance(episode, Trial) else 0 for episode in episodes])
-        searching = isinstance(episodes[0], Trial)
-        self.looks.enter(rows, scenes, self.targets[rows] if searching else None)
+        if self.searching:
+            self.targets[rows] = torch.tensor([episode.cue for episode in episodes])
+            goal = torch.zeros(len(rows), self._right.shape[1], dtype=torch.bool)
+            for number, episode in enumerate(episodes):
+                goal[number, list(episode.goal)] = True
+            self._right[rows] = goal
+        else:
+            self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
+        self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])
         fresh = self._attend(Memory.empty(self.looks, self.observer, len(rows)), rows)
         self.memory = self.memory.put(rows, fresh) if self._begun else fresh
-        self._prepare(rows, episodes)
+        self.result[rows] = self._rate(rows)
         self._steps, self._stimulus = [], None
         self._keep()
 
     @torch.inference_mode()
-    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
         fresh = ~self.memory.visited[rows, actions]
         self.cell[rows] = actions
         new = rows[fresh]
@@ -200,7 +212,8 @@ class CellGazes(Gazes):
         elif len(new):
             self.memory = self.memory.put(new, self._attend(self.memory[new], new))
         self._keep()
-        return self._judge(rows)
+        self.result[rows] = self._rate(rows)
+        return self.result[rows] == 1 if self.searching else self.memory.visited[rows].all(-1)
 
     def _attend(self, memory: Memory, rows: Tensor) -> Memory:
         return attend(self.looks, self.observer, memory, rows, self.cell[rows], self.points(rows))[1]
@@ -227,75 +240,9 @@ class CellGazes(Gazes):
         """The belief of some rows, without a copy where these are all."""
         return self.memory.belief if len(rows) == len(self.episodes) else self.memory.belief[rows]
 
-    @abstractmethod
-    def _map(self, rows: Tensor) -> Tensor:
-        """The belief as planes `(n, C, Y, X)`, in [0, 1]."""
-
-    @abstractmethod
-    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Prepare the rows for new episodes, whose first look was made."""
-
-    @abstractmethod
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Gain of the last look, and whether the task is done, each `(n,)`."""
-
-
-class _SearchGazes(CellGazes):
-    """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
-
-    def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
-        super().__init__(scenery, count, classes=1, **options)
-        self._goal = torch.zeros(count, scenery.shape[0] * scenery.shape[1], dtype=torch.bool)
-
-    def result(self, rows: Tensor) -> Tensor:
-        """1 where the gaze is on the target."""
-        return self._goal[rows, self.cell[rows]].float()
-
-    def _map(self, rows: Tensor) -> Tensor:
-        """Probability of the target in each cell if no fixated cell holds it; 0 in fixated cells."""
-        chance = self._all_or(rows).chance(self.targets[rows]).masked_fill(self.memory.visited[rows], 0.0)
-        return chance.reshape(-1, 1, *self.scenery.shape)
-
-    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        goal = torch.zeros(len(rows), self._goal.shape[1], dtype=torch.bool)
-        for number, episode in enumerate(episodes):
-            goal[number, list(episode.goal)] = True
-        self._goal[rows] = goal
-
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        result = self.result(rows)
-        return result, result > 0
-
-
-class _Explorations(CellGazes):
-    """Explorations: an episode is over when every cell was fixated."""
-
-    def __init__(self, scenery: Scenery, count: int = 1, **options: Any) -> None:
-        super().__init__(scenery, count, classes=len(scenery.classes), **options)
-        self._answers = torch.zeros(count, scenery.shape[0] * scenery.shape[1], len(scenery.classes), dtype=torch.bool)
-        self._success = torch.zeros(count)
-
-    def result(self, rows: Tensor) -> Tensor:
-        """Fraction of the cells with objects whose most probable class is that of one of these objects."""
-        return self._success[rows]
-
-    def _map(self, rows: Tensor) -> Tensor:
-        """Probability of every class in each cell, background first."""
-        return self._all_or(rows).class_probabilities().mT.reshape(len(rows), -1, *self.scenery.shape)
-
-    def _prepare(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        self._answers[rows] = torch.stack([self.scenery.answers(episode.scene) for episode in episodes])
-        self._success[rows] = self._rate(rows)
-
-    def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        before = self._success[rows]
-        self._success[rows] = self._rate(rows)
-        return self._success[rows] - before, self.memory.visited[rows].all(-1)
-
     def _rate(self, rows: Tensor) -> Tensor:
-        answers = self._answers[rows]
-        return count_right(self._all_or(rows).class_probabilities(), answers) / answers.any(-1).sum(-1)
-
-
-GAZES: dict[str, Callable[..., CellGazes]] = {"search": _SearchGazes, "exploration": _Explorations}
-"""Kind of gazes for each task."""
+        """Result of the task: is the gaze on the goal, or the share of the cells with objects that are right."""
+        right = self._right[rows]
+        if self.searching:
+            return right[torch.arange(len(rows)), self.cell[rows]].float()
+        return count_right(self._all_or(rows).class_probabilities(), right) / right.any(-1).sum(-1)

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from semfov.envs.cells import GAZES, CellGazes
+from semfov.envs.cells import CellGazes
 from semfov.envs.gazes import Arrays, Gazes
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.envs.windows import WindowGaze
@@ -116,10 +116,6 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any], EzPickle):
             return None
         return self.gazes.draw()
 
-    def close(self) -> None:
-        """Store the looks of an episode that is not over."""
-        self.gazes.close()
-
     def _observed(self) -> tuple[Arrays, Arrays]:
         return _first(self.gazes.observe(_ROW)), _first(self.gazes.infos(_ROW))
 
@@ -152,7 +148,7 @@ class GazeEnv(EpisodeEnv):
         observation, reward, terminated, truncated, info = env.step(action)
     """
 
-    task: ClassVar[str]
+    task: ClassVar[Task]
     gazes: CellGazes
 
     def __init__(
@@ -167,8 +163,9 @@ class GazeEnv(EpisodeEnv):
         **options: Any,
     ) -> None:
         self.scenery = scenery_or_open(scenery, open_scenery, options, self.task)
-        gazes = GAZES[self.task](
+        gazes = CellGazes(
             self.scenery,
+            self.task,
             price=PRICES[self.task] if price is None else price,
             find=find,
             belief=belief,
@@ -289,6 +286,11 @@ class ZoomEnv(EpisodeEnv):
         super().__init__(gazes, render_mode)
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse, "grid": grid}
         EzPickle.__init__(self, task, self.scenery, **rewards, render_mode=render_mode)
+
+    def close(self) -> None:
+        """Store the looks of an episode that is not over."""
+        if self.gazes.done:
+            self.gazes.glances.save()
 
 
 def scenery_or_open(

@@ -32,7 +32,10 @@ class Score(NamedTuple):
 class Gazes(ABC):
     """A batch of episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
 
-    Shapes: targets `(B,)`, shift `(B,)`.
+    `result` is that of the task so far, from 0 to 1: in a search 1 once the target is found, in an exploration the
+    fraction that is right or found.
+
+    Shapes: targets `(B,)`, shift `(B,)`, result `(B,)`.
     """
 
     coordinates: ClassVar[int]
@@ -47,6 +50,7 @@ class Gazes(ABC):
     def __init__(
         self,
         scenery: Scenery | ZoomScenery,
+        task: str,
         count: int = 1,
         *,
         price: float,
@@ -58,9 +62,11 @@ class Gazes(ABC):
         check_number(price, "price", 0, 1e9)
         check_number(find, "find", 0, 1e9)
         self.scenery, self.price, self.find, self.pictures = scenery, price, find, pictures
+        self.searching = task == "search"
         self._side, self._begun = glimpse, False
         self.episodes: list[Any] = [None] * count
         self.targets, self.shift = torch.zeros(2, count, dtype=torch.int64)
+        self.result = torch.zeros(count)
         entries: dict[str, spaces.Space[Any]] = {
             "gaze": spaces.Box(0, 1, (self.coordinates,), np.float32),
             "target": spaces.Discrete(len(scenery.classes)),
@@ -94,7 +100,9 @@ class Gazes(ABC):
     def move(self, rows: Tensor, actions: Tensor) -> Score:
         """Move the gaze of the rows `(n,)`, and look."""
         self.shift[rows] += 1
-        gain, over = self._look(rows, actions)
+        before = self.result[rows]
+        over = self._look(rows, actions)
+        gain = self.result[rows] - before
         truncated = ~over & (self.shift[rows] >= self.scenery.shifts)
         return Score(self.find * gain.double() - self.price, over, truncated)
 
@@ -122,7 +130,7 @@ class Gazes(ABC):
             "passes": passes.numpy(),
             "pixels": (passes * self.scenery.pixels).numpy(),
             "action_mask": self.mask(rows).astype(np.int8),
-            "result": self.result(rows).numpy(),
+            "result": self.result[rows].numpy(),
             "scene": np.array([self.episodes[row].scene for row in rows.tolist()]),
         }
         if detections:
@@ -150,10 +158,6 @@ class Gazes(ABC):
         """Places that the rows `(n,)` have not looked at."""
 
     @abstractmethod
-    def result(self, rows: Tensor) -> Tensor:
-        """Result of the task so far, `(n,)`, from 0 to 1."""
-
-    @abstractmethod
     def detections(self, rows: Tensor) -> Detections:
         """Detections of the present looks, a batch of n."""
 
@@ -161,16 +165,13 @@ class Gazes(ABC):
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the first episode, RGB `(H, W, 3)`."""
 
-    def close(self) -> None:  # noqa: B027 (most kinds have nothing to release)
-        """Save looks that are not stored yet."""
-
     @abstractmethod
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Set the targets, and make the first looks of new episodes."""
+        """Set the targets, make the first looks of new episodes, and rate them."""
 
     @abstractmethod
-    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Make the next looks; returns their gain, and whether the task is done, each `(n,)`."""
+    def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
+        """Make the next looks, and rate them; returns whether the task is done, `(n,)`."""
 
     @abstractmethod
     def _view(self, row: int) -> Tensor:

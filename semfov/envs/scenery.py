@@ -42,41 +42,68 @@ Source = Scenes | str | Path | None
 _VIEWS = 16  # number of pictures that are kept open for glimpses
 
 
-class Scenery:
+class Surroundings:
+    """What the environments of all kinds share: scenes, and an eye that looks at them.
+
+    Attributes:
+        pictures: the scenes.
+        eye: sensor and detector.
+        classes: names of the classes, background first.
+        shifts: largest number of looks of an episode after the first one.
+        pixels: number of pixels that the detector takes in for a look.
+    """
+
+    opened: partial[Any] | None = None
+
+    def __init__(self, pictures: Scenes, eye: Any, shifts: int, targets: Sequence[str | int] | None) -> None:
+        names = eye.detector.classes
+        self.pictures, self.eye, self.shifts, self.classes = pictures, eye, shifts, ("background", *names)
+        self.pixels = math.prod(eye.detector.input_size)
+        self._chosen = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy opens the same scenes again."""
+        check(
+            self.opened is not None, "scenery", "one that a function of semfov.envs has opened, to be copied", "another"
+        )
+        return self.opened, ()
+
+    def image(self, scene: int) -> Tensor:
+        """Pixels of a scene, `(3, H, W)`."""
+        return self.pictures[scene].image
+
+    def targets(self, scene: int) -> list[int]:
+        """Classes that a scene may be searched for."""
+        return [each for each in self.pictures.targets(scene) if self._chosen is None or each in self._chosen]
+
+
+class Scenery(Surroundings):
     """Scenes, an eye and a belief, which any number of environments can share; `open_scenery` makes one.
 
     Episodes and looks are those of the protocols of search and exploration. The looks from all cells of a scene are
     computed when an episode first enters it, and are kept on disk.
 
     Attributes:
-        eye: sensor and detector.
         protocol: the protocol of the episodes.
         policy: name of the policy in tables.
         observer: turns looks into belief.
         shape: number of rows and columns of the cells.
-        classes: names of the classes, background first.
-        shifts: largest number of gaze shifts of an episode.
-        pixels: number of pixels that the detector takes in for a look.
         episodes: all episodes of a scene, which `GazeEnv.reset` takes as an option.
         annotation, grid, answers: of a scene: its objects, its cells, and their correct classes `(X·Y, K+1)`.
-        count: number of scenes.
         scenes: indices of the scenes that may have episodes.
     """
 
-    opened: partial[Any] | None = None
-
     def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
         check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")
-        self._looking, self._data, self.count = looking, looking.scenes, len(looking.scenes)
+        super().__init__(looking.scenes, looking.eye, looking.config.protocol.shifts, targets)
+        self._looking = looking
         self.policy = next(iter(looking.policies))
         belief, self.protocol = looking.config.belief, looking.config.protocol
-        self.eye, self.shape, self.shifts = looking.eye, (belief.rows, belief.columns), self.protocol.shifts
-        self.classes, self.annotation = ("background", *self._data.classes), self._data.annotation
-        self.pixels = math.prod(self.eye.detector.input_size)
+        self.shape, self.annotation = (belief.rows, belief.columns), self.pictures.annotation
         self.observer: Observer = looking.strategies[self.policy].observer
-        names = self.classes[1:]
-        self._targets = None if targets is None else {class_index(target, names, "targets") for target in targets}
-        self.scenes = [scene for scene in range(self.count) if self._targets_of(scene)]
+        searching = looking.task == "search"
+        labels = self.targets if searching else lambda scene: self.annotation(scene).labels.tolist()
+        self.scenes = [scene for scene in range(len(self.pictures)) if labels(scene)]
         # Results are kept for as long as an environment uses this scenery.
         self.episodes = cache(self._list)
         self.grid = cache(looking.grid)
@@ -92,27 +119,14 @@ class Scenery:
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
             )
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A copy opens the same scenes again."""
-        check(self.opened is not None, "scenery", "one that open_scenery has opened, to be copied", "another")
-        return self.opened, ()
-
-    def _targets_of(self, scene: int) -> list[int]:
-        """Classes to search for in a scene, or those of its objects in an exploration."""
-        if self._looking.task == "search":
-            allowed = self._data.targets(scene)
-            return [target for target in allowed if self._targets is None or target in self._targets]
-        labels: list[int] = self.annotation(scene).labels.tolist()
-        return labels
-
     def _list(self, scene: int) -> list[Any]:
         """All episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
         rows, columns = self.shape
         if self._looking.task == "search":
-            return list(episodes_of(self._data, scene, columns, rows, self.protocol, self._targets_of(scene)))
+            return list(episodes_of(self.pictures, scene, columns, rows, self.protocol, self.targets(scene)))
         if not self.answers(scene).any():
             return []
-        return list(explorations_of(self._data, scene, columns * rows, self.protocol))
+        return list(explorations_of(self.pictures, scene, columns * rows, self.protocol))
 
     def draw(self, random: np.random.Generator) -> Any:
         """Draw an episode: all scenes are equally likely, and so are all episodes of a scene."""
@@ -126,10 +140,6 @@ class Scenery:
         cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
-
-    def image(self, scene: int) -> Tensor:
-        """Pixels of a scene, `(3, H, W)`."""
-        return self._data[scene].image
 
 
 class _SceneLooking(PolicyLooking):

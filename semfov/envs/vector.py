@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.envs.cells import GAZES
+from semfov.envs.cells import CellGazes
 from semfov.envs.environment import PRICES, check_dictionary, scenery_or_open
 from semfov.envs.gazes import Arrays
 from semfov.envs.scenery import Scenery, open_scenery
@@ -70,14 +70,15 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         known, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
         mode = AutoresetMode(lookup(str(name), known, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self.num_envs, self.task = num_envs, lookup(task, GAZES, "task")
+        self.num_envs, self.task = num_envs, lookup(task, PRICES, "task")
         self.scenery = scenery_or_open(scenery, open_scenery, options, task)
         # A copy is a new environment of the same settings and scenes, which begins with a reset.
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
         modes = {"detections": detections, "together": together, "autoreset_mode": mode}
         EzPickle.__init__(self, task, num_envs, self.scenery, **rewards, **modes)
-        self.gazes = GAZES[task](
+        self.gazes = CellGazes(
             self.scenery,
+            task,
             num_envs,
             price=PRICES[task] if price is None else price,
             find=find,

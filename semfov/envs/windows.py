@@ -48,7 +48,7 @@ class WindowGaze(Gazes):
         # Place and magnification; a space of this type holds numbers of any other kind.
         self.action_space = spaces.Box(0, 1, (3,), np.float64)
         self.belief_space = spaces.Box(0, 1, (2, *self.shape), np.float32)
-        super().__init__(scenery, **options)
+        super().__init__(scenery, task, **options)
         self.done: set[Window] = set()
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> _WindowEpisode:
@@ -75,11 +75,6 @@ class WindowGaze(Gazes):
         if score.terminated or score.truncated:
             self.glances.save()
         return score
-
-    def close(self) -> None:
-        """Store the looks of an episode that is not over."""
-        if self.done:
-            self.glances.save()
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """The probability that closer looks find an object, and how closely each place was looked at."""
@@ -110,10 +105,6 @@ class WindowGaze(Gazes):
             free[0, lattice.number(window.level, *window.cells[:2])] = False
         return free
 
-    def result(self, rows: Tensor) -> Tensor:
-        """In a search 1 once the target is found; in an exploration the fraction of objects that are found."""
-        return self._result
-
     def detections(self, rows: Tensor) -> Detections:
         """Detections of the last look."""
         return next(glance for glance in self.looking.glances if glance.window == self.window).detections
@@ -134,24 +125,20 @@ class WindowGaze(Gazes):
         self.looking.open(self.glances, told=True)
         self.done = set()
         self._see(overview(self.glances.lattice))
-        self._result = self._rate()
 
-    def _look(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
         self._see(_window_of(self.glances.lattice, actions[0].numpy()))
-        before, self._result = self._result, self._rate()
-        return self._result - before, (self._result == 1) & (self.task == "search")
+        return (self.result == 1) & self.searching
 
     def _see(self, window: Window) -> None:
+        """Look at a window, unless it was looked at, and rate the looks."""
         self.window = window
         if window not in self.done:
             self.looking.look(window=window)
             self.done.add(window)
-
-    def _rate(self) -> Tensor:
-        scene, target = self.episodes[0]
-        looks = self.looking.glances
+        (scene, target), looks = self.episodes[0], self.looking.glances
         result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
-        return torch.tensor([result], dtype=torch.float64)
+        self.result = torch.tensor([result], dtype=torch.float64)
 
     def _view(self, row: int) -> Tensor:
         eye = self.scenery.eye

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from torch import Tensor
 
-from semfov.data.classes import class_index
 from semfov.data.large import open_large
 from semfov.data.pictures import Pictures
 from semfov.data.scene import Annotation, Scenes
 from semfov.data.sources import PHOTOGRAPHS
-from semfov.envs.scenery import Source
+from semfov.envs.scenery import Source, Surroundings
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.window_looking import LEAST_CONFIDENCE, WindowLooking, WindowLookingConfig, found_in
@@ -27,36 +23,21 @@ from semfov.zoom.objects import merge
 _TRIES = 1000
 
 
-class ZoomScenery:
+class ZoomScenery(Surroundings):
     """Large pictures and an eye that zooms, which any number of environments can share; `open_zoom_scenery` makes one.
 
     Attributes:
-        pictures: the pictures.
-        eye: the eye that looks at windows.
         evidence: learned evidence by magnification.
-        shifts: largest number of looks of an episode after the first one.
         annotated: whether the objects in the pictures are annotated.
-        classes: names of the classes, background first.
-        pixels: number of pixels that the detector takes in for a look.
         episodes: targets of all searches of a picture.
     """
 
-    opened: partial[Any] | None = None
-
     def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
-        self.pictures, self.eye, self.evidence, self.shifts = looking.scenes, looking.eye, looking.evidence, passes - 1
-        self.annotated = not isinstance(self.pictures, Pictures)
-        names, self.pixels = self.eye.detector.classes, math.prod(self.eye.detector.input_size)
-        self.classes = ("background", *names)
-        self._targets = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
+        super().__init__(looking.scenes, looking.eye, passes - 1, targets)
+        self.evidence, self.annotated = looking.evidence, not isinstance(self.pictures, Pictures)
         # Looks are kept for as long as an environment uses this scenery.
         self.glances = cache(looking.glances)
         self.episodes = cache(self._list)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A copy opens the same pictures again."""
-        check(self.opened is not None, "scenery", "one that open_zoom_scenery has opened, to be copied", "another")
-        return self.opened, ()
 
     @cached_property
     def windows(self) -> int:
@@ -70,11 +51,11 @@ class ZoomScenery:
 
     def targets(self, scene: int) -> list[int]:
         """Classes that a picture may be searched for."""
-        if not self.annotated:
-            if self._targets is None:
-                raise InputError("targets: expected classes to search for in pictures without annotations, got none")
-            return self._targets
-        return [each for each in self.pictures.targets(scene) if self._targets is None or each in self._targets]
+        if self.annotated:
+            return super().targets(scene)
+        if self._chosen is None:
+            raise InputError("targets: expected classes to search for in pictures without annotations, got none")
+        return self._chosen
 
     def _list(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
@@ -99,26 +80,16 @@ class ZoomScenery:
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
             return any(float(glance.show[target - 1]) >= LEAST_CONFIDENCE for glance in looks)
-        return bool(found_in(looks, self._of(scene, target), target).any())
+        every = self.pictures.annotation(scene)
+        there = every.labels == target
+        objects = Annotation(every.boxes[there], every.labels[there], every.crowd[there], every.size)
+        return bool(found_in(looks, objects, target).any())
 
     def share(self, looks: Sequence[Glance], scene: int) -> float:
         """Fraction of the objects that looks have found."""
         if not self.annotated:
             return float(len(merge(looks, None, score=LEAST_CONFIDENCE)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
-
-    def boxes(self, scene: int, target: int) -> Tensor:
-        """True boxes of the objects of a class, or of all objects, as far as they are annotated, `(M, 4)`."""
-        return (self._of(scene, target) if target else self.pictures.annotation(scene)).boxes
-
-    def _of(self, scene: int, target: int) -> Annotation:
-        every = self.pictures.annotation(scene)
-        of_target = every.labels == target
-        return Annotation(every.boxes[of_target], every.labels[of_target], every.crowd[of_target], every.size)
-
-    def image(self, scene: int) -> Tensor:
-        """Pixels of a picture, `(3, H, W)`."""
-        return self.pictures[scene].image
 
 
 class _PictureLooking(WindowLooking):

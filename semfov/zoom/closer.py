@@ -1,7 +1,6 @@
 """Closer looks of a search in a large picture: the boxes they are made at, and the windows that show these."""
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -9,7 +8,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
-from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
@@ -74,14 +72,6 @@ class WindowLook(NamedTuple):
     left: float
 
 
-class _Dated(NamedTuple):
-    """Boxes `(M, 4)` of a frame, and scores `(M,)` of the target in them."""
-
-    frame: float
-    boxes: Tensor
-    scores: Tensor
-
-
 class CandidateBoxes(CandidatePlaces[WindowLook]):
     r"""Boxes that seem to hold the target of one search.
 
@@ -103,32 +93,24 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
     def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
         super().__init__(forgetting)
         self.target, self.likely = target, likely
-        self._detections: list[_Dated] = []
-        self._examined: list[tuple[float, Tensor]] = []  # with their frames
-        self._frame, self._number = 0.0, 0
+        self._next = 0
 
     _look: WindowLook
 
     def see(self, look: WindowLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
-        self._look, self._number = look, look.number
+        self._look, self._next, self._left = look, look.number, look.left
         self.detections, self.presence = look.detections, look.presence
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
-            self._detections.append(_Dated(self._frame, look.detections.boxes[0][of_target], scores[of_target]))
-
-    @property
-    def left(self) -> float:
-        """Value of the best look that is left."""
-        return self._look.left
+            self._looks.append((self._frame, (look.detections.boxes[0][of_target], scores[of_target])))
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """The most evident box, if it is likely enough, or at the end probable enough."""
         boxes, scores = self._boxes()
         if self._examined:
-            again = (box_iou(boxes, torch.stack([box for _, box in self._examined])) >= SAME).any(-1)
-            scores = scores.masked_fill(again, 0)
+            scores = scores.masked_fill(self._again(boxes), 0)
         if not len(scores) or float(scores.max()) <= 0:
             return None
         number = int(scores.argmax())
@@ -140,19 +122,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Leave out the detections of both boxes."""
-        self._examined += [(self._frame, candidate.box), (self._frame, box)]
-        self._number += 1
-
-    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Make the record of the last closer look, which is the last look of the path."""
-        return CloseUp(None, self.target, None, box, place, presence, number=self._number - 1)
-
-    def wait(self, frames: float = 1) -> None:
-        """Let frames pass: forget boxes of which less than half the evidence is left."""
-        self._frame += frames
-        oldest = self._frame - self.forgetting.span
-        self._detections = [each for each in self._detections if each.frame >= oldest]
-        self._examined = [(frame, box) for frame, box in self._examined if frame >= oldest]
+        super().dismiss(candidate, box)
+        # It is the last look of the path.
+        self._number, self._next = self._next, self._next + 1
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is at the place of a closer look, by the detections that overlap it."""
@@ -163,11 +135,11 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def _boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target that count, and their scores `(M,)`, faded."""
-        if not self._detections:
+        if not self._looks:
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
-        faded = [each.scores * keep ** (self._frame - each.frame) for each in self._detections]
-        return torch.cat([each.boxes for each in self._detections]), torch.cat(faded)
+        faded = [scores * keep ** (self._frame - frame) for frame, (_, scores) in self._looks]
+        return torch.cat([boxes for _, (boxes, _) in self._looks]), torch.cat(faded)
 
     def _chance(self, score: float) -> float:
         """Probability that the target is where the highest score is this one."""
@@ -190,8 +162,7 @@ class PhotographPlaces(CandidateBoxes):
 
     def __init__(self, target: int, lattice: Lattice, forgetting: Forgetting | None = None) -> None:
         super().__init__(target, 0.0, forgetting)
-        self._lattice, self._at = lattice, 0
-        self._known: list[tuple[float, float]] = []  # with their frames
+        self._lattice = lattice
 
     @property
     def left(self) -> float:
@@ -209,27 +180,11 @@ class PhotographPlaces(CandidateBoxes):
         x1, y1, x2, y2 = closer_window(self._lattice, candidate.box).region(self._lattice)
         return (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
 
-    def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
-        """Look closely at a place, or take the look at the whole."""
-        return super().examine(candidate, (lambda _: self.detections) if self.seen(candidate) else close_up)
-
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Leave out the places of both boxes."""
-        made = self._number
         super().dismiss(candidate, box)
-        self._at = made
         if self.seen(candidate):
-            self._number, self._at = made, self._look.number - 1
+            self._next, self._number = self._next - 1, self._look.number - 1
 
     def _worth(self, place: CandidatePlace) -> float:
         return place.probability * (1 - max((known for _, known in self._known), default=0.0))
-
-    def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Make the record of the last closer look."""
-        self._known.append((self._frame, place))
-        return replace(super().record(box, place, presence), number=self._at)
-
-    def wait(self, frames: float = 1) -> None:
-        """Let frames pass."""
-        super().wait(frames)
-        self._known = [each for each in self._known if each[0] >= self._frame - self.forgetting.span]

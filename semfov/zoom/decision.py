@@ -112,7 +112,7 @@ class SearchFacts:
 CLOSER = 100
 """Largest number of closer looks in a large picture: as many as there are passes for."""
 
-_SCORE = 0.5
+USUAL_SCORE = 0.5
 """Default for the score from which on a detection alone counts as found."""
 
 _DEFAULTS = Thresholds(0.9, 0.005)
@@ -140,6 +140,8 @@ class WindowDecisions:
         self._given, self._most, self._forgetting = (confirm, give_up), closer, forgetting
         self.thresholds = _DEFAULTS
         self.verifier: Verifier[WindowLook] | None = None
+        self.criterion: str | None = None
+        """What the decision `found` needs, in words, after the first look."""
         self.outcome = 0
         self._facts: SearchFacts | None = None
         self._ahead = 0.0
@@ -164,8 +166,10 @@ class WindowDecisions:
                 places = PhotographPlaces(self.target, belief.lattice, self._forgetting)
                 at = at.changed(place=worth)  # all further looks are closer ones
             self.verifier = Verifier(model, places, self._close_up, at, most)
+            self.criterion = self.verifier.criterion
         else:
             self.thresholds = self.thresholds.changed(confirm)
+            self.criterion = f"p is {self.thresholds.confirm:g} and a detection shows the target"
         return SearchFacts(belief)
 
     def wait(self, frames: float = 1) -> None:
@@ -197,13 +201,6 @@ class WindowDecisions:
         return None if self.verifier is None else self.verifier.candidate
 
     @property
-    def criterion(self) -> str:
-        """What the decision `found` needs, in words."""
-        if self.verifier is not None:
-            return self.verifier.criterion
-        return f"p is {self.thresholds.confirm:g} and a detection shows the target"
-
-    @property
     def looks(self) -> list[CloseUp]:
         """The closer looks, in order."""
         return [] if self.verifier is None else self.verifier.looks
@@ -231,17 +228,12 @@ class WindowDecisions:
         return Decision(outcome, presence, None, self._facts.box if outcome == "found" else None)
 
 
-def score_needed(confirm: float | None) -> float:
-    """Score from which on a detection alone counts as found."""
-    return _SCORE if confirm is None else confirm
-
-
-def decide_by_score(looks: Sequence[Glance], target: int, confirm: float | None = None) -> Decision:
+def decide_by_score(looks: Sequence[Glance], target: int, confirm: float) -> Decision:
     """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
     best, box = 0.0, None
     for detections in (look.detections for look in looks):
         scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
         if len(scores) and float(scores.max()) > best:
             best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
-    found = best >= score_needed(confirm)
+    found = best >= confirm
     return Decision("found" if found else "undecided", best, None, box if found else None)

@@ -161,7 +161,8 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
     probable = Known(chances[None], torch.ones(1), chances[None])
 
     def see(detections):
-        candidates.see(SimpleNamespace(belief=probable, visited=torch.zeros(1, 12).bool(), detections=detections))
+        state = {"shift": 0, "belief": probable, "visited": torch.zeros(1, 12).bool()}
+        candidates.see(SimpleNamespace(**state, detections=detections))
 
     for number in range(2):
         see(looks[number : number + 1])
