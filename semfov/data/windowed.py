@@ -170,8 +170,15 @@ class LargePicture(ABC):
         """
         self._inside(box)
         if reduction < self._first or self.size[0] * self.size[1] <= _LARGE:
-            return bytes_of(self.pixels(box))
+            return bytes_of(self._given(box))
         return self._copies.window(box, reduction)
+
+    def _given(self, box: PixelBox) -> NDArray[np.uint8]:
+        """The pixels of a window; raises `InputError` where a reader gives others."""
+        (x1, y1, x2, y2), pixels = box, self.pixels(box)
+        fits = pixels.dtype == np.uint8 and pixels.shape == (y2 - y1, x2 - x1, 3)
+        check(fits, "pixels", f"bytes of shape {(y2 - y1, x2 - x1, 3)}", f"{pixels.dtype} of {pixels.shape}")
+        return pixels
 
     def _inside(self, box: PixelBox) -> PixelBox:
         """The box; raises `InputError` where it is empty or not inside the picture."""
@@ -188,7 +195,7 @@ class LargePicture(ABC):
 
     @cached_property
     def _copies(self) -> _ReducedCopies:
-        return _ReducedCopies(self.size, self.pixels)
+        return _ReducedCopies(self.size, self._given)
 
 
 def chosen_bands(

@@ -15,6 +15,7 @@ from PIL import Image
 
 from semfov import InputError, read_image
 from semfov.data.large import _ArrayPicture, _MemoryPicture, _RasterPicture, _TiffPicture, open_large
+from semfov.data.windowed import LargePicture
 from tests.refusals import refused, unusable
 
 
@@ -122,6 +123,17 @@ def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
     with pytest.raises(InputError, match="unknown order of channels 'bgra'; did you mean 'bgr'"):
         open_large(np.zeros((4, 4, 3), np.uint8), color="bgra")
     refused("box: expected a window inside 4 × 4 pixels", _MemoryPicture(torch.zeros(3, 4, 4)).read, (0, 0, 5, 4))
+
+
+@pytest.mark.parametrize("side", [2, 5000])
+def test_a_reader_of_ones_own_that_gives_other_pixels_is_refused(side):
+    class Own(LargePicture):
+        size = (side, side)
+
+        def pixels(self, box):
+            return np.zeros((1, 1, 3), np.float32)
+
+    refused(r"pixels: expected bytes of shape \(.*, 3\), got float32 of \(1, 1, 3\)", Own().read, (0, 0, side, side), 4)
 
 
 def test_truncated_files_are_refused(tmp_path):
