@@ -229,6 +229,15 @@ def serve() -> Iterator[Callable[[Path], str]]:
 
 
 @pytest.fixture(scope="session")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    """A reader's folder, and what code of a reader takes as given."""
+    from tests.reader import fill
+
+    folder = tmp_path_factory.mktemp("reader")
+    return folder, fill(folder)
+
+
+@pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of the development photographs and models."""
     folder = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[2] / "shared"))

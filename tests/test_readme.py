@@ -20,7 +20,6 @@ import semfov
 from semfov.cli.main import main as semfov_command
 from semfov.detection.weights import fetch
 from tests.colours import SMALL, write_network, write_photographs
-from tests.reader import fill
 from tests.small import once
 
 ROOT = Path(__file__).parents[1]
@@ -88,9 +87,10 @@ def weights(tmp_path_factory):
 
 
 @pytest.fixture
-def given(tmp_path, monkeypatch, weights):
-    """What code of a reader takes as given; the present folder is the reader's."""
-    given = fill(tmp_path)
+def given(tmp_path, monkeypatch, weights, reader):
+    """What code of a reader takes as given; the present folder is a copy of the reader's."""
+    filled, given = reader
+    shutil.copytree(filled, tmp_path, symlinks=True, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SEMFOV_CACHE", str(weights))
     return given

@@ -8,8 +8,7 @@ import torch
 
 from eval import semba, sensors
 from eval.semba import _Inhibited, _search_scene, _SembaConfig
-from semfov.belief.grid import Grid
-from semfov.eye import Eye
+from semfov import Eye, Grid
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
 from tests.colours import write_home

@@ -166,12 +166,10 @@ def test_a_name_that_is_taken_and_other_tasks_are_refused(name, tasks):
     assert FUNCTIONS["kl"] is acquisition.KLDivergence
 
 
-@pytest.mark.parametrize(
-    ("function", "options", "argument"),
-    [(nn.Linear, {}, "function"), (3, {}, "unknown policy"), ("kl", {"samples": True}, "samples")],
-)
-def test_what_is_no_function_and_other_numbers_of_samples_are_refused(function, options, argument, model):
-    refused(f"^{argument}", Policy, function, model, **options)
+def test_what_is_no_function_and_other_numbers_of_samples_are_refused(model):
+    refused("^function", Policy, nn.Linear, model)
+    refused("^unknown policy", Policy, 3, model)
+    refused("^samples", Policy, "kl", model, samples=True)
 
 
 def test_other_names_are_refused_with_a_suggestion():

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from benchmarks import acuity
-from semfov.eye import Eye
-from semfov.sensor import Foveation, LogPolar
-from semfov.zoom import WindowEye
+from semfov import Eye, Foveation, WindowEye
+from semfov.sensor import LogPolar
 from tests.small import Coloured
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,8 @@ from math import isnan
 import pytest
 import torch
 
-from semfov import Detections, Grid, Objects
+from semfov import Detections, Flat, Grid, Objects, Panorama
 from semfov.decision import CloseUp, Decision
-from semfov.head import Flat, Panorama
 from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions

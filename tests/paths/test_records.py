@@ -14,11 +14,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import Detections, DirichletBelief, Grid, Scanpath
+from semfov import Detections, DirichletBelief, Flat, Grid, Objects, Panorama, Scanpath
 from semfov.data.large import open_large
 from semfov.decision import CloseUp, Decision
-from semfov.detection import Objects, Placement
-from semfov.head import Flat, Panorama
+from semfov.detection import Placement
 from semfov.head.views import Views
 from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, HeadPath, Record, WindowMoment, ZoomPath

@@ -113,16 +113,10 @@ def test_workers_end_when_the_process_that_started_them_ends(tmp_path, number, c
     assert last_line is None or error.strip().splitlines()[-1] == last_line
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "seconds"),
-    [
-        ("eval.search", 0.25),
-        *(pytest.param("eval.search", seconds, marks=pytest.mark.long) for seconds in (0.8, 1.6)),
-    ],
-)
-def test_an_early_interrupt_prints_no_traceback(tmp_path, module, seconds):
-    call = [sys.executable, "-m", module, "--out", str(tmp_path), "--workers", "2"]
+@pytest.mark.lab
+@pytest.mark.parametrize("seconds", [0.25, *(pytest.param(each, marks=pytest.mark.long) for each in (0.8, 1.6))])
+def test_an_early_interrupt_of_a_study_prints_no_traceback(tmp_path, seconds):
+    call = [sys.executable, "-m", "eval.search", "--out", str(tmp_path), "--workers", "2"]
     with running(call, cwd=ROOT) as process:
         # Before torch is loaded, Python may not have started to import the module.
         wait_until(lambda: "torch" in Path(f"/proc/{process.pid}/maps").read_text() or process.poll() is not None)

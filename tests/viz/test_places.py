@@ -40,7 +40,7 @@ NAMES = [name for name in viz.__all__ if name.startswith("plot_")]
 def test_figures_are_drawn_into_given_axes(name, scanpath):
     """Their content equals that of a new figure, and other axes stay empty."""
     function, (arguments, options, place) = getattr(viz, name), calls(scanpath)[name]
-    mine = Figure(figsize=(12, 8), layout="constrained")
+    mine = Figure(figsize=(12, 8))
     left, right = mine.subfigures(1, 2, width_ratios=[1, 3])
     other = left.subplots()
     kind = {"projection": "3d"} if name == "plot_belief_bars" else {}
