@@ -6,6 +6,7 @@ The browser is `chromium`, `chromium-browser` or `google-chrome` on the path, or
 import os
 import re
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import combinations
 
@@ -44,18 +45,9 @@ def path(scanpath, image, hostile, tmp_path_factory):
     return write_page(tmp_path_factory.mktemp("page") / "page.html", f"search for {hostile}", episodes)
 
 
-@pytest.fixture
-def opened(chromium, path):
-    """The page, opened; it may give no errors or dialogs, and request nothing from elsewhere."""
-    page, told = watched(chromium)
-    page.goto(path.as_uri())
-    yield page
-    assert told == []
-    page.close()
-
-
-def watched(chromium):
-    """A new page, and a list of its console messages, errors, dialogs and network requests."""
+@contextmanager
+def watched(chromium, path):
+    """The page, opened; it may give no message, error or dialog, and request nothing from elsewhere."""
     page, told = chromium.new_page(viewport={"width": 1200, "height": 900}), []
 
     def dismiss(dialog):
@@ -66,7 +58,16 @@ def watched(chromium):
     page.on("console", lambda message: told.append(message.text))
     page.on("pageerror", lambda error: told.append(str(error)))
     page.on("request", lambda request: request.url.startswith(("file:", "data:")) or told.append(request.url))
-    return page, told
+    page.goto(path.as_uri())
+    yield page
+    page.close()
+    assert told == [], "\n".join(told)
+
+
+@pytest.fixture
+def opened(chromium, path):
+    with watched(chromium, path) as page:
+        yield page
 
 
 PICTURES = ("path", "view", "belief", "entropy", "values")
@@ -171,21 +172,18 @@ def test_the_page_in_a_frame_is_isolated_from_the_notebook(chromium, scanpath, t
     file = tmp_path / "notebook.html"
     style = "<style>* { color: red !important; display: block }</style><p id=outcome>mine</p>"
     file.write_text(f"<!DOCTYPE html>{style}{scanpath._repr_html_()}", "utf-8")
-    page, told = watched(chromium)
-    page.goto(file.as_uri())
-    inside = page.frame_locator("iframe")
-    assert inside.locator("#number").inner_text() == "0 of 2"
-    inside.locator("#forward").click()
-    assert inside.locator("#number").inner_text() == "1 of 2"
-    assert inside.locator("h1").evaluate("each => getComputedStyle(each).color") != "rgb(255, 0, 0)"
-    assert (
-        inside.locator("h1").evaluate("() => { try { return parent.document.title } catch { return 'refused' } }")
-        == "refused"
-    )
-    height = page.locator("iframe").bounding_box()["height"]
-    assert 400 <= height <= 900
-    assert told == []
-    page.close()
+    with watched(chromium, file) as page:
+        inside = page.frame_locator("iframe")
+        assert inside.locator("#number").inner_text() == "0 of 2"
+        inside.locator("#forward").click()
+        assert inside.locator("#number").inner_text() == "1 of 2"
+        assert inside.locator("h1").evaluate("each => getComputedStyle(each).color") != "rgb(255, 0, 0)"
+        assert (
+            inside.locator("h1").evaluate("() => { try { return parent.document.title } catch { return 'refused' } }")
+            == "refused"
+        )
+        height = page.locator("iframe").bounding_box()["height"]
+        assert 400 <= height <= 900
 
 
 def test_curves_fit_on_a_phone(chromium, run_page):
@@ -221,25 +219,21 @@ def test_names_of_an_episode_are_shown_and_not_run(opened, hostile):
 
 
 def test_names_of_a_run_are_shown_and_not_run(chromium, run_page, hostile):
-    page, told = watched(chromium)
-    page.goto(run_page.as_uri())
-    assert page.title() == f"semfov: {hostile} with {hostile}"
-    for label in page.locator("#class option").all_inner_texts():
-        page.locator("#class").select_option(label=label)
-    page.keyboard.press("End")
-    page.locator("summary").click()
-    assert page.locator("script").count() == 2
-    assert page.locator("main img").count() == 0
-    assert told == []
-    page.close()
+    with watched(chromium, run_page) as page:
+        assert page.title() == f"semfov: {hostile} with {hostile}"
+        for label in page.locator("#class option").all_inner_texts():
+            page.locator("#class").select_option(label=label)
+        page.keyboard.press("End")
+        page.locator("summary").click()
+        assert page.locator("script").count() == 2
+        assert page.locator("main img").count() == 0
 
 
 def test_names_that_are_not_escaped_run(chromium, hostile, tmp_path):
     """Without this, the tests above could pass with harmless names."""
-    page, told = watched(chromium)
-    page.goto(write_page(tmp_path / "page.html", "t", [], sections=hostile).as_uri())
-    assert told.count("dialog: taken") >= 2
-    page.close()
+    page = write_page(tmp_path / "page.html", "t", [], sections=hostile)
+    with pytest.raises(AssertionError, match=r"(?s)dialog: taken.*dialog: taken"), watched(chromium, page):
+        pass
 
 
 def test_selecting_another_episode_starts_at_its_first_fixation(opened):
@@ -256,72 +250,64 @@ def test_the_play_button_runs_to_the_last_fixation(opened):
 
 
 def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
-    page, told = watched(chromium)
-    page.goto(zoom_page.as_uri())
-    assert page.locator("#episode-views").is_hidden()
-    shown = page.locator(".look:visible")
-    assert shown.locator("h4").all_inner_texts() == ["Look 0: the whole picture"]
-    assert page.get_by_role("button", name="Next look").count() == 1
-    page.keyboard.press("ArrowRight")
-    assert shown.locator("h4").all_inner_texts() == ["Look 1"]
-    assert page.locator("#number").inner_text() == "1 of 2"
-    assert page.locator("#status").inner_text().startswith("Look 1 of 2 at (100, 100)")
-    chosen = page.locator(".chosen rect").first
-    assert [chosen.get_attribute(name) for name in ("x", "y", "width", "height")] == ["0", "0", "200", "200"]
-    assert page.locator(".window.now").get_attribute("data-look") == "1"
-    assert page.locator(".window.later").get_attribute("data-look") == "2"
-    page.locator(".window[data-look='2'] text").click()
-    assert shown.locator("h4").all_inner_texts() == ["Look 2"]
-    assert page.locator(".object.now").get_attribute("data-look") == "2"
-    page.locator("#fixation").focus()
-    page.keyboard.press("Home")
-    assert page.locator("#number").inner_text() == "0 of 2"
-    assert hostile in page.locator("#about").inner_text()
-    assert told == []
-    page.close()
+    with watched(chromium, zoom_page) as page:
+        assert page.locator("#episode-views").is_hidden()
+        shown = page.locator(".look:visible")
+        assert shown.locator("h4").all_inner_texts() == ["Look 0: the whole picture"]
+        assert page.get_by_role("button", name="Next look").count() == 1
+        page.keyboard.press("ArrowRight")
+        assert shown.locator("h4").all_inner_texts() == ["Look 1"]
+        assert page.locator("#number").inner_text() == "1 of 2"
+        assert page.locator("#status").inner_text().startswith("Look 1 of 2 at (100, 100)")
+        chosen = page.locator(".chosen rect").first
+        assert [chosen.get_attribute(name) for name in ("x", "y", "width", "height")] == ["0", "0", "200", "200"]
+        assert page.locator(".window.now").get_attribute("data-look") == "1"
+        assert page.locator(".window.later").get_attribute("data-look") == "2"
+        page.locator(".window[data-look='2'] text").click()
+        assert shown.locator("h4").all_inner_texts() == ["Look 2"]
+        assert page.locator(".object.now").get_attribute("data-look") == "2"
+        page.locator("#fixation").focus()
+        page.keyboard.press("Home")
+        assert page.locator("#number").inner_text() == "0 of 2"
+        assert hostile in page.locator("#about").inner_text()
 
 
 def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromium, zoom_page):
-    page, told = watched(chromium)
-    page.goto(zoom_page.as_uri())
-    assert (page.locator(".object").count(), page.locator(".object.later").count()) == (2, 0)
-    rows = page.locator(".objects tbody tr")
-    first = rows.first.locator(".crop").screenshot()
-    assert len(set(first)) > 50  # it shows something
-    rows.nth(1).click()
-    assert page.locator(".object.picked").get_attribute("data-look") == "2"
-    assert page.locator("#number").inner_text() == "2 of 2"
-    heads = page.locator(".objects th[scope=col]")
-    heads.filter(has_text="score").get_by_role("button").click()
-    scores = page.locator(".objects tbody tr td:nth-child(4)")
-    ascending = scores.all_inner_texts()
-    assert ascending == sorted(ascending)
-    heads.filter(has_text="score").get_by_role("button").click()
-    assert scores.all_inner_texts() == ascending[::-1]
-    assert heads.filter(has_text="score").get_attribute("aria-sort") == "descending"
-    for switch, drawn in (("Windows", ".window"), ("Names", ".object .name")):
-        assert page.locator(drawn).first.is_visible()
-        page.get_by_role("checkbox", name=switch).uncheck()
-        assert not page.locator(drawn).first.is_visible()
-    assert told == []
-    page.close()
+    with watched(chromium, zoom_page) as page:
+        assert (page.locator(".object").count(), page.locator(".object.later").count()) == (2, 0)
+        rows = page.locator(".objects tbody tr")
+        first = rows.first.locator(".crop").screenshot()
+        assert len(set(first)) > 50  # it shows something
+        rows.nth(1).click()
+        assert page.locator(".object.picked").get_attribute("data-look") == "2"
+        assert page.locator("#number").inner_text() == "2 of 2"
+        heads = page.locator(".objects th[scope=col]")
+        heads.filter(has_text="score").get_by_role("button").click()
+        scores = page.locator(".objects tbody tr td:nth-child(4)")
+        ascending = scores.all_inner_texts()
+        assert ascending == sorted(ascending)
+        heads.filter(has_text="score").get_by_role("button").click()
+        assert scores.all_inner_texts() == ascending[::-1]
+        assert heads.filter(has_text="score").get_attribute("aria-sort") == "descending"
+        for switch, drawn in (("Windows", ".window"), ("Names", ".object .name")):
+            assert page.locator(drawn).first.is_visible()
+            page.get_by_role("checkbox", name=switch).uncheck()
+            assert not page.locator(drawn).first.is_visible()
 
 
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
     large = zoom_data(zoom_path, large_picture, name="large.jpg")
     small = episode_data(scanpath, image, [image] * 3, name="small.jpg")
-    page, told = watched(chromium)
-    page.goto(write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}]).as_uri())
-    for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
-        page.locator("#episode").select_option(index=number)
-        assert page.locator(".large:visible > h3:first-child").all_inner_texts() == visible
-        assert page.locator("#episode-views").is_visible() == (not visible)
-        assert page.locator("#word").inner_text() == ("Look" if visible else "Fixation")
-        assert page.locator("#about dd").nth(1).is_visible() == bool(visible)
-        page.locator("#forward").click()
-        assert page.locator("#number").inner_text() == "1 of 2"
-    assert told == []
-    page.close()
+    both = write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}])
+    with watched(chromium, both) as page:
+        for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
+            page.locator("#episode").select_option(index=number)
+            assert page.locator(".large:visible > h3:first-child").all_inner_texts() == visible
+            assert page.locator("#episode-views").is_visible() == (not visible)
+            assert page.locator("#word").inner_text() == ("Look" if visible else "Fixation")
+            assert page.locator("#about dd").nth(1).is_visible() == bool(visible)
+            page.locator("#forward").click()
+            assert page.locator("#number").inner_text() == "1 of 2"
 
 
 def test_without_javascript_all_looks_are_shown(chromium, zoom_page):

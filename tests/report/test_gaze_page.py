@@ -25,14 +25,11 @@ def drawn(name, seed=0):
 
 @pytest.fixture
 def opened(chromium, hostile, tmp_path):  # noqa: F811
-    """The page of two pictures; it may give no message, and request nothing from elsewhere."""
+    """The page of two pictures."""
     pictures = [drawn(hostile), drawn("b.png", seed=1)]
     path = write_gaze_page(tmp_path / "gaze.html", f"where people look in {hostile}", pictures)
-    page, told = watched(chromium)
-    page.goto(path.as_uri())
-    yield page
-    assert told == []
-    page.close()
+    with watched(chromium, path) as page:
+        yield page
 
 
 def circles(page):
