@@ -1,5 +1,5 @@
 """The pages by task run as printed, except that the default detector, whose weights the tests have, stands for others,
-and looks three times where they let it look more.
+looks three times where they let it look more, and is fitted in few steps.
 
 Commands of a checkout are not run: their programs exist and take the options.
 """
@@ -22,6 +22,7 @@ SHORTER = {
     "(?<=passes[= ])16": "3",
     "(?<=shifts=)(5|10)": "2",
     "(?<=duration=)10": "3",
+    "(?<=--gaze.seconds 5)": " --gaze.folds 2 --gaze.fit.epochs 2 --gaze.fit.saccade_epochs 1",
 }
 """What is printed, and what runs in its place."""
 RUN = [page for page in PAGES if "mymodels" not in page.read_text(encoding="utf-8")]  # a fit: tests/test_readme.py
