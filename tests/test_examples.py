@@ -24,6 +24,7 @@ def run(monkeypatch, capsys, one_thread):
     return call
 
 
+@pytest.mark.lab
 def test_finetuning_raises_the_chance_of_a_hit(run):
     output = run("finetune_observation", "--scenes", 2, "--starts", 4, "--steps", 12)
     steps = [float(value) for value in re.findall(r"step .*fixation ([\d.]+) %", output)]
@@ -87,6 +88,7 @@ def test_own_sensor_recognises_objects_too_small_for_the_published_fovea(run):
     assert found[0][2] == found[1][2] != "0"
 
 
+@pytest.mark.lab
 def test_own_detector_gets_an_observation_model(run, tmp_path):
     output = run("own_onnx_detector", "--scenes", 3, "--looks", 4, "--out", tmp_path / "model.safetensors")
     raw, fitted = (float(value) for value in re.findall(r"likelihood of ([\d.]+) nats", output))
