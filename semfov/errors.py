@@ -55,10 +55,12 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
 
 def values_known(*tensors: Tensor) -> bool:
     """Tell whether the values of tensors can be read: not while traced, under `torch.func`, or on the device `meta`."""
-    if torch.compiler.is_compiling() or any(tensor.is_meta for tensor in tensors):
+    if torch.compiler.is_compiling():
         return False
     try:
         for tensor in tensors:
+            if tensor.is_meta:
+                return False
             # A transform wraps its tensors, and a wrapped tensor has no memory of its own.
             tensor.data_ptr()
     except RuntimeError:

@@ -16,7 +16,7 @@ from torch import Tensor
 from semfov.errors import values_known
 
 # Lines of up to this many pixels are computed by one dense matrix, longer lines tile by tile.
-_SMALL = 160
+_SMALL = 112
 
 # Pixels of planes that are filtered together.
 _CACHED = 1 << 19
@@ -111,12 +111,14 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     shrinks = down.length < down.count
     if not shrinks:
         planes = planes.contiguous()
-    number, result = len(planes), planes.new_empty(len(planes), down.length, across.length)
+    number = planes.shape[0]
+    result = planes.new_empty(number, down.length, across.length)
     # So many planes are filtered at a time that what is between the passes stays in the cache.
     sides = (down.length, across.count) if shrinks else (down.count, across.length)
-    between = planes.new_empty(min(max(1, _CACHED // (sides[0] * sides[1])), number), *sides)
-    for first in range(0, number, max(1, len(between))):
-        passes = _passes(down, across, min(len(between), number - first), planes.stride())
+    most = max(1, _CACHED // (sides[0] * sides[1]))
+    between = planes.new_empty(min(most, number), *sides)
+    for first in range(0, number, most):
+        passes = _passes(down, across, min(most, number - first), planes.stride())
         begin = planes.storage_offset() + first * planes.stride(0)
         for matrix, (size, strides, offset), into in passes[0]:
             torch.bmm(matrix, planes.as_strided(size, strides, begin + offset), out=between.as_strided(*into))

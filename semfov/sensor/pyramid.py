@@ -18,8 +18,8 @@ Convention = Literal["kornia", "opencv"]
 _AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 # Input pixels that one tile covers, down and across: with fewer the products are slow, with more they multiply more
-# zeros. Across they are slow sooner.
-_SHIFTS = 8, 32
+# zeros. Across they are slow sooner, and tiles that enlarge have four times as many output pixels.
+_REDUCED, _EXPANDED = (8, 32), (8, 16)
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,8 @@ def _reduce(image: Tensor, convention: Convention) -> Tensor:
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
     wide = widened(image)
-    sides = zip(image.shape[-2:], _SHIFTS, strict=True)
-    down, across = (_reducing(count, shift, convention, wide.dtype, image.device) for count, shift in sides)
-    return separable(wide, down, across).to(image.dtype)
+    height, width = image.shape[-2:]
+    return separable(wide, *_reducing(height, width, convention, wide.dtype, image.device)).to(image.dtype)
 
 
 def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -115,9 +114,8 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
     """`pyrup` without the checks."""
     if _runs_in_kornia(image, convention, size):
         return _kornia().pyrup(image.contiguous())
-    sides, wide = zip(image.shape[-2:], size, _SHIFTS, strict=True), widened(image)
-    down, across = (_expanding(*side, convention, wide.dtype, image.device) for side in sides)
-    return separable(wide, down, across).to(image.dtype)
+    before, after, wide = (image.shape[-2], image.shape[-1]), (size[0], size[1]), widened(image)
+    return separable(wide, *_expanding(before, after, convention, wide.dtype, image.device)).to(image.dtype)
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -208,32 +206,40 @@ def _check(image: Tensor, convention: Convention, levels: int | None = None) -> 
 
 
 @constant
-def _reducing(count: int, shift: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
-    """The matrix of `pyrdown` for a line of `count` pixels."""
-    if convention == "opencv":
-        taps = _blur(torch.arange(0, count, 2), count)
-    else:
-        taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
-    # Halving an odd number of pixels shifts positions by one pixel from one end of the line to the other.
-    return banded(taps, count, shift // 2, shift, 2 + count % 2, dtype, device)
+def _reducing(
+    height: int, width: int, convention: Convention, dtype: torch.dtype, device: torch.device
+) -> tuple[Lines, Lines]:
+    """The matrices of `pyrdown` for the columns and the rows of an image."""
+    lines = []
+    for count, shift in zip((height, width), _REDUCED, strict=True):
+        if convention == "opencv":
+            taps = _blur(torch.arange(0, count, 2), count)
+        else:
+            taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
+        # Halving an odd number of pixels shifts positions by one pixel from one end of the line to the other.
+        lines.append(banded(taps, count, shift // 2, shift, 2 + count % 2, dtype, device))
+    return lines[0], lines[1]
 
 
 @constant
 def _expanding(
-    count: int, length: int, shift: int, convention: Convention, dtype: torch.dtype, device: torch.device
-) -> Lines:
-    """The matrix of `pyrup` from a line of `count` pixels to one of `length` pixels."""
-    if convention == "opencv":
-        # The blur of a line with zeros in between, mirrored before its first pixel and continued after its last.
-        place = torch.arange(length)[:, None]
-        half = place.div(2, rounding_mode="floor")
-        index = torch.where(place % 2 == 0, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
-        weight = torch.where(place % 2 == 0, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
-        taps = Taps(torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1)), weight.double())
-    else:
-        taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
-    drift = abs(length - 2 * count)
-    return banded(taps, count, 2 * shift, shift if drift <= 1 else count, 2 + drift, dtype, device)
+    before: tuple[int, int], after: tuple[int, int], convention: Convention, dtype: torch.dtype, device: torch.device
+) -> tuple[Lines, Lines]:
+    """The matrices of `pyrup` for the columns and the rows of an image of one size that get another."""
+    lines = []
+    for count, length, shift in zip(before, after, _EXPANDED, strict=True):
+        if convention == "opencv":
+            # The blur of a line with zeros in between, mirrored before its first pixel and continued after its last.
+            place = torch.arange(length)[:, None]
+            half = place.div(2, rounding_mode="floor")
+            index = torch.where(place % 2 == 0, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
+            weight = torch.where(place % 2 == 0, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
+            taps = Taps(torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1)), weight.double())
+        else:
+            taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
+        drift = abs(length - 2 * count)
+        lines.append(banded(taps, count, 2 * shift, shift if drift <= 1 else count, 2 + drift, dtype, device))
+    return lines[0], lines[1]
 
 
 def _blur(place: Tensor, count: int) -> Taps:
