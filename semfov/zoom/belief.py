@@ -180,8 +180,10 @@ class ZoomBelief:
         x1, y1, x2, y2 = window.cells
         x1, y1, x2, y2 = max(x1, 0), max(y1, 0), min(x2, self.lattice.columns), min(y2, self.lattice.rows)
         if x1 < x2 and y1 < y2:
-            self.left.numpy()[y1:y2, x1:x2] = 0
-            self._mark((x1, y1, x2, y2))
+            part = self.left.numpy()[y1:y2, x1:x2]
+            if part.any():
+                part[:] = 0
+                self._mark((x1, y1, x2, y2))
 
     def _mark(self, changed: Box, *, left: bool = True) -> None:
         """Mark stored values of windows as outdated where cells, or the share of them that is left, changed."""

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window, overview
+from semfov.zoom.glances import Glance, Glances, Window, overview, points_closer
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
@@ -16,8 +16,9 @@ Order = Callable[[Sequence[Glance], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
 none ends the episode."""
 
-_Guess = Callable[[Sequence[Glance], set[Window], Window], WindowChoice | None]
-"""Guesses the window to look at after one that is being looked at, the last argument and among the windows."""
+_Guess = Callable[[Sequence[Glance], set[Window], Window | None], WindowChoice | None]
+"""Guesses the window to look at after one that is being looked at, which is among the windows; the last argument names
+it if it is not in the belief yet."""
 
 
 class WindowStep(Generic[_Belief]):
@@ -106,7 +107,8 @@ def look_by_look(
     r"""Look at the whole picture, and then at the windows of an order, until it has none left.
 
     The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it. The
-    one that is guessed is resampled during the look before, by a second thread.
+    one that is guessed is resampled during the look before, by a second thread. After a look of the last level it is
+    known: nothing that such a look shows changes the belief.
 
     In a stream (`LiveGlances.show`) looks are forgotten. A look counts for :math:`\ln 2 / r` frames, in which half of
     its evidence would fade at the rate r, or until the next look at its window. The window is then free again. The
@@ -123,7 +125,12 @@ def look_by_look(
 
     def prepare(window: Window) -> None:
         assert guess is not None
-        if likely := guess(recent.looks, recent.windows | {window}, window):
+        beside: Window | None = window
+        if belief is not None and not points_closer(window, glances.lattice):
+            # Whatever the look shows, the belief about where to look next is known.
+            belief.discount(window)
+            beside = None
+        if likely := guess(recent.looks, recent.windows | {window}, beside):
             glances.prepare(likely[0])
 
     choices: Sequence[WindowChoice] = [(first, float("inf"))]
@@ -148,8 +155,8 @@ def look_for(
         choice = best_hit(belief, done)
         return [] if choice is None else [choice]
 
-    def guess(looks: Sequence[Glance], done: set[Window], window: Window) -> WindowChoice | None:
-        return best_hit(belief, done, beside=window)
+    def guess(looks: Sequence[Glance], done: set[Window], beside: Window | None) -> WindowChoice | None:
+        return best_hit(belief, done, beside=beside)
 
     return look_by_look(glances, best, belief, forgetting=forgetting, guess=guess)
 
@@ -170,7 +177,7 @@ def find_everything(
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
-    def guess(looks: Sequence[Glance], done: set[Window], window: Window) -> WindowChoice | None:
-        return best_find(belief, done, belief.foresight, beside=window)
+    def guess(looks: Sequence[Glance], done: set[Window], beside: Window | None) -> WindowChoice | None:
+        return best_find(belief, done, belief.foresight, beside=beside)
 
     return look_by_look(glances, best, belief, hints=False, forgetting=forgetting, guess=guess)

@@ -123,7 +123,7 @@ class LiveGlances(Glances):
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Resample the windows and detect in them."""
-        hints = hints or any(_points_closer(window, self.lattice) for window in windows)
+        hints = hints or any(points_closer(window, self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
         meanwhile, self.meanwhile = self.meanwhile, None
@@ -143,7 +143,7 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
     look_gist, faint = None, None
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]
-    elif _points_closer(window, lattice):
+    elif points_closer(window, lattice):
         look_gist = gist(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
         scores = look_gist.scores.flatten(0, 1)
     else:
@@ -153,7 +153,7 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
     return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
 
 
-def _points_closer(window: Window, lattice: Lattice) -> bool:
+def points_closer(window: Window, lattice: Lattice) -> bool:
     """Whether a look at a window tells where to look more closely: it is on the lattice, and not of the last level."""
     return window.within is None and window.level < lattice.levels - 1
 
