@@ -1,6 +1,5 @@
 """Searches and explorations of large pictures, and merging."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +10,7 @@ from torchvision.transforms.functional import to_pil_image
 from semfov import Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import open_picture
 from semfov.data.large import open_large
-from semfov.zoom import GlimpseEvidence, Lattice, eye, merge
+from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 from tests.refusals import refused
 
@@ -52,41 +51,6 @@ def test_the_records_of_each_look_have_the_picture(agent, picture):
         assert len(seen) == 2
         assert all(torch.equal(record.photograph, whole.photograph) for record in seen)
         assert seen[1].plot().axes[0].images
-
-
-@pytest.mark.parametrize(
-    ("task", "settings"),
-    [("search", {"confirm": 1.0, "give_up": 0.0, "closer": 0}), ("find_all", {"worth": 0.0})],
-    ids=["search", "find all"],
-)
-def test_a_second_thread_changes_no_look_and_knows_the_one_after_a_look_of_the_last_level(
-    agent, picture, monkeypatch, task, settings
-):
-    """Here the thread's work is done before the detector's, or never."""
-    small, prepare, prepared, paths = picture[:, :400, 300:800], LiveGlances.prepare, [], []
-
-    def noted(glances, window):
-        prepared.append(window)
-        prepare(glances, window)
-
-    monkeypatch.setattr(LiveGlances, "prepare", noted)
-    for done in (True, False):
-
-        @contextmanager
-        def beside(work, *, idle, done=done):
-            if done and work is not None:
-                work()
-            yield
-
-        monkeypatch.setattr(eye, "beside", beside)
-        path = getattr(agent, task)(small, "green", passes=16, **settings)
-        paths.append([glance.window for glance in path.glances])
-    assert paths[0] == paths[1]
-    last = agent.eye.open(small).lattice.levels - 1
-    # Nothing is prepared during the overview.
-    exact = [window == prepared[n] for n, window in enumerate(paths[0][2:]) if paths[0][n + 1].level == last]
-    assert exact
-    assert all(exact)
 
 
 def test_search_for_an_absent_target_ends(agent, picture):
@@ -227,3 +191,18 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
             assert torch.equal(getattr(alone.candidates, name), getattr(helped.candidates, name))
     looked = {look.window for path in paths[cores] for look in path.glances}
     assert looked & set(prepared)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings"), [("search", {"confirm": 1.0, "give_up": 0.0}), ("find_all", {"worth": 0.0})]
+)
+def test_a_second_thread_knows_the_window_after_a_look_of_the_last_level(agent, picture, monkeypatch, task, settings):
+    small, prepared = picture[:, :400, 300:800], []
+    monkeypatch.setattr(LiveGlances, "prepare", lambda self, window: prepared.append(window))
+    monkeypatch.setattr("semfov.threads.available_cores", lambda: torch.get_num_threads() + 1)
+    path = getattr(agent, task)(small, "green", passes=16, **settings)
+    windows, last = [look.window for look in path.glances], path.lattice.levels - 1
+    # Nothing is prepared during the overview.
+    known = [window == prepared[n] for n, window in enumerate(windows[2:]) if windows[n + 1].level == last]
+    assert known
+    assert all(known)
