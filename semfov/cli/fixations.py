@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,39 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, suspicions
-from semfov.data.fixations.reading import DATA_SETS, PictureSizes, frame_of, read_by, reader_of
+from semfov.data.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
 from semfov.data.fixations.table import FrameError
-from semfov.data.sources import PHOTOGRAPHS
+from semfov.data.large import picture_size
+from semfov.data.sources import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, SemfovError, check, printable
+
+
+class _PictureSizes(Mapping[str, tuple[int, int]]):
+    """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files: dict[str, Path] = {}
+        for path in picture_files(folder, recursive=True):
+            for name in (path.stem, path.name, path.relative_to(folder).as_posix()):
+                self._files[name.lower()] = path
+        self._sizes: dict[Path, tuple[int, int]] = {}
+
+    def __getitem__(self, name: str) -> tuple[int, int]:
+        whole = name.lower().replace("\\", "/")
+        parts = whole.split("/")
+        names = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
+        path = next((self._files[each] for each in names if each in self._files), None)
+        if path is None:
+            raise KeyError(name)
+        if path not in self._sizes:
+            self._sizes[path] = picture_size(path)
+        return self._sizes[path]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
 
 def check_fixations(options: CheckOptions) -> int:
@@ -28,7 +57,7 @@ def check_fixations(options: CheckOptions) -> int:
     if folder:
         del given["picture"]
     pictures = place is not None and (folder or (place.is_file() and place.suffix.lower() in PHOTOGRAPHS))
-    sizes = PictureSizes(place) if place is not None and pictures else None
+    sizes = _PictureSizes(place) if place is not None and pictures else None
     wrong = False
     for name in options.files:
         try:
@@ -56,7 +85,7 @@ def check_fixations(options: CheckOptions) -> int:
 
 
 def _records(
-    reader: Callable[..., list[Fixations]], path: Path, given: dict[str, Any], sizes: PictureSizes | None
+    reader: Callable[..., list[Fixations]], path: Path, given: dict[str, Any], sizes: _PictureSizes | None
 ) -> list[Fixations]:
     """The records of a file; where it has no frames, they are the pictures."""
     if "picture" in given and "picture" not in signature(reader).parameters:

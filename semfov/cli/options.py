@@ -330,20 +330,3 @@ def white_of(text: str | None) -> White | None:
         raise InputError(f"white: expected 4095, 300,3000 or auto, got {text!r}") from None
     white: White = values[0] if len(values) == 1 else values
     return white
-
-
-def shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
-    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given.
-
-    >>> shown_by(PictureOptions(white="300,3000", bands="4,3,2"))
-    {'white': (300.0, 3000.0), 'bands': (4, 3, 2)}
-    """
-    white = white_of(options.white)
-    shown: dict[str, Any] = {} if white is None else {"white": white}
-    if options.bands is not None:
-        try:
-            numbers = tuple(int(each) for each in options.bands.split(","))
-        except ValueError:
-            raise InputError(f"bands: expected 4,3,2 or the number of one band, got {options.bands!r}") from None
-        shown["bands"] = numbers
-    return shown

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from semfov.agents.picture import How, PictureLike
-from semfov.cli.options import GazeOptions, PictureOptions, shown_by
+from semfov.cli.options import GazeOptions, PictureOptions, white_of
 from semfov.data.large import open_large, picture_size
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
-from semfov.errors import check, printable
+from semfov.errors import InputError, check, printable
 from semfov.head import Flat, Panorama
 
 
@@ -57,7 +57,7 @@ class PictureSource(NamedTuple):
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: dict[str, PictureSource] = {}
-    pictures, shown = options.pictures, shown_by(options)
+    pictures, shown = options.pictures, _shown_by(options)
     # A file may have brackets in its name, as copies do: photo[1].jpg.
     patterns = (name if set(name) & set("*?[") and not os.path.lexists(name) else None for name in pictures)
     matched = ([] if pattern is None else sorted(glob(pattern, recursive=True)) for pattern in patterns)
@@ -78,3 +78,20 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
             # A picture that is named twice, such as by its name and by its folder, is looked at once.
             sources.setdefault(os.path.abspath(each), source)
     return [*sources.values()]
+
+
+def _shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
+    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given.
+
+    >>> _shown_by(PictureOptions(white="300,3000", bands="4,3,2"))
+    {'white': (300.0, 3000.0), 'bands': (4, 3, 2)}
+    """
+    white = white_of(options.white)
+    shown: dict[str, Any] = {} if white is None else {"white": white}
+    if options.bands is not None:
+        try:
+            numbers = tuple(int(each) for each in options.bands.split(","))
+        except ValueError:
+            raise InputError(f"bands: expected 4,3,2 or the number of one band, got {options.bands!r}") from None
+        shown["bands"] = numbers
+    return shown

@@ -51,12 +51,6 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     return _index(data), hashlib.sha256(raw).hexdigest()
 
 
-def category_names(path: str | PathLike[str]) -> tuple[str, ...]:
-    """Names of the categories of an annotation file, in the order of their ids."""
-    coco, _ = read_annotations(path)
-    return tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
-
-
 class _Fault(Exception):
     """An error in an entry; the message describes it."""
 

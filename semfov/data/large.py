@@ -3,15 +3,16 @@
 import lzma
 import math
 import re
+import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 import torch
@@ -29,20 +30,11 @@ from semfov.data.images import (
     quiet_decoders,
     read_image,
     turned,
+    warn_of_range,
 )
 from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.data.windowed import (
-    BY_WINDOWS,
-    FIRST,
-    RASTERS,
-    ChosenBands,
-    LargePicture,
-    PixelBox,
-    bytes_of,
-    chosen_bands,
-    tone_of,
-)
+from semfov.data.windowed import BY_WINDOWS, FIRST, RASTERS, ChosenBands, LargePicture, PixelBox, bytes_of
 from semfov.errors import DataError, check, check_pixels, lookup
 from semfov.io.files import check_regular
 
@@ -101,7 +93,7 @@ class _TiffPicture(LargePicture):
         usual = colour if len(colour) == 3 else None
         if usual is None and colours == 3 and page.photometric == _RGB:
             usual = 1, 2, 3
-        self._channels = [band - 1 for band in chosen_bands(count, bands, usual, self.path, alpha=bool(self._alpha))]
+        self._channels = [band - 1 for band in _chosen_bands(count, bands, usual, self.path, alpha=bool(self._alpha))]
         if self._alpha:
             self._channels.append(colours + extra.index(self._alpha))
         nodata = page.tags.get(_NODATA)
@@ -112,7 +104,7 @@ class _TiffPicture(LargePicture):
             with opening(self.path, "decoded"):
                 self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
         shown = len(self._channels) - bool(self._alpha)
-        self._tone = tone_of(
+        self._tone = _tone_of(
             self, white, lambda box: self._values(box)[..., :shown], nodata=self._nodata, wide=page.dtype == np.uint16
         )
         self.nothing = self._colour_of_nothing()
@@ -276,13 +268,13 @@ class _RasterPicture(LargePicture):
             raise DataError(f"{path}: expected bands of 8 or 16 bits, got {got}")
         named = tuple(meanings.index(name) + 1 for name in ("red", "green", "blue") if name in meanings)
         usual = named if len(named) == 3 else None
-        self._bands = chosen_bands(self._file.count, bands, usual, self.path, alpha="alpha" in meanings)
+        self._bands = _chosen_bands(self._file.count, bands, usual, self.path, alpha="alpha" in meanings)
         self.size = self._file.width, self._file.height
         self._has_overviews = bool(self._file.overviews(self._bands[0]))
         flags = {each.name for each in self._file.mask_flag_enums[self._bands[0] - 1]}
         self._masked = "per_dataset" in flags
         nodata = self._file.nodatavals[self._bands[0] - 1]
-        self._tone = tone_of(
+        self._tone = _tone_of(
             self, white, lambda box: self._values(box, 1), nodata=nodata, wide="uint16" in kinds
         )  # fmt: skip
         if self._masked:
@@ -522,3 +514,62 @@ def _upright_size(image: "Image") -> tuple[int, int]:
     tags = getattr(image, "tag_v2", {})
     width, height = tags.get(_WIDTH, image.size[0]), tags.get(_HEIGHT, image.size[1])
     return height, width
+
+
+_ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which the values of a picture are looked at
+
+
+def _sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
+    """Windows all over a picture in which its values are looked at, row by row.
+
+    >>> next(_sample_windows((1000, 500)))
+    (100, 50, 164, 114)
+    """
+    width, height = size
+    for row in range(_ACROSS):
+        for column in range(_ACROSS):
+            x, y = (length * (1 + 2 * n) // (2 * _ACROSS) for length, n in zip(size, (column, row), strict=True))
+            yield x, y, min(x + _SIDE, width), min(y + _SIDE, height)
+
+
+def _chosen_bands(
+    count: int, bands: ChosenBands, usual: tuple[int, ...] | None, path: Path, *, alpha: bool = False
+) -> list[int]:
+    """The bands that are shown, one or three, from 1; `usual` has those that a file with `count` bands names."""
+    if bands is not None:
+        numbers = [*bands] if isinstance(bands, tuple | list) else [cast(int, bands)]
+        check(max(numbers) <= count, "bands", f"numbers from 1 to {count} for {path}", bands)
+        return numbers
+    if usual is not None:
+        return [*usual]
+    colours = count - alpha
+    shown = [1, 2, 3] if colours >= 3 else [1]
+    if colours not in (1, 3):
+        words = "1 is shown as grey" if len(shown) == 1 else "1, 2 and 3 are shown as red, green and blue"
+        warnings.warn(f"image {path}: of {count} bands without names {words}; choose by bands=", stacklevel=2)
+    return shown
+
+
+def _tone_of(
+    picture: LargePicture,
+    white: White | None,
+    values: Callable[[PixelBox], NDArray[Any]],
+    *,
+    nodata: float | None,
+    wide: bool,
+) -> tuple[float, float] | None:
+    """The values that are black and white in a file; None by its type, with a warning where few of 16 bits are used."""
+    if white is None and not wide:
+        return None
+    assert picture.path is not None
+    if white is not None and not isinstance(white, str):
+        return black_and_white(white, np.zeros(0))
+    seen = []
+    # What cannot be decoded is refused where it is read.
+    with nullcontext() if white else suppress(Exception):
+        seen = [values(box).ravel() for box in _sample_windows(picture.size)]
+    if white is not None:
+        return black_and_white(white, np.concatenate(seen), nodata)
+    if seen:
+        warn_of_range(float(min(each.min() for each in seen)), float(max(each.max() for each in seen)), picture.path)
+    return None

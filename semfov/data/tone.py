@@ -1,6 +1,6 @@
 """The values of a picture that are shown as black and as white, for thermal cameras, reflectances and 12 bits."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,6 @@ White = float | tuple[float, float] | Literal["auto"]
 """The value that is white where 0 is black, the values that are black and white, or `auto` for percentiles."""
 
 _PERCENTILES = 1.0, 99.0  # of the values, which are black and white for `auto`
-_ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which the values of a picture are looked at
 _ROWS = 64  # of a picture that are converted at once: more leave the cache of the processor
 
 
@@ -65,16 +64,3 @@ def bytes_between(values: NDArray[Any], tone: tuple[float, float] | None) -> NDA
         else:
             shown[rows] = np.rint(between(values[rows], tone) * 255)
     return shown
-
-
-def sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
-    """Windows all over a picture in which its values are looked at, row by row.
-
-    >>> next(sample_windows((1000, 500)))
-    (100, 50, 164, 114)
-    """
-    width, height = size
-    for row in range(_ACROSS):
-        for column in range(_ACROSS):
-            x, y = (length * (1 + 2 * n) // (2 * _ACROSS) for length, n in zip(size, (column, row), strict=True))
-            yield x, y, min(x + _SIDE, width), min(y + _SIDE, height)

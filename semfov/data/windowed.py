@@ -1,12 +1,10 @@
 """Pictures that are read window by window: their base, and what their files have in common."""
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +13,6 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.dlpack import from_dlpack
 
-from semfov.data.images import warn_of_range
-from semfov.data.tone import White, black_and_white, sample_windows
 from semfov.errors import check
 
 PixelBox = tuple[int, int, int, int]
@@ -196,46 +192,3 @@ class LargePicture(ABC):
     @cached_property
     def _copies(self) -> _ReducedCopies:
         return _ReducedCopies(self.size, self._given)
-
-
-def chosen_bands(
-    count: int, bands: ChosenBands, usual: tuple[int, ...] | None, path: Path, *, alpha: bool = False
-) -> list[int]:
-    """The bands that are shown, one or three, from 1; `usual` has those that a file with `count` bands names."""
-    if bands is not None:
-        numbers = [*bands] if isinstance(bands, tuple | list) else [cast(int, bands)]
-        check(max(numbers) <= count, "bands", f"numbers from 1 to {count} for {path}", bands)
-        return numbers
-    if usual is not None:
-        return [*usual]
-    colours = count - alpha
-    shown = [1, 2, 3] if colours >= 3 else [1]
-    if colours not in (1, 3):
-        words = "1 is shown as grey" if len(shown) == 1 else "1, 2 and 3 are shown as red, green and blue"
-        warnings.warn(f"image {path}: of {count} bands without names {words}; choose by bands=", stacklevel=2)
-    return shown
-
-
-def tone_of(
-    picture: LargePicture,
-    white: White | None,
-    values: Callable[[PixelBox], NDArray[Any]],
-    *,
-    nodata: float | None,
-    wide: bool,
-) -> tuple[float, float] | None:
-    """The values that are black and white in a file; None by its type, with a warning where few of 16 bits are used."""
-    if white is None and not wide:
-        return None
-    assert picture.path is not None
-    if white is not None and not isinstance(white, str):
-        return black_and_white(white, np.zeros(0))
-    seen = []
-    # What cannot be decoded is refused where it is read.
-    with nullcontext() if white else suppress(Exception):
-        seen = [values(box).ravel() for box in sample_windows(picture.size)]
-    if white is not None:
-        return black_and_white(white, np.concatenate(seen), nodata)
-    if seen:
-        warn_of_range(float(min(each.min() for each in seen)), float(max(each.max() for each in seen)), picture.path)
-    return None

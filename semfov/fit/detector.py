@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from semfov.agent import ActivePerception
-from semfov.data.coco import category_names
+from semfov.data.coco import read_annotations
 from semfov.detection.class_names import UnnamedClasses
 from semfov.errors import DataError, InputError
 from semfov.fit.evidence import EvidenceFit
@@ -269,7 +269,10 @@ def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
         check_sources(config.data, config.detector)
         make_detector(config.detector)
     except UnnamedClasses as error:
-        names = () if config.data.annotations is None else category_names(config.data.annotations)
+        names: tuple[str, ...] = ()
+        if config.data.annotations is not None:
+            coco, _ = read_annotations(config.data.annotations)
+            names = tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
         if len(names) != error.count:
             known = f"; the annotations have {len(names)} categories" if names else ""
             raise InputError(f"{error}{known}") from None

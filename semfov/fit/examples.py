@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -16,7 +16,22 @@ from semfov.belief.observers.base import Look
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
-from semfov.gaze.choice import Exploratory
+from semfov.gaze.choice import Greedy
+
+
+class _Exploratory(Greedy):
+    """`Greedy`, with some fixations drawn at random so that training sees all cells."""
+
+    def __init__(self, noise: Callable[[int, Tensor], Tensor], astray: float) -> None:
+        super().__init__(noise)
+        self.astray = astray
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the best cell, or with the probability `astray` any cell not visited."""
+        drawn = self.noise(shift, episodes)[:, :1] < self.astray
+        return super().__call__(shift, episodes, torch.where(drawn, 0.0, values.detach()), visited, centres)
 
 
 @dataclass(frozen=True)
@@ -70,5 +85,5 @@ def example_episodes(
 ) -> Iterator[Step]:
     """Make one episode over every example, from a random start. Searches continue after they reach their target."""
     start = torch.randint(len(grid), (len(examples),), generator=generator)
-    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
+    choice = _Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
     return rollout(_ExampleLooks(examples, grid), observer, acquisition, start, choice, most=looks)

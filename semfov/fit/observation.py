@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, in_words, section
@@ -23,11 +24,15 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.samples import CellsOfLook, Samples, all_cells
+from semfov.runs.samples import Samples, all_cells
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 from semfov.zoom.eye import WindowEye
+
+_CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
+"""Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
+`(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +153,7 @@ def statistics_of(
 
 
 def count_misses(
-    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: CellsOfLook
+    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: _CellsOfLook
 ) -> MissCounts:
     """Count cells without any detection over all looks at some photographs; edges `(N-1,)`."""
     counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()

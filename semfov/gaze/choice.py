@@ -55,21 +55,6 @@ class Greedy(Choice):
         return centres[cell], cell
 
 
-class Exploratory(Greedy):
-    """`Greedy`, with some fixations drawn at random so that training sees all cells."""
-
-    def __init__(self, noise: _Noise, astray: float) -> None:
-        super().__init__(noise)
-        self.astray = astray
-
-    def __call__(
-        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the best cell, or with the probability `astray` any cell not visited."""
-        drawn = self.noise(shift, episodes)[:, :1] < self.astray
-        return super().__call__(shift, episodes, torch.where(drawn, 0.0, values.detach()), visited, centres)
-
-
 class Softmax(Choice):
     r"""A noisy choice: draw a cell not visited with probability :math:`P(x) \propto e^{b \, a(x)}`.
 

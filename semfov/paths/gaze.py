@@ -296,7 +296,7 @@ class GazePrediction:
         check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
         for each in people:
             check_viewed(each, "people", self.size)
-        from semfov.metrics.scanpath.density import compare_density
+        from semfov.metrics.scanpath.beside import compare_density
 
         return compare_density(self, people)
 

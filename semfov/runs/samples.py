@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -84,10 +83,6 @@ class Samples:
 
 _DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
 _NAMES = (*_DETECTIONS, "scenes", "fixations")
-
-CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
-"""Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
-`(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
 def all_cells(

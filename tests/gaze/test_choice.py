@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov import Grid
-from semfov.gaze.choice import Exploratory, Greedy, Softmax, drawn_from, select_fixation, soft_fixation
+from semfov.fit.examples import _Exploratory
+from semfov.gaze.choice import Greedy, Softmax, drawn_from, select_fixation, soft_fixation
 from tests.refusals import refused
 
 CENTRES = torch.stack([torch.arange(9.0), torch.zeros(9)], -1)
@@ -24,7 +25,7 @@ def test_the_given_share_of_fixations_is_random(astray):
     values, visited = torch.zeros(count, 9), torch.zeros(count, 9, dtype=torch.bool)
     values[:, 4] = 1
     visited[:, 7] = True
-    fixation, cell = Exploratory(noise_from(0), astray)(0, torch.arange(count), values, visited, CENTRES)
+    fixation, cell = _Exploratory(noise_from(0), astray)(0, torch.arange(count), values, visited, CENTRES)
     assert torch.equal(fixation, CENTRES[cell])
     counts = torch.bincount(cell, minlength=9)
     # Random fixations are uniform over unvisited cells, the best one included; within five standard deviations.
@@ -41,7 +42,7 @@ def test_a_visited_cell_is_never_chosen(seed, astray):
     values, visited = torch.rand(6, 9, generator=generator), torch.rand(6, 9, generator=generator) < 0.7
     left = ~visited.all(-1)
     before = values.clone()
-    _, cell = Exploratory(noise_from(seed), astray)(0, torch.arange(6), values, visited, CENTRES)
+    _, cell = _Exploratory(noise_from(seed), astray)(0, torch.arange(6), values, visited, CENTRES)
     assert not visited[left].gather(1, cell[left, None]).any()
     assert torch.equal(values, before)
 
@@ -51,14 +52,14 @@ def test_without_random_fixations_the_choice_is_greedy():
     visited = torch.rand(50, 9) < 0.3
     got, expected = (
         make(0, torch.arange(50), values, visited, CENTRES)[1]
-        for make in (Exploratory(lambda *_: noise, 0.0), Greedy(lambda *_: noise))
+        for make in (_Exploratory(lambda *_: noise, 0.0), Greedy(lambda *_: noise))
     )
     assert torch.equal(got, expected)
 
 
 def test_no_gradient_flows_through_a_choice():
     values = torch.rand(3, 9, requires_grad=True)
-    fixation, _ = Exploratory(noise_from(2), 0.5)(
+    fixation, _ = _Exploratory(noise_from(2), 0.5)(
         0, torch.arange(3), values, torch.zeros(3, 9, dtype=torch.bool), CENTRES
     )
     assert not fixation.requires_grad

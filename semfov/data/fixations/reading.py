@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from inspect import signature
 from os import PathLike
 from pathlib import Path
@@ -14,8 +14,6 @@ from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import OURS, is_export, read_export, read_table
-from semfov.data.large import picture_size
-from semfov.data.sources import picture_files
 from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import check_regular, read_text
 
@@ -104,34 +102,6 @@ def _json_reader(path: str | PathLike[str]) -> _Reader:
     if trials:
         return read_cocosearch
     return read_osie if people else read_ruarte
-
-
-class PictureSizes(Mapping[str, tuple[int, int]]):
-    """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
-
-    def __init__(self, folder: Path) -> None:
-        self._files: dict[str, Path] = {}
-        for path in picture_files(folder, recursive=True):
-            for name in (path.stem, path.name, path.relative_to(folder).as_posix()):
-                self._files[name.lower()] = path
-        self._sizes: dict[Path, tuple[int, int]] = {}
-
-    def __getitem__(self, name: str) -> tuple[int, int]:
-        whole = name.lower().replace("\\", "/")
-        parts = whole.split("/")
-        names = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
-        path = next((self._files[each] for each in names if each in self._files), None)
-        if path is None:
-            raise KeyError(name)
-        if path not in self._sizes:
-            self._sizes[path] = picture_size(path)
-        return self._sizes[path]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._files)
-
-    def __len__(self) -> int:
-        return len(self._files)
 
 
 def frame_of(text: str) -> tuple[int, int]:

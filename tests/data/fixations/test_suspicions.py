@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from semfov.cli.fixations import _PictureSizes
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
-from semfov.data.fixations.reading import PictureSizes
 from tests.refusals import unusable
 
 SIZE = (800, 600)
@@ -164,7 +164,7 @@ def test_pictures_of_one_name_are_told_apart_by_their_folders(tmp_path):
     for name, side in (("a/p.png", 8), ("b/p.png", 9)):
         (tmp_path / name).parent.mkdir()
         Image.new("L", (side, side)).save(tmp_path / name)
-    sizes = PictureSizes(tmp_path)
+    sizes = _PictureSizes(tmp_path)
     for before in ("", "x/", f"{tmp_path}/"):
         assert [sizes[f"{before}{name}/p.png"] for name in "aB"] == [(8, 8), (9, 9)]
 
