@@ -14,16 +14,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from eval.bootstrap import Bootstrap
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
-from semfov.errors import DataError
+from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
@@ -37,12 +39,13 @@ from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Positive, Share
 from semfov.runs.store import RememberedLooks
 from semfov.runs.tables import table
+from semfov.sensor import MultiScaleFovea
 
 _RULES = ("kaplan", "semba")
 _SHIFTS = (1, 3, 6)
-_STEPS = ("here", "scores", "and native picture", "and 3 × 3 inhibition", "and escape")
+_STEPS = ("here", "scores", "and native picture", "and 3 × 3 inhibition", "and escape", "and bilinear crops")
 """What a row takes over from the code of SemBA, beside what the rows before it do."""
-_SCORES, _NATIVE, _INHIBITION, _ESCAPE = range(1, 5)
+_SCORES, _NATIVE, _INHIBITION, _ESCAPE, _BILINEAR = range(1, 6)
 _LEAST = 1e-12
 
 
@@ -67,6 +70,21 @@ class _SembaConfig(LookingConfig):
     native: Positive = 1680.0
     stop: Share = 0.1
     out: Path = Path("runs/semba")
+
+
+class _BilinearFovea(MultiScaleFovea):
+    """The crops without averaging: a pixel is the picture in the middle of its square, by bilinear interpolation."""
+
+    def look(self, state: tuple[tuple[Tensor, ...], tuple[int, int]], gaze: Tensor) -> Tensor:
+        """Compute the crops `(F·L, 3, side, side)` around fixations `(F, 2)`."""
+        (bordered, *_), size = state
+        windows = self.windows(gaze).flatten(0, 1)
+        middles = (torch.arange(self.side, device=gaze.device) + 0.5) / self.side
+        points = windows[:, None, :2] + middles[:, None] * (windows[:, 2:] - windows[:, :2])[:, None]
+        x, y = (2 * points / points.new_tensor(size) - 1).unbind(-1)
+        where = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), -1).to(bordered)
+        image = bordered[..., 1:-1, 1:-1].expand(len(where), -1, -1, -1)
+        return F.grid_sample(image, where, "bilinear", "zeros", align_corners=False)
 
 
 class _CodeLooks(Looks):
@@ -138,6 +156,7 @@ class _Inhibited(Greedy):
 
 def _search_as_semba(config: _SembaConfig) -> None:
     """Search for every target of every photograph in each way, and write the table."""
+    check(config.sensor.name == "multi-scale", "sensor.name", "multi-scale, as SemBA has it", config.sensor.name)
     run = Looking(config)
     results: list[Tensor] = []
     scenes: list[int] = []
@@ -190,12 +209,15 @@ def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor
     remembered = RememberedLooks(
         lambda: photograph_looks(run.eye, lambda: image, grid), store, lambda: run.digest(index)
     )
-    eyes = [Eye(run.eye.sensor, run.eye.detector, reference=each) for each in (run.eye.reference, config.native)]
+    sizes = run.eye.reference, config.native
+    sensor: Any = run.eye.sensor
+    eyes = [Eye(sensor, run.eye.detector, reference=each) for each in sizes]
+    eyes.append(Eye(_BilinearFovea(sensor.side, sensor.scales), run.eye.detector, reference=config.native))
     here, codes = CellLooks(remembered, grid, image), [_CodeLooks(eye, image, grid) for eye in eyes]
     noise = torch.stack([noise_for(config.protocol, len(grid), index, target) for target in targets.tolist()])
     results = []
     for step, rule in product(range(len(_STEPS)), _RULES):
-        code, choice = codes[step >= _NATIVE], Greedy(drawn_from(noise))
+        code, choice = codes[(step >= _NATIVE) + (step >= _BILINEAR)], Greedy(drawn_from(noise))
         if step >= _INHIBITION:
             choice = _Inhibited(noise, code, escape=step >= _ESCAPE)
         looks: Looks = here if step < _SCORES else code

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval import semba, sensors
-from eval.semba import _Inhibited, _search_scene, _SembaConfig
+from eval.semba import _BilinearFovea, _Inhibited, _search_scene, _SembaConfig
 from semfov import Eye, Grid
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looking import Looking
@@ -137,7 +137,7 @@ def test_the_searcher_of_semba_equals_a_loop(home):
         out=home / "semba",
     )
     run, stopped, empty = Looking(config), 0, 0
-    eye = Eye(run.eye.sensor, run.eye.detector, reference=300.0)
+    eye, bilinear = (Eye(each, run.eye.detector, reference=300.0) for each in (run.eye.sensor, _BilinearFovea(64, 3)))
     for index in range(2):
         results = _search_scene(config, run, index)
         grid, annotation = run.grid(index), run.scenes.annotation(index)
@@ -146,12 +146,25 @@ def test_the_searcher_of_semba_equals_a_loop(home):
         assert len(results) == len(targets) > 0
         for target, result in zip(targets, results, strict=True):
             for number, rule in enumerate(("kaplan", "semba")):
-                for row, code in ((number, None), (number - 2, eye)):
+                for row, code in ((number, None), (number - 4, eye), (number - 2, bilinear)):
                     expected, nothing = search_by_loop(run, index, target, rule, config.stop, 6, code)
                     assert result[row].tolist() == [float(each) for each in expected]
                     stopped, empty = stopped + expected[-2], empty + nothing
     assert stopped > 0
     assert empty > 0
+
+
+def test_bilinear_crops_equal_those_that_torch_resizes():
+    image, sensor, side, levels = torch.rand(1, 3, 50, 70), _BilinearFovea(12, 4), 12, range(4)
+    for x, y in ((20, 30), (3, 47), (69, 1)):
+        # Edges of the crops lie between pixels where the fixation does.
+        crops = sensor.look(sensor.open(image, torch.ones(1)), torch.tensor([[x - 0.5, y - 0.5]]))
+        wide = torch.nn.functional.pad(image, [96] * 4)
+        for level, crop in zip(levels, crops, strict=True):
+            half = side * 2**level // 2
+            square = wide[..., 96 + y - half : 96 + y + half, 96 + x - half : 96 + x + half]
+            resized = torch.nn.functional.interpolate(square, (side, side), mode="bilinear")
+            torch.testing.assert_close(crop[None], resized, atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("escape", [False, True])
