@@ -16,7 +16,6 @@ from semfov.head.speeds import Speeds
 from semfov.head.sphere import Sphere
 from semfov.head.world import BLANK, FIELDS, World, check_fields
 from semfov.sensor.perspective import even_rows, go_around, sample
-from semfov.sensor.sphere import Boxes
 
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
@@ -78,16 +77,13 @@ class Panorama(Sphere):
         super().__init__(image, size, tilt=(-reach, reach), fields=fields, speeds=speeds, cell=cell)
         self.reach = reach
         self._source = None if pixels is None else go_around(even_rows(pixels)[None])[0]
+        self._drawn = None if self._source is None else self._source[:, 1:-1, 1:-1]
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Render the view of the camera."""
         if self._source is None:
             raise InputError(BLANK)
         return sample(self._source, pose, self.size).clamp(0, 1), pose
-
-    def image(self) -> Tensor | None:
-        """The panorama."""
-        return None if self._source is None else self._source[:, 1:-1, 1:-1]
 
 
 class Flat(World):
@@ -130,7 +126,7 @@ class Flat(World):
         self.fields = check_fields(fields)
         self.opened: LargePicture | None = None
         if not isinstance(picture, tuple):
-            self.opened = open_large(picture, color=color)
+            self.opened = self._drawn = open_large(picture, color=color)
             picture = self.opened.size
         self.picture = width, height = picture
         if degree is None:
@@ -167,10 +163,6 @@ class Flat(World):
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 
-    def image(self) -> LargePicture | None:
-        """The picture."""
-        return self.opened
-
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of the view that show points of the picture."""
         x1, y1, x2, y2 = self._box(pose)
@@ -183,10 +175,6 @@ class Flat(World):
         x1, y1, x2, y2 = self._box(pose)
         extent = points.new_tensor([x2 - x1, y2 - y1])
         return (points + 0.5) * extent / points.new_tensor(self.size) + points.new_tensor([x1, y1]) - 0.5
-
-    def cell_of(self, points: Tensor) -> Tensor:
-        """Cells that contain points."""
-        return self.scene.cell_of(points)
 
     def pixels_of(self, points: Tensor) -> Tensor:
         """The points themselves."""
@@ -220,10 +208,6 @@ class Flat(World):
 
         across, down = (middles(*pair) for pair in zip(self.picture, (width, height), strict=True))
         return [[torch.tensor([x, -y, field]) for x in across] for y in down]
-
-    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
-        """Boxes of the picture."""
-        return Boxes(self.boxes(boxes, pose))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
         """Boxes of the picture."""

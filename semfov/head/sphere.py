@@ -67,10 +67,6 @@ class Sphere(World):
         """Directions of pixels."""
         return Camera(pose, self.size).directions(points)
 
-    def cell_of(self, points: Tensor) -> Tensor:
-        """Cells that contain directions."""
-        return self.scene.cell_of(self.pixels_of(points))
-
     def pixels_of(self, points: Tensor) -> Tensor:
         """Pixels of the panorama at directions."""
         return panorama_points(points, self.picture)

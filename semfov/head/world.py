@@ -53,6 +53,8 @@ class World(ABC):
     closed: bool = False
     still: bool = True
 
+    _drawn: Tensor | LargePicture | None = None
+
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """The picture from a pose `(3,)`, `(3, h, w)` in [0, 1], and the pose where it was taken."""
         raise InputError(BLANK)
@@ -69,9 +71,9 @@ class World(ABC):
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
         """Points `(N, D)` of the scene that pixels `(N, 2)` of the view from a pose show."""
 
-    @abstractmethod
     def cell_of(self, points: Tensor) -> Tensor:
         """Cells `(N,)` of the scene that contain points `(N, D)`."""
+        return self.scene.cell_of(self.pixels_of(points))
 
     @abstractmethod
     def pixels_of(self, points: Tensor) -> Tensor:
@@ -93,9 +95,9 @@ class World(ABC):
     def poses(self, field: float) -> list[list[Tensor]]:
         """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene."""
 
-    @abstractmethod
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         """Regions of the scene that boxes `(M, 4)` in the view from a pose cover."""
+        return Boxes(self.boxes(boxes, pose))
 
     @abstractmethod
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
@@ -103,4 +105,4 @@ class World(ABC):
 
     def image(self) -> Tensor | LargePicture | None:
         """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""
-        return None
+        return self._drawn

@@ -29,10 +29,8 @@ _CLEAR = 0.1
 class Rates(Protocol):
     """Predicts how many objects closer looks find, such as `GlimpseEvidence` and `Survey`."""
 
-    @property
-    def foresight(self) -> float:
-        """Share of what still closer looks would find in a window that counts towards its value."""
-        ...
+    foresight: float
+    """Share of what still closer looks would find in a window that counts towards its value."""
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """See `GlimpseEvidence.rates`."""
@@ -109,7 +107,7 @@ class ZoomBelief:
         self._areas: dict[int, Cells] = {}
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
-        self._targets = torch.tensor([target])
+        self.foresight, self._targets = self._rates.foresight, torch.tensor([target])
         self.clear()
 
     def clear(self) -> None:
@@ -146,11 +144,6 @@ class ZoomBelief:
     def photograph(self) -> PhotographEvidence | None:
         """The evidence for photographs, where the picture is one: nothing in it can be looked at an octave closer."""
         return self.evidence.photograph if self.lattice.levels == 1 else None
-
-    @property
-    def foresight(self) -> float:
-        """Share of what still closer looks would find in a window that counts towards its value."""
-        return self._rates.foresight
 
     def restore(self, left: Tensor) -> None:
         """Set back what is left to see, to undo `discount`; left `(rows, columns)`."""

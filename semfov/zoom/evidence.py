@@ -305,9 +305,9 @@ class GlimpseEvidence(Pretrained):
             "width": self.width,
             "patience": self.patience,
             "foresight": self.foresight,
-            "thresholds": _listed(self.thresholds),
+            "thresholds": self.thresholds and asdict(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
-            "verification": None if verified is None else {"thresholds": _listed(verified.thresholds)},
+            "verification": verified and {"thresholds": verified.thresholds and asdict(verified.thresholds)},
             "certainty": None if self.certainty is None else self.certainty.numbers,
             "photograph": None if self.photograph is None else self.photograph.record(),
         }
@@ -316,13 +316,14 @@ class GlimpseEvidence(Pretrained):
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model from its file."""
         verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
+        chosen, sure = record["thresholds"], verified and verified["thresholds"]
         model = cls(
             record["classes"],
             record["width"],
             patience=record["patience"],
             foresight=record["foresight"],
-            thresholds=_thresholds(record["thresholds"]),
-            verification=None if verified is None else Verification(thresholds=_thresholds(verified["thresholds"])),
+            thresholds=chosen and Thresholds(**chosen),
+            verification=verified and Verification(thresholds=sure and Thresholds(**sure)),
             certainty=None if certainty is None else Certainty.of(certainty),
             photograph=None if photograph is None else PhotographEvidence.of(record["classes"], photograph),
             metadata=record["metadata"],
@@ -330,16 +331,6 @@ class GlimpseEvidence(Pretrained):
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
         return model
-
-
-def _listed(thresholds: Thresholds | None) -> dict[str, float] | None:
-    """Thresholds as JSON."""
-    return None if thresholds is None else asdict(thresholds)
-
-
-def _thresholds(record: Mapping[str, float] | None) -> Thresholds | None:
-    """Thresholds from JSON."""
-    return None if record is None else Thresholds(**record)
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ class PolicyAgent:
         visited = gazes.memory.visited[row]
         values = policy(targets, grid)(gazes.memory.belief[row], visited)
         draw = tie_noise if isinstance(episode, Trial) else explore_noise
-        noise = draw(scenery._data, episode, len(grid), scenery.protocol)
+        noise = draw(scenery.pictures, episode, len(grid), scenery.protocol)
         # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.
         noise = noise[min(int(gazes.shift[row]), scenery.shifts)]
         return Greedy(drawn_from(noise[None, None]))(0, torch.tensor([0]), values, visited, grid.centres)[1]
