@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov import ActivePerception, EmbeddedScenes, Eye, FovealObservationModel, Foveation, Grid, Scanpath
-from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence, Verification
 from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
@@ -228,6 +228,27 @@ class Coloured(Detector):
                     boxes[row, kind] = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
                     scores[row, kind, kind] = contrast.max().clamp(0, 1) if self.score is None else self.score
         return Candidates(boxes, scores)
+
+
+class Shown(Detector):
+    """Detects nothing; its only feature map is the canvas itself, as means of squares."""
+
+    def __init__(self, *given, square=2, **options) -> None:
+        super().__init__(*given, **options)
+        self.square = square
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
+
+    def propose_with_features(self, canvas: Tensor, layers=None):
+        return self.propose(canvas), {"backbone8": nn.functional.avg_pool2d(canvas, self.square)}
+
+
+class Sure(Verification):
+    """Every place holds the target, with log odds of 4."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        return torch.full_like(features[..., :2], 4.0)
 
 
 class Tiles(Detector):

@@ -6,33 +6,20 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch.nn import functional as F
 
-from semfov import Detector
 from semfov.cli.main import main
 from semfov.data.fixations import by_picture, read_table
-from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.paths import GazePrediction
 from tests.refusals import refused, unusable
-from tests.small import rand
-
-
-class Colours(Detector):
-    """Its only feature map is the picture itself."""
-
-    def propose(self, canvas):
-        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
-
-    def propose_with_features(self, canvas, layers=None):
-        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 8)}
+from tests.small import Shown, rand
 
 
 @pytest.fixture
 def run(monkeypatch, tmp_path, capsys):
-    """Runs the command with a model for `Colours`; returns code, output and errors."""
-    detector = Colours("colours", ("cup",), (416, 416), stride=32).eval()
+    """Runs the command with a model for `Shown`; returns code, output and errors."""
+    detector = Shown("colours", ("cup",), (416, 416), stride=32, square=8).eval()
     torch.manual_seed(0)
     model = FixationDensity({"backbone8": 3}, metadata={"detector": detector.settings()})
     monkeypatch.setattr(FixationDensity, "shipped", tmp_path / "models")
@@ -122,7 +109,7 @@ def test_a_model_of_ones_own(run, photos, tmp_path):
     assert own == folder
     assert "did you mean --model?" in run(photos / "0.png", "--models", tmp_path / "own")[2]
     unusable(r"semfov gaze --model .*own/gaze\.safetensors", Manifest.read, tmp_path / "own")
-    detector = Colours("colours", ("cup",), (416, 416), stride=32).eval()
+    detector = Shown("colours", ("cup",), (416, 416), stride=32, square=8).eval()
     image = rand(3, 60, 80)
     by_path = GazePrediction.of(detector, image, model=str(tmp_path / "own/gaze.safetensors"))
     torch.testing.assert_close(by_path.density, GazePrediction.of(detector, image, model=other).density)
@@ -193,7 +180,7 @@ def test_wrong_options_are_told_before_a_look(run, photos, words, told):
 
 
 def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
-    other = Colours("other", ("cup",), (416, 416), stride=32).eval()
+    other = Shown("other", ("cup",), (416, 416), stride=32, square=8).eval()
     monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: other)
     code, _, err = run(photos / "0.png")
     assert code == 1

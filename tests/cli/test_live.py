@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Detections, Grid, InputError
-from semfov.belief import DirichletBelief, Verification
+from semfov.belief import DirichletBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.cli import live
 from semfov.cli.main import main
@@ -132,15 +132,8 @@ def test_windows_and_objects_are_drawn_into_a_frame(agent):
     assert np.array_equal(draw_moment((large * 255).round().byte(), moment, "red"), draw_moment(large, moment, "red"))
 
 
-class Sure(Verification):
-    """Every place holds the target."""
-
-    def forward(self, features):
-        return torch.full_like(features[..., :2], 4.0)
-
-
 def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, agent, tmp_path):
-    agent.verification = Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
+    agent.verification = small.Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
     path = write(tmp_path / "red.avi", frames())
     _, printed = run("live", path, "--target", "red", "--start", 0)
     shown = re.findall(

@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 import semfov
 from examples import ros_messages as ros
 from semfov import Detections, InputError
-from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
 from semfov.gaze.policies import Policy
 from tests.examples.messages import KINDS, plain
 from tests.refusals import refused
-from tests.small import Coloured
+from tests.small import Coloured, Sure
 
 CLASSES = ("cup", "cat", "car")
 ARRAY, DETECTION = KINDS["vision_msgs/Detection2DArray"], KINDS["vision_msgs/Detection2D"]
@@ -129,13 +128,6 @@ def test_bad_input(seen):
     cut = image(np.zeros((2, 2, 3), np.uint8), "rgb8")
     cut.height = 3
     refused("data", ros.picture, cut)
-
-
-class Sure(Verification):
-    """Every place holds the target, with log odds of 4."""
-
-    def forward(self, features):
-        return torch.full_like(features[..., :2], 4.0)
 
 
 class Node:

@@ -9,15 +9,13 @@ import pytest
 import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
-from torch.nn import functional as F
 
 from eval.human import main as compare
 from eval.human.folds import StudiedFold, others_of, viewed_by
 from eval.human.viewing import covering
-from semfov import Detector, InputError, saliency
+from semfov import InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
-from semfov.detection import Candidates
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
 from semfov.fit.gaze_folds import CENTRE, FoldStore, _folds
 from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, _summary_of
@@ -33,18 +31,9 @@ from semfov.fit.viewing import (
 )
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
+from tests.small import Shown
 
 SIZE = (60, 80)
-
-
-class Colours(Detector):
-    """Its only feature map is the picture itself, in pixels of 8."""
-
-    def propose(self, canvas):
-        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
-
-    def propose_with_features(self, canvas, layers=None):
-        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 2)}
 
 
 def picture(seed):
@@ -68,7 +57,7 @@ def people(seed, place, count=6):
 
 def viewed(shown):
     """Pictures `(image, people)` as the fit has them."""
-    source = features_of(Colours("colours", ("none",), (80, 60), stride=4).eval())
+    source = features_of(Shown("colours", ("none",), (80, 60), stride=4).eval())
     (made,) = _grouped((source.maps(image[None]), some) for image, some in shown)
     return made
 
@@ -242,7 +231,7 @@ def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, 
         Image.fromarray(np.kron(pixels, np.ones((scale, scale, 1), np.uint8))).save(tmp_path / f"pictures/{seed}.png")
         everyone += [each.resized((80 * scale, 60 * scale)) for each in people(seed, place, 2)]
     write_table(tmp_path / "people.csv", everyone)
-    detector = Colours("colours", ("none",), (160, 120), stride=4).eval()
+    detector = Shown("colours", ("none",), (160, 120), stride=4).eval()
     monkeypatch.setattr("semfov.fit.detector.check_sources", lambda data, config: None)
     monkeypatch.setattr("semfov.fit.detector.make_detector", lambda config: detector)
     data = {"fixations": tmp_path / "people.csv", "pictures": tmp_path / "pictures", "cache": tmp_path, "seconds": 3}

@@ -8,16 +8,15 @@ import torch
 from PIL import Image
 from torch.nn import functional as F
 
-from semfov import Detector, Eye, Foveation, InputError, foveate
+from semfov import Eye, Foveation, InputError, foveate
 from semfov.data.fixations import Fixations, read_table
-from semfov.detection import Candidates
 from semfov.gaze.saliency import FixationDensity
 from semfov.metrics.scanpath import auc, correlation, nss
 from semfov.paths import GazePrediction
 from semfov.sensor import LogPolar
 from tests import small
 from tests.refusals import refused
-from tests.small import rand
+from tests.small import Shown, rand
 
 
 def bump(x, y, rows=39, columns=52, width=2.0):
@@ -135,20 +134,10 @@ def test_what_is_not_one_viewers_fixations_of_the_picture_is_refused(gaze, given
     refused(rf"^scanpath: expected (Fixations|fixations) .*, got {got}", gaze.next_density, given)
 
 
-class Colours(Detector):
-    """Its only feature map is the picture itself, in pixels of 2."""
-
-    def propose(self, canvas):
-        return Candidates(canvas.new_zeros(len(canvas), 0, 4), canvas.new_zeros(len(canvas), 0, 1))
-
-    def propose_with_features(self, canvas, layers=None):
-        return self.propose(canvas), {"backbone8": F.avg_pool2d(canvas, 2)}
-
-
 def test_what_a_fovea_has_seen_is_known_alone():
     """After one look, the picture is what the fovea has shown; between two, each half is that of its own look."""
     torch.manual_seed(0)
-    detector = Colours("colours", ("none",), (80, 60), stride=4).eval()
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
     model, image = FixationDensity({"backbone8": 3}).eval(), rand(3, 60, 80).float()
     eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
     points = np.array([[12.0, 30.0], [68.0, 30.0]])

@@ -2,32 +2,28 @@
 
 import pytest
 import torch
-from torch import Tensor
 
-from semfov.detection import Candidates, Detector
+from semfov import WindowEye, ZoomAgent
+from semfov.zoom import GlimpseEvidence
+from tests.small import Tiles
 
 
-class Squares(Detector):
-    """Proposes one box for each of its classes in every 16-px cell that shows its colour, by how full the cell is."""
+class Squares(Tiles):
+    """One box for each of three colours in every cell of 16 px that shows it, by how full the cell is."""
 
     def __init__(self, size=(128, 128)):
-        super().__init__("squares", ("red", "green", "blue"), size, fill=0.0)
-
-    def propose(self, canvas: Tensor) -> Candidates:
-        batch = canvas.shape[0]
-        others = canvas.sum(1, keepdim=True) - canvas
-        pure = (canvas - others).clamp(0, 1)
-        full = torch.nn.functional.avg_pool2d(pure, 16)
-        rows, columns = full.shape[-2:]
-        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
-        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(batch, -1, -1)
-        classes = full.flatten(2).mT
-        return Candidates(boxes, classes, classes.amax(-1))
+        super().__init__(("red", "green", "blue"), size, name="squares", pure=True, fill=0.0)
 
 
 @pytest.fixture
 def detector():
     return Squares().eval()
+
+
+@pytest.fixture
+def agent(detector):
+    torch.manual_seed(0)
+    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
 
 
 @pytest.fixture

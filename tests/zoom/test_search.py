@@ -15,12 +15,6 @@ from semfov.zoom.glances import Glance, LiveGlances, on_lattice
 from tests.refusals import refused
 
 
-@pytest.fixture
-def agent(detector):
-    torch.manual_seed(0)
-    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
-
-
 def test_search_finds_a_target_in_the_picture(agent, picture):
     path = agent.search(picture, "red")
     assert path.decision.outcome == "found"

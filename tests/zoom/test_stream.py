@@ -26,12 +26,6 @@ def same_looks(moments, path):
     assert last.object_rows() == path.object_rows()
 
 
-@pytest.fixture
-def agent(detector):
-    torch.manual_seed(0)
-    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
-
-
 @pytest.mark.parametrize("target", [None, 3, [1, 3]])
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, picture, target, one_thread):
     path = agent.find_all(picture, target, passes=9)
