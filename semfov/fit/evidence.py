@@ -16,8 +16,7 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score, look_features
-from semfov.belief.observers import Observer, Semantic
-from semfov.belief.observers.base import own
+from semfov.belief.observers import Semantic
 from semfov.belief.observers.target import Target, TargetBelief, TargetLook
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import legal_targets
@@ -98,22 +97,12 @@ class FitSearchConfig(FitOnLooksConfig):
 class _TargetExamples(Examples):
     """One example for each pair of photograph and class to search for. The class may be absent.
 
-    Shapes: features `(E, X·Y, X·Y, F)`, score `(E, X·Y)`, goal `(E, X·Y)`, target `(E,)`.
+    Shapes: features `(E, X·Y, X·Y, F)`, score `(E, X·Y)`, target `(E,)`, goal `(E, X·Y)`.
     """
 
-    goal: Tensor
-    target: Tensor
+    looks = TargetLook
 
-    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> TargetLook:
-        """Process stored looks with the model in training; see `Examples.look`."""
-        return TargetLook(
-            own(observer, Target, "observer").model.evidence(self.features[episodes, cell].float()),
-            self.distance[episodes, cell],
-            self.score[episodes, cell],
-            cell,
-            self.target[episodes],
-            columns,
-        )
+    goal: Tensor
 
 
 def _make_examples(
@@ -141,7 +130,7 @@ def _make_examples(
             with torch.inference_mode():
                 features = look_features(detections, grid.centres, grid, target).half()
             score = highest_score(detections, target)
-            row = features, score, grid.cell_distance, torch.tensor(index), goal, torch.tensor(target)
+            row = features, score, grid.cell_distance, torch.tensor(index), torch.tensor(target), goal
             rows.append(row)
     if not rows:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
-from semfov.belief.observers.base import Look
+from semfov.belief.observers.base import own
+from semfov.belief.observers.gathering import EvidenceLook, Gatherer
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
@@ -35,16 +35,23 @@ class _Exploratory(Greedy):
 
 
 @dataclass(frozen=True)
-class Examples(ABC):
+class Examples:
     """Base of training examples; the fields are tensors with a row for each example.
 
-    Shapes: features `(E, X·Y, …, X·Y, F)`, score `(E, X·Y, …)`, distance `(E, X·Y, X·Y)`, scene `(E,)`.
+    Stored looks become looks of the kind `looks`, which takes `more` fields, with the model in training.
+
+    Shapes: features `(E, X·Y, …, X·Y, F)`, score `(E, X·Y, …)`, distance `(E, X·Y, X·Y)`, scene `(E,)`, target
+    `(E, …)`.
     """
+
+    looks: ClassVar[type[EvidenceLook]]
+    more: ClassVar[tuple[str, ...]] = ()
 
     features: Tensor
     score: Tensor
     distance: Tensor
     scene: Tensor
+    target: Tensor
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -52,10 +59,6 @@ class Examples(ABC):
     def __getitem__(self, index: Tensor) -> Self:
         """Select examples by index or mask."""
         return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    @abstractmethod
-    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> Look:
-        """Process stored looks with the model in training; episodes `(A,)`, cell `(A,)`."""
 
 
 class _ExampleLooks(Looks):
@@ -67,7 +70,17 @@ class _ExampleLooks(Looks):
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Look up the looks from some cells, processed by the model in training."""
-        return Sight(self.examples.look(observer, episodes, cell, self.grid.columns), _no_detections, {})
+        examples, model = self.examples, own(observer, Gatherer, "observer").model  # type: ignore[type-abstract]
+        look = examples.looks(
+            model.evidence(examples.features[episodes, cell].float()),
+            examples.distance[episodes, cell],
+            examples.score[episodes, cell],
+            cell,
+            examples.target[episodes],
+            self.grid.columns,
+            *(getattr(examples, name)[episodes] for name in examples.more),
+        )
+        return Sight(look, _no_detections, {})
 
 
 def _no_detections() -> Detections:

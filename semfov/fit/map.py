@@ -15,8 +15,7 @@ from torch.nn import functional as F
 from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
-from semfov.belief.observers import LearnedMap, Observer, Semantic
-from semfov.belief.observers.base import own
+from semfov.belief.observers import LearnedMap, Semantic
 from semfov.belief.observers.learned_map import MapBelief, MapLook
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError, InputError
@@ -70,25 +69,14 @@ class FitMapConfig(FitOnLooksConfig):
 class _MapExamples(Examples):
     """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
 
-    Shapes: features `(E, X·Y, T, X·Y, F)`, score `(E, X·Y, T)`, answers `(E, X·Y, T+1)`, targets `(E, T)`, stands_for
+    Shapes: features `(E, X·Y, T, X·Y, F)`, score `(E, X·Y, T)`, target `(E, T)`, answers `(E, X·Y, T+1)`, stands_for
     `(E, T)`.
     """
 
-    answers: Tensor
-    targets: Tensor
-    stands_for: Tensor
+    looks, more = MapLook, ("stands_for",)
 
-    def look(self, observer: Observer, episodes: Tensor, cell: Tensor, columns: int) -> MapLook:
-        """Process stored looks with the model in training; see `Examples.look`."""
-        return MapLook(
-            own(observer, LearnedMap, "observer").model.evidence(self.features[episodes, cell].float()),
-            self.distance[episodes, cell],
-            self.score[episodes, cell],
-            cell,
-            self.targets[episodes],
-            columns,
-            self.stands_for[episodes],
-        )
+    answers: Tensor
+    stands_for: Tensor
 
 
 def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _MapExamples:
@@ -118,7 +106,7 @@ def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _M
             )
         answers = answers_of(annotation, grid, components)
         answers = torch.cat([~answers.any(-1, keepdim=True), answers[:, every[chosen]]], -1)
-        row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), answers, every[chosen], stands_for
+        row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), every[chosen], answers, stands_for
         rows.append(row)
     if not rows:
         raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")

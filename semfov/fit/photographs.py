@@ -12,7 +12,6 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
-from semfov.detection.detections import Detections
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import (
     VerificationResult,
@@ -67,7 +66,14 @@ class _WholeSearch(TargetSearch[WindowLook]):
         spare: bool = False,
     ) -> None:
         places = partial(PhotographPlaces, target, glances.lattice)
-        super().__init__(number, target, places, self._look_closely, present=len(objects) > 0, spare=spare)
+        super().__init__(
+            number,
+            target,
+            places,
+            lambda box: candidates(look_closely(glances, box)),
+            present=len(objects) > 0,
+            spare=spare,
+        )
         self.glances, self.whole, self.objects, self.model = glances, whole, objects, model
 
     def __len__(self) -> int:
@@ -82,10 +88,6 @@ class _WholeSearch(TargetSearch[WindowLook]):
         """The look at the whole."""
         presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
         return WindowLook(candidates(self.whole), number, float(presence), self.best, 0.0)
-
-    def _look_closely(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`."""
-        return candidates(look_closely(self.glances, box))
 
     def right(self, box: Tensor) -> bool:
         """Whether the centre of a box `(4,)` lies in an annotated box of the class."""

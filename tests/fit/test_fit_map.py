@@ -57,7 +57,7 @@ def test_examples_match_looks_from_every_cell(run, examples):
     assert examples.score.shape == (4, CELLS, 6)
     assert examples.answers.shape == (4, CELLS, 7)
     for row in range(4):
-        index, targets = int(examples.scene[row]), examples.targets[row]
+        index, targets = int(examples.scene[row]), examples.target[row]
         annotation, seen = run.scenes.annotation(index), run.detections(index)
         features = class_features(seen, GRID.centres, GRID, targets)
         torch.testing.assert_close(examples.features[row].float(), features, atol=2e-3, rtol=2e-3)
@@ -72,21 +72,21 @@ def test_examples_match_looks_from_every_cell(run, examples):
 
 def test_examples_have_all_present_classes_and_some_that_represent_the_others(run, examples):
     for row in range(4):
-        annotation, targets = run.scenes.annotation(int(examples.scene[row])), examples.targets[row].tolist()
+        annotation, targets = run.scenes.annotation(int(examples.scene[row])), examples.target[row].tolist()
         assert len(set(targets)) == 6
         assert set(annotation.labels.tolist()) <= set(targets)
         # Four classes, present or with the highest scores, represent themselves; two represent the four others.
         assert examples.stands_for[row].tolist() == [1, 1, 1, 1, 2, 2]
         assert float(examples.stands_for[row].sum()) == len(CLASSES)
-    draws = {tuple(_make_map_examples(run, 6, 2, seed).targets[0].tolist()) for seed in range(8)}
+    draws = {tuple(_make_map_examples(run, 6, 2, seed).target[0].tolist()) for seed in range(8)}
     assert len(draws) > 1
-    assert torch.equal(_make_map_examples(run, 6, 2, 0).targets, examples.targets)
+    assert torch.equal(_make_map_examples(run, 6, 2, 0).target, examples.target)
 
 
 @pytest.mark.parametrize(("classes", "others"), [(8, 3), (9, 3), (12, 3), (20, 5)])
 def test_every_class_represents_itself_when_there_are_few(run, classes, others):
     made = _make_map_examples(run, classes, others, 0)
-    assert made.targets.shape == (4, 8)
+    assert made.target.shape == (4, 8)
     assert bool((made.stands_for == 1).all())
 
 
@@ -101,7 +101,7 @@ def test_looks_of_examples_match_stored_looks(run):
     steps = rollout(_ExampleLooks(chosen, GRID), observer, acquisition, cells[:, 0], Given(cells), most=4)
     beliefs = [step.belief for step in steps]
     for row, scene in enumerate(chosen.scene.tolist()):
-        path, order = cells[row : row + 1], chosen.targets[row]
+        path, order = cells[row : row + 1], chosen.target[row]
         alone = rollout(
             StoredLooks(run.detections(scene), GRID), observer, acquisition, path[:, 0], Given(path), most=4
         )
