@@ -468,4 +468,4 @@ def test_most_changes_of_a_number_are_noticed():
                     changed += 1
                     noticed += not carried(other, known, said)
     assert changed > 100
-    assert noticed / changed > 0.5, f"{noticed} of {changed}"
+    assert noticed / changed > 0.45, f"{noticed} of {changed}"

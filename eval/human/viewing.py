@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from eval.comparison.saliency import SALIENCY_CLASSES
 from eval.human.folds import Maps, StudiedFold, viewed_by
+from eval.human.glimpses import glimpsed, glimpses_table
 from eval.page.origin import END, PLACE
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
@@ -57,6 +58,7 @@ class ViewingConfig(ViewingData):
         studied: number of the detector that is also fitted to half of the people, and to the first data set alone.
         folds: number of folds; every picture is held out once.
         sequences: number of held-out pictures of the first data set for which scanpaths are drawn.
+        glimpses: number of held-out pictures of the first data set at which a fovea looks.
         fit: how the models are fitted.
         page: page with places for the tables (`<!-- table viewing -->` to `<!-- end -->`); none: it is left alone.
         out: folder for the tables, and for the models and scores of the folds.
@@ -67,6 +69,7 @@ class ViewingConfig(ViewingData):
     studied: Whole = 1
     folds: Annotated[int, Range(2, 1000)] = 5
     sequences: Whole = 50
+    glimpses: Whole = 20
     page: Path | None = None
     fit: GazeFit = field(default_factory=GazeFit)
     out: Path = Path("runs/human_viewing")
@@ -84,6 +87,7 @@ def compare_viewing(config: ViewingConfig) -> None:
     rows: dict[str, Scores] = {}
     splits: dict[str, Scores] = {}
     drawn: dict[str, list[dict[str, float]]] = {}
+    seen: dict[str, Tensor] = {}
     for name, source in made.items():
         opened = source()
         groups, store = cache(partial(look, config, opened)), FoldStore(config.out, {**opened.what, "data": data})
@@ -102,6 +106,8 @@ def compare_viewing(config: ViewingConfig) -> None:
             )
             if config.sequences:
                 drawn |= _sequences(name, store, folds, config)
+            if config.glimpses:
+                seen = glimpsed(name, opened, config.pictures[0], store, folds, config.glimpses)
     plain, store = cache(lambda: [_without_maps(group) for group in groups()]), FoldStore(config.out, {"data": data})
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
@@ -111,6 +117,7 @@ def compare_viewing(config: ViewingConfig) -> None:
         "viewing": viewing_table(rows),
         "viewing terms": terms_table(rows),
         "viewing splits": splits_table(splits),
+        "viewing glimpses": glimpses_table(seen),
         "viewing sequences": sequences_table(drawn),
     }
     text = "\n".join(["\n".join([f"## {name}", "", *lines, ""]) for name, lines in tables.items()])

@@ -23,6 +23,8 @@ _EVENTS = 12
 _SCORED = 40
 """Fixations of a picture on which conditional densities are scored, drawn at random."""
 
+MapsOfPicture = Tensor | Callable[[Events], Tensor]
+"""Map of a picture, `(1, rows, columns)`, one for each person, or what gives one for each event."""
 _Pictures = Sequence[Sequence[int]]
 """Pictures of each group."""
 
@@ -206,7 +208,7 @@ def fit_oculomotor(
             chosen, corner = _drawn(events[number][picture], size, generator)
             if not len(chosen.cell):
                 continue
-            terms = {"map": _for_people(maps[number][places[number][picture]], chosen), "centre bias": centre[None]}
+            terms = {"map": _for_events(maps[number][places[number][picture]], chosen), "centre bias": centre[None]}
             log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
             rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
             target = rows // corner[2] * log.shape[-1] + columns // corner[2]
@@ -220,8 +222,10 @@ def fit_oculomotor(
     )  # fmt: skip
 
 
-def _for_people(maps: Tensor, events: Events) -> Tensor:
-    """The map of each event: that of its person, or the one map of the picture."""
+def _for_events(maps: MapsOfPicture, events: Events) -> Tensor:
+    """The map of each event."""
+    if not isinstance(maps, Tensor):
+        return maps(events)
     return maps if len(maps) == 1 else maps[events.person]
 
 
@@ -242,7 +246,7 @@ def _drawn(events: Events, size: tuple[int, int], generator: torch.Generator) ->
 def score(
     model: FixationDensity,
     group: Viewed,
-    maps: Sequence[Tensor],
+    maps: Sequence[MapsOfPicture],
     pictures: Sequence[int],
     *,
     conditional: bool,
@@ -252,8 +256,7 @@ def score(
     """NSS, AUC and log likelihood in bits above uniform of the fixations of pictures, means of each `(P, 3)`.
 
     One result for each set of terms to leave out. Densities are sums over the bins of a raster of `(columns, rows)`;
-    fixations are all but the first of each path, and of these some where the scanpath is given. Maps are those of
-    `fit_oculomotor`.
+    fixations are all but the first of each path, and of these some where the scanpath is given.
     """
     size, generator = group.size, torch.Generator().manual_seed(0)
     rows: list[list[Tensor]] = [[] for _ in without]
@@ -262,10 +265,11 @@ def score(
         events = events_of(group.paths[picture], size, raster[::-1])
         if conditional:
             events = events.some(torch.randperm(len(events.cell), generator=generator)[:_SCORED])
-        given: dict[str, Tensor] = {**terms, "map": _for_people(one, events)}
+        given: dict[str, Tensor] = {**terms, "map": _for_events(one, events)}
         given = model.given(given, size, events.before) if conditional else given
         for left_out, scored in zip(without, rows, strict=True):
-            log = sum((term for name, term in given.items() if name not in left_out), torch.zeros_like(one[:1]))
+            kept = [term for name, term in given.items() if name not in left_out]
+            log = sum(kept, torch.zeros_like(given["map"][:1]))
             density = cell_saliency((log - log.flatten(1).logsumexp(1)[:, None, None]).exp(), *raster)
             density = (density / density.sum(1, keepdim=True)).expand(len(events.cell), -1)
             scored.append(_scores(density, events.cell))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from eval.human import main as compare
 from eval.human.folds import StudiedFold, others_of, viewed_by
+from eval.human.glimpses import so_far
 from eval.human.viewing import covering
 from semfov import InputError, saliency
 from semfov.cli.main import main
@@ -110,6 +112,19 @@ def test_scores_equal_the_measures_of_scanpaths(group):
     x, y = cell % 52, cell // 52
     expected = [nss(log.exp(), x, y).mean(), auc(log, x, y).mean(), log_likelihood(log, x, y).mean()]
     np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-4)
+
+
+def test_views_that_are_all_sharp_show_what_the_sharp_picture_shows(group):
+    torch.manual_seed(1)
+    model = saliency.FixationDensity({"backbone8": 3}, centre=torch.randn(39, 52)).requires_grad_(False)
+    views = group.some([2, 2, 2])
+    seen = partial(so_far, model, views, torch.tensor([[5.0, 5.0], [70.0, 5.0], [40.0, 50.0]]), SIZE)
+    sharp = maps_of(model, group, [2])[0]
+    torch.testing.assert_close(seen(events_of(group.paths[2], SIZE, (3, 4)))[5:6], sharp)
+    one, other = (score(model, group, [each], [2], conditional=True)[0] for each in (sharp, seen))
+    torch.testing.assert_close(one, other)
+    views.maps["backbone8"].zero_()
+    assert not score(model, group, [seen], [2], conditional=True)[0].allclose(one)
 
 
 def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
@@ -251,7 +266,18 @@ def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, 
     page = tmp_path / "page.md"
     page.write_text("<!-- table viewing -->\n<!-- end -->\n")
     words = [word.replace("gaze.", "") for word in words]
-    more = ["--detectors", "[colours]", "--saliency", "[vocus2]", "--studied", "0", "--sequences", "2"]
+    more = [
+        "--detectors",
+        "[colours]",
+        "--saliency",
+        "[vocus2]",
+        "--studied",
+        "0",
+        "--sequences",
+        "2",
+        "--glimpses",
+        "1",
+    ]
     more += ["--out", str(tmp_path / "viewing"), "--page", str(page)]
     assert compare(["viewing", *words, *more]) == 0, capsys.readouterr().err
     lines = page.read_text().splitlines()
@@ -260,4 +286,6 @@ def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, 
         "colours, with oculomotor biases", "centre bias, with oculomotor biases",
         "inter-observer, with oculomotor biases",
     ]  # fmt: skip
-    assert "half of the people" in (tmp_path / "viewing/summary.md").read_text()
+    summary = (tmp_path / "viewing/summary.md").read_text()
+    assert "half of the people" in summary
+    assert "| without oculomotor biases | " in summary
