@@ -283,20 +283,6 @@ def _ssd_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
 
 
-def _retinanet_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
-    """RetinaNet (Lin et al. 2017): the best anchors of every level, with a sigmoid for each class."""
-    outputs, anchors, pixels = _dense(model, images)
-    scores = outputs["cls_logits"].sigmoid()
-    return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode_single)
-
-
-def _fcos_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
-    """FCOS (Tian et al. 2019): the best points of every level, with the scores `√(σ(class) σ(centreness))`."""
-    outputs, anchors, pixels = _dense(model, images)
-    scores = (outputs["cls_logits"].sigmoid() * outputs["bbox_ctrness"].sigmoid()).sqrt()
-    return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode)
-
-
 def _features(model: Any, images: Any) -> dict[str, Tensor]:
     features = model.backbone(images.tensors)
     return {"0": features} if isinstance(features, Tensor) else features
@@ -310,17 +296,16 @@ def _dense(model: Any, images: Any) -> tuple[dict[str, Tensor], list[Tensor], li
     return outputs, anchors, [feature.shape[-1] * feature.shape[-2] for feature in features]
 
 
-def _best_of_levels(
-    model: Any,
-    images: Any,
-    outputs: dict[str, Tensor],
-    anchors: list[Tensor],
-    pixels: Sequence[int],
-    scores: Tensor,
-    backgrounds: int,
-    decode: Callable[[Tensor, Tensor], Tensor],
-) -> _Raw:
-    """The `topk_candidates` anchors of each level with the highest class score; the model's own are among these."""
+def _level_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
+    """RetinaNet (Lin et al. 2017) and FCOS (Tian et al. 2019): of every level the anchors with the best class.
+
+    Scores are a sigmoid for each class, of FCOS `√(σ(class) σ(centreness))`. There are `topk_candidates` of each level;
+    the model's own are among these.
+    """
+    outputs, anchors, pixels = _dense(model, images)
+    scores, decode = outputs["cls_logits"].sigmoid(), model.box_coder.decode_single
+    if "bbox_ctrness" in outputs:
+        scores, decode = (scores * outputs["bbox_ctrness"].sigmoid()).sqrt(), model.box_coder.decode
     raw: _Raw = []
     each = len(anchors[0]) // sum(pixels)
     for regression, score, anchor, size in zip(
@@ -349,8 +334,8 @@ def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool] |
     for kind, function, softmax in (
         (FasterRCNN, _roi_outputs, True),
         (SSD, _ssd_outputs, True),
-        (RetinaNet, _retinanet_outputs, False),
-        (FCOS, _fcos_outputs, False),
+        (RetinaNet, _level_outputs, False),
+        (FCOS, _level_outputs, False),
     ):
         if isinstance(model, kind):
             return function, softmax
