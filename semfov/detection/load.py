@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import fields
 from inspect import Parameter, signature
 from os import PathLike, fspath
 from pathlib import Path
@@ -35,6 +36,9 @@ _OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".
 """Ends of the names of models in formats that are not read."""
 
 _EXPORT = "export it with: yolo export model={}.pt format=onnx"
+
+_SELECTING = [each.name for each in fields(Selection)]
+"""Options of the selection of boxes, which all loaders have."""
 
 DetectorLike = str | PathLike[str] | nn.Module
 """What `load_detector` takes: the name or file of a detector, a `Detector`, or a model of another library."""
@@ -94,7 +98,9 @@ def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, opti
             raise InputError(
                 f"device: expected a device of PyTorch, such as cpu or cuda, got {options['device']!r}"
             ) from None
-    return load(model, **options)
+    chosen = {name: value for name, value in options.items() if name in _SELECTING}
+    others = {name: value for name, value in options.items() if name not in _SELECTING}
+    return load(model, selection=Selection(**chosen), **others)
 
 
 def _loader(name: str) -> Callable[..., Detector]:
@@ -149,7 +155,8 @@ def _options_of(load: Callable[..., Detector]) -> list[str]:
 
     loaders = (load, wrap_transformers) if load is load_hub else (load,)
     options = (each for loader in loaders for each in signature(loader).parameters.values())
-    return [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
+    names = [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
+    return [each for name in names for each in (_SELECTING if name == "selection" else [name])]
 
 
 def loader_options() -> list[str]:
@@ -205,10 +212,7 @@ def load_yolo(
     input_size: int | tuple[int, int] | None = None,
     stride: int | None = 32,
     background: BackgroundPolicy = "residual",
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     runtime: Runtime = "auto",
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
@@ -231,7 +235,7 @@ def load_yolo(
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         stride=stride,
         background=background,
-        selection=Selection(threshold, iou, limit, per_class),
+        selection=selection,
         digest=digest,
         runtime=runtime,
     )

@@ -200,10 +200,7 @@ def load_onnx(
     preprocessing: Preprocessing | Mapping[str, Any] | None = None,
     logits: bool | None = None,
     background: BackgroundPolicy | None = None,
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     threads: int | None = None,
     device: torch.device | str = "cpu",
     providers: Sequence[Provider] | None = None,
@@ -268,7 +265,7 @@ def load_onnx(
         preprocessing=preprocessing,
         logits=chosen.get("logits", False),
         background=chosen.get("background"),
-        selection=Selection(threshold, iou, limit, per_class),
+        selection=selection,
         digest=_model_digest(file),
     )
 

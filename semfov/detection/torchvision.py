@@ -128,10 +128,7 @@ def wrap_torchvision(
     name: str = "torchvision",
     first: int = 1,
     background: BackgroundPolicy | None = None,
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     device: torch.device | str | None = None,
 ) -> _TorchvisionDetector:
     """Make a detector of a torchvision detection model."""
@@ -148,7 +145,7 @@ def wrap_torchvision(
         name=name,
         first=first,
         background=background,
-        selection=Selection(threshold, iou, limit, per_class),
+        selection=selection,
         digest=module_digest(model),
     ).eval()
 
@@ -160,10 +157,7 @@ def load_torchvision(
     classes: Sequence[str] | None = None,
     first: int = 1,
     background: BackgroundPolicy | None = None,
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     device: torch.device | str = "cpu",
     **model: Any,
 ) -> _TorchvisionDetector:
@@ -198,7 +192,7 @@ def load_torchvision(
         name=PREFIX + name,
         first=first,
         background=background,
-        selection=Selection(threshold, iou, limit, per_class),
+        selection=selection,
         digest=digest,
     ).eval()
 

@@ -134,14 +134,11 @@ def wrap_transformers(
     name: str | None = None,
     processor: Mapping[str, Any] | None = None,
     background: BackgroundPolicy | None = None,
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     device: torch.device | str | None = None,
 ) -> _TransformersDetector:
     """Make a detector of an object detection model of transformers."""
-    placed, selection = model if device is None else model.to(device), Selection(threshold, iou, limit, per_class)
+    placed = model if device is None else model.to(device)
     options = {"selection": selection, "digest": module_digest(model)}
     return _TransformersDetector(placed, classes, name, processor, background, **options).eval()
 

@@ -47,10 +47,7 @@ def wrap_ultralytics(
     name: str = "ultralytics",
     input_size: int | tuple[int, int] = 640,
     background: BackgroundPolicy = "residual",
-    threshold: float = 0.02,
-    iou: float = 0.5,
-    limit: int = 100,
-    per_class: bool = False,
+    selection: Selection | None = None,
     device: torch.device | str | None = None,
 ) -> _UltralyticsDetector:
     """Make a detector of a model of Ultralytics; input_size `(width, height)`."""
@@ -61,7 +58,7 @@ def wrap_ultralytics(
         name=name,
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         background=background,
-        selection=Selection(threshold, iou, limit, per_class),
+        selection=selection,
         digest=module_digest(network),
     ).eval()
 
