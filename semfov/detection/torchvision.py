@@ -297,9 +297,10 @@ def _level_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     the model's own are among these.
     """
     outputs, anchors, pixels = _dense(model, images)
-    scores, decode = outputs["cls_logits"].sigmoid(), model.box_coder.decode_single
-    if "bbox_ctrness" in outputs:
-        scores, decode = (scores * outputs["bbox_ctrness"].sigmoid()).sqrt(), model.box_coder.decode
+    scores, centred = outputs["cls_logits"].sigmoid(), "bbox_ctrness" in outputs
+    if centred:
+        scores = (scores * outputs["bbox_ctrness"].sigmoid()).sqrt()
+    decode = model.box_coder.decode if centred else model.box_coder.decode_single
     raw: _Raw = []
     each = len(anchors[0]) // sum(pixels)
     for regression, score, anchor, size in zip(
