@@ -80,7 +80,7 @@ class WindowGaze(Gazes):
         """The probability that closer looks find an object, and how closely each place was looked at."""
         lattice, belief = self.glances.lattice, self.looking.belief
         assert belief is not None
-        expected = [belief.expected(level) for level in range(1, lattice.levels)]
+        expected = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
         # Objects of each place: the mean of its cells times their number.
         count = adaptive_avg_pool2d(most[None], self.shape) * most.numel() / (self.shape[0] * self.shape[1])

@@ -360,11 +360,6 @@ class Record(Conversion):
             (x, y), pixels = look.fixation, read_region(source, (x1, y1, x2, y2), self.size, across)
             yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
 
-    @property
-    def values_in_words(self) -> str:
-        """What the values of the looks are; empty where their columns tell it."""
-        return ""
-
     def sensor_in_words(self) -> str | None:
         """Describe through what was looked.
 

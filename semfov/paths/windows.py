@@ -60,19 +60,6 @@ VALUES: dict[str, Json] = {
 }
 """JSON values of the files of looks at windows."""
 
-_NUMBER = (
-    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
-    "looks would then show. "
-)
-"""What values of windows mean where objects are counted (`semfov.zoom.policy.best_find`)."""
-
-_PROBABILITY = (
-    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
-    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
-    "is the probability, before it, that the target is at the place. "
-)
-"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
-
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ZoomPath(Record):
@@ -227,11 +214,6 @@ class ZoomPath(Record):
             more = {"magnification": window.fixation[2], "level": window.level}
             point, region = window.centre(self.lattice), window.region(self.lattice)
             yield RecordedLook(number, point, region, glance.detections, seconds, chosen, more)
-
-    @property
-    def values_in_words(self) -> str:
-        """What the values of looks are (`semfov.zoom.policy`)."""
-        return _NUMBER if self.decision is None else _PROBABILITY
 
     def sensor_in_words(self) -> str:
         """Describe the windows of the lattice."""

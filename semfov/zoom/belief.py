@@ -6,7 +6,6 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -212,29 +211,20 @@ class ZoomBelief:
                 np.copyto(values, cells[step] if 0 <= step < STEPS else 0, where=newer)
             rated[newer] = look.level
 
-    def expected(self, level: int) -> Tensor:
-        """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
-        return torch.from_numpy(self._expected(level))
-
     def remaining(self) -> tuple[float, float]:
         """Number of objects that looks are still expected to find: in each cell those of the level that finds most."""
         levels = range(1, self.lattice.levels)
         if not levels:
             return 0.0, 0.0
-        expected = np.maximum.reduce([self._expected(level) for level in levels])
+        expected = np.maximum.reduce([self.expected(level) for level in levels])
         clear = float(expected[expected >= _CLEAR].sum())
         return clear, float(expected.sum()) - clear
 
-    def _expected(self, level: int, at: Place = _EVERYWHERE) -> Cells:
-        """`expected` in some rows and columns."""
+    def expected(self, level: int, at: Place = _EVERYWHERE) -> Cells:
+        """Number of objects that looks of a level are expected to find in each cell, in some rows and columns."""
         self._predict()
         expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
         return expected
-
-    def _unseen(self, level: int, at: Place) -> NDArray[np.bool_]:
-        """Whether no look has shown a cell at a level or closer, in some rows and columns."""
-        unseen: NDArray[np.bool_] = self.source.numpy()[at] < level
-        return unseen
 
     def value(self, level: int, foresight: float) -> Cells:
         """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`); → `(down, across)`."""
@@ -259,10 +249,11 @@ class ZoomBelief:
     def _sum(self, level: int, octaves: int) -> Cells:
         """Sums over the windows of a level; → `(down, across)`."""
         if (level, octaves) not in self._sums:
+            source = self.source.numpy()  # where it is below a level, no look has shown a cell at it or closer
             cells: Callable[[Place], Cells] = (
-                lambda at: self.left.numpy()[at] * self._unseen(level, at),
-                lambda at: self._expected(level, at),
-                lambda at: self._expected(level + 1, at) * self._unseen(level, at),
+                lambda at: self.left.numpy()[at] * (source[at] < level),
+                lambda at: self.expected(level, at),
+                lambda at: self.expected(level + 1, at) * (source[at] < level),
             )[octaves]
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)

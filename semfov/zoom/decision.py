@@ -45,7 +45,15 @@ class _LookFacts(NamedTuple):
 
 
 class SearchFacts:
-    """What the looks of a search have shown of the target, and what is left to see."""
+    """What the looks of a search have shown of the target, and what is left to see.
+
+    `best` is the highest score of the target in any look, and `box` `(4,)` that of the detection with the highest one,
+    None if there is none. `detected` tells whether a detection shows it, so that a search can name a box as found.
+    """
+
+    best: float
+    box: Tensor | None
+    detected: bool
 
     def __init__(self, belief: ZoomBelief) -> None:
         self.belief = belief
@@ -61,22 +69,9 @@ class SearchFacts:
     def add(self, glance: Glance) -> None:
         """Add the facts of a look."""
         self.looks.append(_LookFacts.of(glance, self.belief.target, self.belief.lattice))
-
-    @property
-    def best(self) -> float:
-        """Highest score of the target in any look."""
-        return max(look.score for look in self.looks)
-
-    @property
-    def box(self) -> Tensor | None:
-        """Box `(4,)` of the detection with the highest score of the target; None if there is none."""
-        best = max(self.looks, key=lambda look: look.found)
-        return best.box if best.found > 0 else None
-
-    @property
-    def detected(self) -> bool:
-        """Whether a detection shows the target, so that a search can name a box as found."""
-        return any(look.found >= DETECTION_SCORE for look in self.looks)
+        self.best = max(look.score for look in self.looks)
+        shown = max(self.looks, key=lambda look: look.found)
+        self.box, self.detected = shown.box if shown.found > 0 else None, shown.found >= DETECTION_SCORE
 
     def case(self, ahead: float) -> Tensor:
         """Facts about the search for `GlimpseEvidence.anywhere`; → `(10,)`.
