@@ -1,5 +1,6 @@
 """The expected gain of a look from each pose and fixation, and acquisition functions of a head that use it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import chain
 
@@ -28,13 +29,17 @@ OUT = -1e6
 """Value of actions that must not be chosen."""
 
 
-class LookGain(nn.Module):
-    """Base of the expected gains `(A,)` of all actions from given poses; the values of others have no meaning."""
+class LookGain(nn.Module, ABC):
+    """Base of the expected gains of a look."""
 
     def __init__(self, views: Views) -> None:
         super().__init__()
         self.views = views
         self._acuity = [views.acuity(distance) for distance in views.distances]
+
+    @abstractmethod
+    def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
+        """Gains `(A,)` of all actions from the given poses; the values of other actions have no meaning."""
 
 
 class SearchGain(LookGain):
@@ -164,7 +169,7 @@ class PerSecond(AcquisitionFunction):
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(1, A)`."""
         views = self.gain.views
-        values: Tensor = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
+        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
         allowed = torch.zeros(len(views), dtype=torch.bool)
         allowed[self.poses] = True
         if self.speeds is not None:

@@ -10,7 +10,6 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
@@ -21,7 +20,6 @@ from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
 
 WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
-SIDE = Number(low=1, high=10_000, whole=True)
 
 _DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
 _CLOSER = {
@@ -78,18 +76,6 @@ _OTHERS = {
 def pair(of: Json) -> Array:
     """Requirements of two values of one kind."""
     return Array(of, 2)
-
-
-def grid_values(grid: Grid) -> dict[str, Any]:
-    """The JSON values of a grid."""
-    size = grid.size.tolist() if isinstance(grid.size, Tensor) else list(grid.size)
-    return {"grid": [grid.columns, grid.rows], "size": size}
-
-
-def grid_from(record: Mapping[str, Any]) -> Grid:
-    """The grid with these JSON values."""
-    columns, rows = record["grid"]
-    return Grid(columns, rows, tuple(record["size"]))
 
 
 class Format:

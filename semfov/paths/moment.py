@@ -20,7 +20,8 @@ from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Number, Object
 from semfov.paths.base import Record
-from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.cells import GRID, CellRecord
+from semfov.paths.files import FARTHEST, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook, cell_columns
 from semfov.paths.windows import TENSORS, VALUES, WINDOW, ZoomPath, window_from, window_values
 from semfov.zoom.glances import Window
@@ -34,17 +35,13 @@ _FOVEA = Format(
     },
     {
         "number": WHOLE,
-        "grid": pair(SIDE),
-        "size": pair(POSITIVE),
+        **GRID,
         "cell": WHOLE,
         "next_cell": WHOLE,
         "seconds": Array(Object({}, Number(low=0)), 1),
     },
 )
 """Format of the files of moments of a fovea."""
-
-_PLAIN = "number", "cell", "next_cell"
-_TENSORS = "fixation", "probability", "visited"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -125,7 +122,7 @@ class Moment(Record):
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class FoveaMoment(Moment):
+class FoveaMoment(CellRecord, Moment):
     """Look, belief and decision at one frame that a fovea looks at.
 
     Beside the attributes of `Moment` it has those of its look.
@@ -148,29 +145,22 @@ class FoveaMoment(Moment):
         print(moment.decision.outcome, moment.probability.max())
     """
 
-    grid: Grid
     cell: int
     fixation: Tensor
     probability: Tensor
     visited: Tensor
     next_cell: int
-    seconds: tuple[Mapping[str, float]]
     belief: Belief | None = field(default=None, compare=False)
 
-    how = "fovea"
     _format = _FOVEA
+    _tensors = "fixation", "probability", "visited"
+    _plain = "number", "cell", "next_cell"
 
     @property
     def next_point(self) -> tuple[float, float]:
         """`(x, y)` in pixels, the centre of the next cell."""
         x, y = self.grid.centres[self.next_cell].tolist()
         return x, y
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the frame in pixels."""
-        width, height = (int(side) for side in self.grid.extent)
-        return width, height
 
     def _looks(self) -> Iterator[RecordedLook]:
         """The look at the frame, with the whole frame as its region."""
@@ -194,25 +184,17 @@ class FoveaMoment(Moment):
         row, column = divmod(self.cell, self.grid.columns)
         return [f"frame {self.number}, at (column, row): ({column}, {row})"]
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        record = {name: getattr(self, name) for name in _PLAIN} | grid_values(self.grid)
-        return {name: getattr(self, name) for name in _TENSORS}, {**record, "seconds": [dict(self.seconds[0])]}
-
     @classmethod
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        grid, looks = grid_from(record), shared["detections"]
-        check(len(looks) == 1, "lengths", "one look", len(looks))
-        check(len(tensors["visited"]) == len(grid), "visited", f"{len(grid)} cells", len(tensors["visited"]))
+        check(len(shared["detections"]) == 1, "lengths", "one look", len(shared["detections"]))
+        made = super()._fields(tensors, record, shared)
+        cells, visited = len(made["grid"]), len(tensors["visited"])
+        check(visited == cells, "visited", f"{cells} cells", visited)
         for name in ("cell", "next_cell"):
-            check(record[name] < len(grid), name, f"a cell number below {len(grid)}", record[name])
-        return {
-            **{name: tensors[name] for name in _TENSORS},
-            **{name: record[name] for name in _PLAIN},
-            "seconds": tuple(record["seconds"]),
-            "grid": grid,
-        }
+            check(record[name] < cells, name, f"a cell number below {cells}", record[name])
+        return made
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -21,8 +21,8 @@ from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
-from semfov.paths.base import Record
-from semfov.paths.files import FARTHEST, POSITIVE, SIDE, WHOLE, Format, grid_from, grid_values, pair
+from semfov.paths.cells import GRID, CellRecord
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
 
@@ -43,8 +43,6 @@ _SETTINGS = Object(
     ("sensor", "detector"),
 )
 _PLACEMENT = {"size": pair(POSITIVE), "scale": pair(POSITIVE), "offset": pair(WHOLE)}
-_TENSORS = "cells", "fixations", "probabilities", "values"
-_OPTIONAL = "posterior", "presence"
 
 _FORMAT = Format(
     "scanpath",
@@ -58,8 +56,7 @@ _FORMAT = Format(
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
     {
-        "grid": pair(SIDE),
-        "size": pair(POSITIVE),
+        **GRID,
         "seconds": Array(Object(dict.fromkeys(STAGES, Number(low=0)), Number(low=0))),
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
         "settings": Maybe(_SETTINGS),
@@ -87,7 +84,7 @@ class _MadeWhenRead:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Scanpath(Record):
+class Scanpath(CellRecord):
     """Fixations of one episode in order, with the detections and the belief at each of them.
 
     A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
@@ -115,18 +112,16 @@ class Scanpath(Record):
         scanpath.save("scanpath.safetensors")
     """
 
-    grid: Grid
     cells: Tensor
     fixations: Tensor
     probabilities: Tensor = _MadeWhenRead()  # type: ignore[assignment]
     values: Tensor
     posterior: Tensor | None = None
     presence: Tensor | None = None
-    seconds: tuple[Mapping[str, float], ...] = ()
     stimulus: Stimulus | None = None
 
-    how = "fovea"
     _format = _FORMAT
+    _tensors = "cells", "fixations", "probabilities", "values", "posterior", "presence"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "probabilities": self.probabilities}
@@ -134,12 +129,6 @@ class Scanpath(Record):
     def __len__(self) -> int:
         """Number of fixations, the start included."""
         return len(self.cells)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the photograph in pixels."""
-        width, height = (int(side) for side in self.grid.extent)
-        return width, height
 
     @property
     def shifts(self) -> int:
@@ -255,13 +244,8 @@ class Scanpath(Record):
         return [f"at (column, row): {' '.join(path)} of {of}"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        tensors = {name: getattr(self, name) for name in (*_TENSORS, *_OPTIONAL) if getattr(self, name) is not None}
-        record: dict[str, Any] = {
-            **grid_values(self.grid),
-            "seconds": [dict(each) for each in self.seconds],
-            "placement": None,
-            "settings": None,
-        }
+        tensors, record = super()._contents()
+        record |= {"placement": None, "settings": None}
         if self.stimulus is not None:
             tensors["canvas"] = self.stimulus.canvas
             record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
@@ -272,22 +256,11 @@ class Scanpath(Record):
     def _fields(
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
-        grid, cells, seconds = grid_from(record), tensors["cells"], record["seconds"]
-        check(tensors["values"].shape[-1] == len(grid), "values", f"one for each of {len(grid)} cells",
-              tensors["values"].shape[-1])  # fmt: skip
-        check(int(cells.max()) < len(grid), "cells", f"cell numbers below {len(grid)}", int(cells.max()))
-        check(len(seconds) in (0, len(cells)), "seconds", f"times of {len(cells)} looks, or none", len(seconds))
-        decision = shared["decision"]
-        cell = None if decision is None else decision.cell
-        check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
-        for look in shared["closer"]:
-            check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
-        return {
-            "grid": grid,
-            **{name: tensors.get(name) for name in (*_TENSORS, *_OPTIONAL)},
-            "seconds": tuple(seconds),
-            "stimulus": Stimulus.restored(tensors, record),
-        }
+        made = super()._fields(tensors, record, shared)
+        cells, most, values = len(made["grid"]), int(tensors["cells"].max()), tensors["values"].shape[-1]
+        check(values == cells, "values", f"one for each of {cells} cells", values)
+        check(most < cells, "cells", f"cell numbers below {cells}", most)
+        return {**made, "stimulus": Stimulus.restored(tensors, record)}
 
 
 class Trace:
