@@ -6,7 +6,7 @@ import torch
 
 from semfov.belief import Verification
 from semfov.belief.observers import AnyOf, LearnedMap, Semantic, Target
-from tests.base_tester import GraphTester, make_testers
+from tests.base_tester import GraphTester, Host, make_testers
 from tests.small import GRID, detections, evidence, look, mapping, model, observing, rand
 
 
@@ -67,6 +67,15 @@ class ObserverTester(LookTester):
         return self.host(partial(self.call, looks=1))
 
 
+class TestAnyOf(ObserverTester):
+    def make(self):
+        return AnyOf(Target(evidence()), {1: 0.3, 2: 1.0})
+
+    def traced(self):
+        """All classes have the same graph."""
+        return Host(AnyOf(Target(evidence()), {2: 1.0}), partial(self.call, looks=1))
+
+
 class PartTester(ObserverTester):
     """An observer that is traced as a part of another one."""
 
@@ -82,7 +91,6 @@ globals().update(
         {
             "Semantic": observing,
             "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
-            "AnyOf": lambda: AnyOf(Target(evidence()), {1: 0.3, 2: 1.0}),
             "AnyOfOneMap": lambda: AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0}),
         },
     )

@@ -1,5 +1,6 @@
 """Acquisition functions, policies and saliency models as submodules of other modules."""
 
+import pytest
 import torch
 
 from semfov import DirichletBelief, acquisition, policies, saliency
@@ -164,7 +165,15 @@ class TestOculomotorBias(GraphTester):
         return rand(2, 4, 2), rand(5, 2)
 
 
-class TestVOCUS2(GraphTester):
+class SaliencyTester(GraphTester):
+    """Tests of a model with which studies compare: its graph is long to trace."""
+
+    @pytest.mark.lab
+    def test_export(self):
+        super().test_export()
+
+
+class TestVOCUS2(SaliencyTester):
     autocast = 0.05
 
     def make(self):
@@ -174,7 +183,7 @@ class TestVOCUS2(GraphTester):
         return (rand(2, 3, 40, 60),)
 
 
-class TestIttiKoch(GraphTester):
+class TestIttiKoch(SaliencyTester):
     def make(self):
         return saliency.IttiKoch()
 

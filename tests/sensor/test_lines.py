@@ -11,7 +11,7 @@ from tests.small import rand
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     tiles=st.integers(1, 10),
     tile=st.integers(1, 16),
