@@ -212,7 +212,7 @@ class Eye(StatedModule):
         sides = window[2:] - window[:2]
         scale = (sides.new_tensor(self.detector.input_size) / sides).amin()
         width, height = (max(1, round(side)) for side in (sides * scale).tolist())
-        detections = self.detector(glimpse(image, window[None], (width, height)).clamp(0, 1))
+        detections = self.detector(glimpse(image, window[None], (width, height)).clamp_(0, 1))
         unit = (sides / sides.new_tensor([width, height])).repeat(2)
         return replace(detections, boxes=detections.boxes * unit + window[:2].repeat(2))
 

@@ -202,7 +202,8 @@ class Sensor(StatedModule, ABC):
 def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
     """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""
     views = [view(b, g) for b in range(batch) for g in range(many)]
-    whole = torch.stack(views) if views else empty[None].expand(0, *empty.shape)
+    one = views[0] if views else empty
+    whole = torch.stack(views) if len(views) > 1 else one[None].expand(len(views), *one.shape)
     return whole.reshape(batch, many, *whole.shape[1:])
 
 

@@ -75,7 +75,7 @@ def glimpse(
     def view(b: int, g: int) -> Tensor:
         return _window(image[b], windows[b, g], size, padding_mode, value)
 
-    result = stacked_views(view, batch, windows.shape[1], image.new_zeros(image.shape[1], size[1], size[0]))
+    result = stacked_views(view, batch, windows.shape[1], image.new_empty(image.shape[1], size[1], size[0]))
     return result if boxes.ndim == 3 else result[:, 0]
 
 

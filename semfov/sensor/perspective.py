@@ -53,7 +53,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     def view(b: int, g: int) -> Tensor:
         return sample(source[b], poses[b, g], size, antialias=antialias)
 
-    result = stacked_views(view, batch, poses.shape[1], panorama.new_zeros(panorama.shape[1], size[1], size[0]))
+    result = stacked_views(view, batch, poses.shape[1], panorama.new_empty(panorama.shape[1], size[1], size[0]))
     return result if pose.ndim == 3 else result[:, 0]
 
 
