@@ -206,15 +206,13 @@ def _index(value: object, classes: int, argument: str) -> int:
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:
     """The message for an unknown class, with the classes that may be meant."""
     names = list(dict.fromkeys(meant))
-    hint = f"did you mean {' or '.join(map(repr, names))}?" if names else f"known: {_few(classes)}"
+    if names:
+        hint = f"did you mean {' or '.join(map(repr, names))}?"
+    elif len(classes) <= _MOST_NAMED:
+        hint = f"known: {', '.join(classes)}"
+    else:
+        hint = f"known: {', '.join(classes[:5])} and {len(classes) - 5} more; agent.classes lists them"
     return f"{argument}: unknown class {name!r}; {hint}"
-
-
-def _few(classes: Sequence[str]) -> str:
-    """The classes, or of many the first ones and where the others are listed."""
-    if len(classes) <= _MOST_NAMED:
-        return ", ".join(classes)
-    return f"{', '.join(classes[:5])} and {len(classes) - 5} more; agent.classes lists them"
 
 
 def _plain_key(name: str) -> str:

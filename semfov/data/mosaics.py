@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
@@ -93,19 +92,16 @@ class Mosaics(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        pairs = [(tile, self.scenes.annotation(tile.scene)) for tile in self.tiles(index)]
-        boxes = torch.cat([_moved(annotation, tile) for tile, annotation in pairs])
-        labels = torch.cat([annotation.labels for _, annotation in pairs])
-        return Annotation(boxes, labels, torch.cat([annotation.crowd for _, annotation in pairs]), self.size)
+        boxes, labels, crowd = [], [], []
+        for tile in self.tiles(index):
+            part, (x1, y1, x2, y2) = self.scenes.annotation(tile.scene), tile.box
+            scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)
+            boxes.append(part.boxes * scale + part.boxes.new_tensor([x1, y1] * 2))
+            labels.append(part.labels)
+            crowd.append(part.crowd)
+        return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""
         tiles = [(self.scenes.digest(tile.scene), tile.box) for tile in self.tiles(index)]
         return json_sha256([_VERSION, self.size, self.fill, tiles])
-
-
-def _moved(part: Annotation, tile: _Tile) -> Tensor:
-    """Boxes of a photograph `(M, 4)` in pixels of the mosaic."""
-    x1, y1, x2, y2 = tile.box
-    scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)
-    return part.boxes * scale + part.boxes.new_tensor([x1, y1] * 2)

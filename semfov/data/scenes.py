@@ -159,12 +159,16 @@ class EmbeddedScenes(ComposedScenes):
         return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
 
     def _pixels(self, index: int) -> NDArray[np.uint8]:
+        from PIL import Image
+
         generator = self._generator(index)
         items = _layout(generator)
         canvas = _background(generator)
         for item in items:
             x1, y1, x2, y2 = item.patch
-            patch = _cut_out(item.photograph, (x2 - x1, y2 - y1))
+            photograph = Image.fromarray(_photograph(item.photograph.package, item.photograph.file))
+            size, crop = (x2 - x1, y2 - y1), item.photograph.crop
+            patch = np.asarray(photograph.resize(size, Image.Resampling.LANCZOS, box=crop))
             canvas[y1:y2, x1:x2] = patch[:, ::-1] if item.mirrored else patch
         return canvas
 
@@ -213,13 +217,6 @@ def _texture(file: str) -> NDArray[np.int64]:
     grey = _photograph("skimage", file)[..., 0].astype(np.int64)
     mirrored = np.concatenate([grey, grey[:, ::-1]], axis=1)
     return (mirrored - grey.sum() // grey.size)[: _SIZE[1], : _SIZE[0]]
-
-
-def _cut_out(photograph: _Photograph, size: tuple[int, int]) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    pixels = Image.fromarray(_photograph(photograph.package, photograph.file))
-    return np.asarray(pixels.resize(size, Image.Resampling.LANCZOS, box=photograph.crop))
 
 
 @cache

@@ -402,7 +402,10 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
             data = bytearray(file.read(longest + 1))
     except OSError as error:
         raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
-    start = _header(data)
+    start = 20
+    if len(data) >= 12:
+        major, minor, _ = struct.unpack_from("<3i", data)
+        start = 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
     needed = start + 4 * sum(_count(layer) for layer in layers)
     if length != needed or len(data) != needed:
         fault = "truncated" if length < needed else "too long"
@@ -417,13 +420,6 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     for layer in layers:
         numbers = _fill(layer, numbers, str(path))
     return hashlib.sha256(data).hexdigest()
-
-
-def _header(data: bytearray) -> int:
-    if len(data) < 12:
-        return 20
-    major, minor, _ = struct.unpack_from("<3i", data)
-    return 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
 
 
 def _count(layer: Convolution) -> int:

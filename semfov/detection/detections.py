@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from semfov.detection.exchange import category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, check_shape, check_whole
@@ -129,18 +130,11 @@ class Detections:
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
         longest = max(d.mask.shape[-1] for d in images)
-        padded = [d._pad(longest) for d in images]
+        missing = [longest - d.mask.shape[-1] for d in images]
         return cls(
-            torch.cat([d.boxes for d in padded]),
-            torch.cat([d.scores for d in padded]),
-            torch.cat([d.mask for d in padded]),
-        )
-
-    def _pad(self, length: int) -> Self:
-        extra = length - self.mask.shape[-1]
-        pad = torch.nn.functional.pad
-        return type(self)(
-            pad(self.boxes, (0, 0, 0, extra)), pad(self.scores, (0, 0, 0, extra)), pad(self.mask, (0, extra))
+            torch.cat([pad(d.boxes, (0, 0, 0, extra)) for d, extra in zip(images, missing, strict=True)]),
+            torch.cat([pad(d.scores, (0, 0, 0, extra)) for d, extra in zip(images, missing, strict=True)]),
+            torch.cat([pad(d.mask, (0, extra)) for d, extra in zip(images, missing, strict=True)]),
         )
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -181,8 +181,11 @@ def load_torchvision(
         network = models.get_model(name, weights=enum, **model)
     except (TypeError, ValueError) as error:
         raise InputError(f"options of {name}: {error}") from error
+    # The builder and the constructors of its model would silently accept any other option.
+    builders = models.get_model_builder(name), *(each for each in type(network).__mro__ if issubclass(each, nn.Module))
     for option in model:
-        lookup(option, _options(models.get_model_builder(name), type(network)), f"option of {name}")
+        known = sorted({each for call in builders for each in inspect.signature(call).parameters})
+        lookup(option, known, f"option of {name}")
     if enum is None and weights is not None:
         _load_state(network, _file(weights))
     network.requires_grad_(False).to(device)
@@ -205,12 +208,6 @@ def _member(enum: Any, weights: Any) -> Any:
     if isinstance(weights, str) and not Path(text).suffix:
         return enum[lookup(text, [*enum.__members__], f"{enum.__name__} member")]
     return None
-
-
-def _options(builder: Callable[..., nn.Module], kind: type[nn.Module]) -> list[str]:
-    """Options of a builder and of its model's constructors, which would silently accept any other option."""
-    callables: list[Any] = [builder, *(each for each in kind.__mro__ if issubclass(each, nn.Module))]
-    return sorted({name for call in callables for name in inspect.signature(call).parameters})
 
 
 def _file(weights: str | PathLike[str]) -> Path:

@@ -40,11 +40,17 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
     number = {name: index for index, name in enumerate(pictures)}
     unknown = [each.picture for each in fixations if each.picture not in number]
     check(not unknown, "pictures", "all pictures of the fixations", f"none named {unknown[:1]}")
+    onsets = [
+        np.arange(len(each), dtype=np.float64)
+        if each.durations is None
+        else (np.cumsum(each.durations) - each.durations) / 1000
+        for each in fixations
+    ]
     people = {name: index for index, name in enumerate(sorted({each.subject for each in fixations}))}
     return FixationTrains.from_fixation_trains(
         xs=[each.points[:, 0] + 0.5 for each in fixations],
         ys=[each.points[:, 1] + 0.5 for each in fixations],
-        ts=[_onsets(each) for each in fixations],
+        ts=onsets,
         ns=[number[each.picture] for each in fixations],
         subjects=[people[each.subject] for each in fixations],
     )
@@ -72,9 +78,3 @@ def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tu
         picture = pictures[int(n)]
         scanpaths.append(Fixations(picture, str(subject), points[np.isfinite(points).all(1)], sizes[picture]))
     return scanpaths
-
-
-def _onsets(fixations: Fixations) -> Any:
-    if fixations.durations is None:
-        return np.arange(len(fixations), dtype=np.float64)
-    return (np.cumsum(fixations.durations) - fixations.durations) / 1000
