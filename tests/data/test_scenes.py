@@ -77,7 +77,7 @@ def test_every_object_is_a_legal_target(scenes):
 
 def test_mirrored_boxes_follow_the_pixels():
     """Checked on a photograph that is white only inside the box of its object."""
-    photograph = module.Photograph("test", "skimage", "test.png", (10, 20, 110, 80), "cat", (30, 25, 60, 75))
+    photograph = module._Photograph("test", "skimage", "test.png", (10, 20, 110, 80), "cat", (30, 25, 60, 75))
     pixels = np.zeros((100, 120), np.uint8)
     pixels[25:75, 30:60] = 255
     patch = Image.fromarray(pixels).crop(photograph.crop).resize((50, 30), Image.Resampling.BOX)
