@@ -296,6 +296,10 @@ class WindowEpisode(Episode[ZoomPath]):
     def open(self, glances: Glances, *, told: bool = False) -> Self:
         """Begin with a picture, or with the first frame of a stream."""
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
+        # From this probability or score on objects count. Without evidence and in photographs slices are looked at.
+        usual = LEAST if self.certainty is None else LIKELY
+        self.least = usual if self._least is None else self._least
+        self._slicing = self.evidence is None or glances.lattice.levels == 1
         self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
         self._turns: Iterator[WindowStep[Any]]
         still = self.forgetting is None or self.forgetting.rate == 0
@@ -400,17 +404,6 @@ class WindowEpisode(Episode[ZoomPath]):
         usual: Ending = "windows" if self.searches or self._slicing else "worth"
         over = found or (self._decisions is not None and self._decisions.outcome > 0)
         self.ending = decided if over else limit or usual
-
-    @property
-    def least(self) -> float:
-        """Probability, or score, from which on objects count."""
-        usual = LEAST if self.certainty is None else LIKELY
-        return usual if self._least is None else self._least
-
-    @property
-    def _slicing(self) -> bool:
-        """Whether all objects are looked for in slices: without evidence, and in a photograph."""
-        return self.evidence is None or (self._glances is not None and self._glances.lattice.levels == 1)
 
     @property
     def decision(self) -> Decision | None:

@@ -12,7 +12,6 @@ from semfov.episode.looks import Looks
 from semfov.errors import check_number
 
 
-@dataclass(frozen=True)
 class Forgetting:
     r"""Forgetting in a scene that changes between looks.
 
@@ -20,8 +19,13 @@ class Forgetting:
     fixated cell for :math:`\ln 2 / r` looks, until half of its evidence is left. If all cells are inhibited, the one
     that was fixated longest ago is free.
 
-    Attributes:
+    Args:
         rate: r, 0 or more; 0 forgets nothing.
+
+    Attributes:
+        rate: as given.
+        keep: share of the evidence that is left after a look, :math:`e^{-r}`.
+        span: number of looks for which a fixated cell is inhibited, :math:`\ln 2 / r`.
 
     Raises:
         InputError: `rate` is negative or above 100.
@@ -30,20 +34,10 @@ class Forgetting:
     (0.905, 6.9)
     """
 
-    rate: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_number(self.rate, "rate", 0, 100)
-
-    @property
-    def keep(self) -> float:
-        """Share of the evidence that is left after a look, :math:`e^{-r}`."""
-        return math.exp(-self.rate)
-
-    @property
-    def span(self) -> float:
-        r"""Number of looks for which a fixated cell is inhibited, :math:`\ln 2 / r`."""
-        return math.log(2) / self.rate if self.rate else math.inf
+    def __init__(self, rate: float = 0.0) -> None:
+        check_number(rate, "rate", 0, 100)
+        self.rate, self.keep = rate, math.exp(-rate)
+        self.span = math.log(2) / rate if rate else math.inf
 
     def visited(self, age: Tensor) -> Tensor:
         """Cells that inhibition of return keeps the gaze from.

@@ -48,16 +48,12 @@ class Sphere(World):
         check(-90 <= tilt[0] <= tilt[1] <= 90, "tilt", "limits from -90 to 90 degrees, down and up", tilt)
         self.picture, self.size, self.cell = picture, size, cell
         self.pan, self.tilt, self.fields = pan, tilt, check_fields(fields)
+        self.around = pan[1] - pan[0] >= 360  # whether the head turns all the way round
         self.speeds = Speeds() if speeds is None else speeds
         self.scene = Grid(round(360 / cell), round(180 / cell), picture)
         self.centres = panorama_directions(self.scene.centres, picture)
         weight = torch.linalg.vector_norm(self.centres[:, ::2], dim=-1)
         self.area = weight / weight.mean()
-
-    @property
-    def around(self) -> bool:
-        """Whether the head turns all the way round."""
-        return self.pan[1] - self.pan[0] >= 360
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels at which directions are seen."""
