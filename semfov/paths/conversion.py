@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from os import PathLike, fspath
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
@@ -18,11 +18,13 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import category_ids, coco_results, named_detections
-from semfov.detection.objects import Objects
 from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
+from semfov.paths.look import look_columns
+from semfov.paths.merging import number_of
+from semfov.paths.outcome import Outcome
 from semfov.words import RECORD_WORDS, not_there
 
 if TYPE_CHECKING:
@@ -39,12 +41,8 @@ _PIXELS = "pixels of the picture: x to the right, y down"
 """What the coordinates of a GeoJSON file are whose picture has no georeference."""
 
 
-class Conversion(ABC):
+class Conversion(Outcome):
     """Conversion of looks and objects to tables, and of objects to the formats of other libraries and of maps."""
-
-    classes: tuple[str, ...]
-    source: str | None
-    shown: Mapping[str, Any] | None
 
     _columns: ClassVar[tuple[str, ...]] = COLUMNS
     """Columns of the table of objects."""
@@ -54,28 +52,43 @@ class Conversion(ABC):
         def __getattr__(self, name: str) -> Any:
             return not_there(self, name, RECORD_WORDS)
 
-    @property
-    @abstractmethod
-    def size(self) -> tuple[int, int]:
-        """`(width, height)` of the picture in pixels."""
-
-    @property
-    @abstractmethod
-    def objects(self) -> Objects:
-        """The objects."""
-
-    @property
-    @abstractmethod
-    def confirmed(self) -> Tensor:
-        """Which of them were confirmed."""
-
-    @abstractmethod
     def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values."""
+        """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
 
-    @abstractmethod
+        `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
+        the picture that it shows, in picture pixels. `detections` is the number of detections, `seen` the class of the
+        most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on the clock of
+        the episode. `value` is that for which the look was chosen. `closer` is the probability that the target is
+        there, by a closer look that this is, or that follows it. `brought` is the number of objects that it shows most
+        sharply. The columns that the kind adds come last.
+
+        Returns:
+            One dictionary for each look.
+        """
+        closer = {number_of(look): look.place for look in self.closer}
+        brought = Counter(self.objects.passes.tolist())
+        return [look_columns(look, self.classes, closer.get(look.number), brought[look.number]) for look in self]
+
     def to_dict(self) -> dict[str, Any]:
-        """The record as JSON values."""
+        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.
+
+        Returns:
+            Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
+        """
+        (width, height), decision = self.size, self.decision
+        values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}
+        values["targets"] = [self.classes[label] for label in self._sought]
+        if decision is not None:
+            box = decision.box.tolist() if decision.outcome == "found" and decision.box is not None else [None] * 4
+            values |= {"outcome": decision.outcome, "probability": decision.probability}
+            edges = (*(self.found_at or (None, None)), *box)
+            values |= dict(zip(("x", "y", "x1", "y1", "x2", "y2"), edges, strict=True))
+        error = dict.fromkeys(self.expected, math.nan) if self.unseen is None else self.expected_error
+        values["least"] = self.least
+        for key, numbers in (("expected", self.expected), ("expected_error", error)):
+            values[key] = {name: None if math.isnan(number) else number for name, number in numbers.items()}
+        values["passes"] = self.passes
+        return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
 
     def object_rows(self) -> list[dict[str, Any]]:
         """The objects as a table of plain values, one row for each object, most confident first.

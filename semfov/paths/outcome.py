@@ -1,0 +1,260 @@
+"""What the looks of a record found: its objects, its decision, and the words for both."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.decision import CloseUp, Decision
+from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST, Objects
+from semfov.paths.endings import FIXATIONS, Ending
+from semfov.paths.look import RecordedLook
+from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Outcome(ABC):
+    """The looks of a record, what they found, and what was decided (`semfov.paths.Record`)."""
+
+    classes: tuple[str, ...]
+    target: int | None
+    detections: tuple[Detections, ...]
+    found: bool = False
+    closer: tuple[CloseUp, ...] = ()
+    ending: Ending | None = None
+    seconds: tuple[Any, ...] = ()
+    decision: Decision | None = None
+    targets: tuple[int, ...] = ()
+    least: float = LEAST
+    unseen: tuple[float, float] | None = None
+    photograph: Tensor | None = None
+    source: str | None = None
+    shown: Mapping[str, Any] | None = None
+
+    how: ClassVar[Literal["fovea", "windows", "head"]]
+    """Kind of look: of a fovea, at windows, or of a head that turns."""
+
+    _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
+
+    @abstractmethod
+    def _looks(self) -> Iterator[RecordedLook]:
+        """The looks in their order, made anew."""
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Describe the outcome in one line."""
+
+    @property
+    @abstractmethod
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the picture in pixels."""
+
+    @cached_property
+    def looks(self) -> tuple[RecordedLook, ...]:
+        """The looks in their order."""
+        return tuple(self._looks())
+
+    def __iter__(self) -> Iterator[RecordedLook]:
+        """The looks in their order."""
+        return iter(self.looks)
+
+    def __len__(self) -> int:
+        """Number of looks, the first included."""
+        return len(self.detections)
+
+    def __getitem__(self, number: int) -> RecordedLook:
+        """The look of a number, as iteration gives it; -1 is the last one."""
+        return self.looks[number]
+
+    @property
+    def passes(self) -> int:
+        """Number of passes of the detector, closer looks included."""
+        return len(self) + sum(look.number is None for look in self.closer)
+
+    @property
+    def target_name(self) -> str | None:
+        """Name of the class that was searched for; None for all classes."""
+        return None if self.target is None else self.classes[self.target]
+
+    @property
+    def measure(self) -> str:
+        """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
+        return "score" if self.unseen is None else "probability"
+
+    @property
+    def threshold_in_words(self) -> str:
+        """From what on objects count, such as `probability or score 0.5`; in a search only the probability counts."""
+        score = " or score" if self.decision is None and self.unseen is not None else ""
+        return f"{self.measure}{score} {self.least:g}"
+
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
+        return "probability"
+
+    @property
+    def found_at(self) -> tuple[float, float] | None:
+        """`(x, y)` in picture pixels of the found target: the middle of its box, or else of its cell; None for none."""
+        decision, grid = self.decision, getattr(self, "grid", None)
+        if decision is not None and decision.outcome == "found" and decision.box is not None:
+            x1, y1, x2, y2 = decision.box.tolist()
+            return (x1 + x2) / 2, (y1 + y2) / 2
+        if decision is None or decision.outcome != "found" or decision.cell is None or not isinstance(grid, Grid):
+            return None
+        return tuple(grid.centres[decision.cell].tolist())
+
+    @property
+    def image(self) -> Tensor | None:
+        """The reduced picture, `(3, h, w)` in [0, 1]; None if it was not kept."""
+        return None if self.photograph is None else self.photograph.float() / 255
+
+    def is_whole(self, region: Sequence[float]) -> bool:
+        """Whether a region is the whole picture, up to a pixel.
+
+        Args:
+            region: `(x1, y1, x2, y2)` in picture pixels.
+
+        Returns:
+            Whether it is.
+        """
+        (x1, y1, x2, y2), (width, height) = region, self.size
+        return x2 - x1 > width - 1 and y2 - y1 > height - 1
+
+    @cached_property
+    def candidates(self) -> Objects:
+        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
+
+        Of several boxes of one object, the box of the nearest fixation is kept, or that of a closer look. The score of
+        a closer look is the probability that the target is there.
+        """
+        looks = [look.detections for look in self]
+        distances = [
+            distances_to(look.detections.boxes[0], torch.tensor(look.fixation, dtype=torch.float64)) for look in self
+        ]
+        return merge_fixations(looks, distances, self.closer)
+
+    @property
+    def objects(self) -> Objects:
+        """The candidates of the targets that have at least the score `least`, or that were confirmed.
+
+        A candidate that was confirmed has the probability that the target is there as its score, where that is higher.
+        The box that a decision found is always among the objects.
+        """
+        return self._outcome[0]
+
+    @property
+    def confirmed(self) -> Tensor:
+        """Which of the objects a closer look or the decision confirmed, `(M,)` boolean."""
+        return self._outcome[1]
+
+    @property
+    def confirmable(self) -> bool:
+        """Whether objects can be confirmed: by a decision or by closer looks."""
+        return self.decision is not None or len(self.closer) > 0
+
+    @property
+    def refuted(self) -> list[CloseUp]:
+        """The closer looks that did not confirm that the target is there."""
+        boxes = [box for box, *_ in self._confirmed_places]
+        return [look for look in self.closer if not any(look.box.equal(box) for box in boxes)]
+
+    @property
+    def expected(self) -> dict[str, float]:
+        """Expected number of objects by the name of their class; without a model of it, the number of `objects`.
+
+        With a model it is the sum of the probabilities of all candidates, and of what further looks are expected to
+        show, of which each class has its share of that sum. It is NaN for a class to which the detector hardly reacts
+        (`semfov.paths.ZoomPath.reacts`), and null in files.
+        """
+        return {name: mean for name, (mean, _) in self._claimed().items()}
+
+    @property
+    def expected_error(self) -> dict[str, float]:
+        r"""Standard deviation of the expected number of objects by the name of their class; 0 without a model of it.
+
+        With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
+        has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
+        share :math:`\tau` (`spread`) of the expected number E:
+
+        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+        """
+        return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
+
+    def _claimed(self) -> dict[str, tuple[float, float]]:
+        """Mean and variance of the number of objects of each class."""
+        counts = Counter(self.objects.labels.tolist())
+        return {self.classes[label]: (float(counts[label]), 0.0) for label in self._sought or counts}
+
+    @property
+    def _sought(self) -> tuple[int, ...]:
+        """Classes that were searched for; none stands for all."""
+        return self.targets or (() if self.target is None else (self.target,))
+
+    @property
+    def _confirmed_places(self) -> list[tuple[Tensor, int, float, int]]:
+        """Box, class, probability and look of the places that closer looks and the decision confirmed."""
+        decision, closer = self.decision, self.closer
+        box = decision.box if decision is not None and decision.outcome == "found" else None
+        others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
+        places = [(look.box, look.target, look.place, number_of(look)) for look in others]
+        if box is not None and decision is not None and self.target is not None:
+            number = next((number_of(look) for look in closer if look.box.equal(box)), len(self) - 1)
+            probability = decision.probability if decision.place is None else decision.place
+            places.append((box, self.target, probability, number))
+        return places
+
+    @cached_property
+    def _outcome(self) -> tuple[Objects, Tensor]:
+        """The objects, and which of them were confirmed."""
+        objects, sure = confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
+        return replace(objects, classes=self.classes), sure
+
+    def _counts(self, candidates: Objects) -> Tensor:
+        """Which candidates of the classes that were searched for count as objects without being confirmed, `(M,)`."""
+        return candidates.scores >= self.least
+
+    def objects_in_words(self) -> str:
+        """Count the objects, by class where classes were searched for, and say from which score on.
+
+        Returns:
+            A phrase such as `2 × person from score 0.3`.
+        """
+        labels = self.objects.labels
+        names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought]
+        every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
+        return f"{', '.join(names) or every} from {self.threshold_in_words}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why the search or the exploration ended.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
+        sentences, looks = self._sentences, self.passes
+        if self.closer and self.found:
+            # Windows as large as the picture: the first look is a closer look already.
+            box = None if self.decision is None else self.decision.box
+            showing = [look.number for look in self.closer if box is not None and look.box.equal(box)]
+            found = sentences["closer found"]
+            return sentences.get("first found", found) if showing == [0] else found
+        if self.ending == "decision" and self.decision is not None:
+            outcome, closer = self.decision.outcome, any(look.number != 0 for look in self.closer)
+            return sentences.get(f"closer {outcome}" if closer else outcome, sentences[outcome])
+        if self.ending == "shifts":
+            return f"All {len(self) - 1} gaze shifts were made."
+        if self.ending == "passes":
+            return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
+        return sentences.get(self.ending or "", "")
+
+    def summary(self) -> str:
+        """Describe the outcome, and explain why the search or the exploration ended."""
+        return f"{self.describe()}. {self.why_it_ended()}".rstrip()
