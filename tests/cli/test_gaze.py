@@ -148,9 +148,9 @@ def test_a_heat_map_that_is_gone_is_written_again(run, photos, tmp_path, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(GazePrediction, "of", stopped)
-        assert run(photos, "--people", 2, "--out", out)[0] == 130
+        assert run(photos, "--people", 2, "--seconds", 1, "--out", out)[0] == 130
     (out / "000-0.png").unlink()
-    assert run(photos, "--people", 2, "--out", out)[0] == 0
+    assert run(photos, "--people", 2, "--seconds", 1, "--out", out)[0] == 0
     assert sorted(each.name for each in out.iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
 
 

@@ -154,7 +154,7 @@ def test_shared_processes_stay_for_other_settings_and_end_with_the_block():
     assert multiprocessing.active_children() == []
 
 
-@pytest.mark.slow
+@pytest.mark.lab
 def test_shared_processes_end_at_once_if_the_block_fails():
     with pytest.raises(ZeroDivisionError), shared_processes():  # noqa: PT012
         results((1).__truediv__, [1, 2, 3], 2)
