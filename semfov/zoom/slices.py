@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from semfov.zoom.closer import PART
 from semfov.zoom.episode import Order
@@ -62,19 +61,16 @@ def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bo
     if glance.hints is not None:
         boxes, within = glance.hints.boxes, glance.hints.boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
         centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-        return _value(glance.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)], targets, most=most)
-    look = glance.gist
-    assert look is not None
-    x1, y1, x2, y2 = window.cells
-    left, top = look.first
-    box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
-    columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
-    rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
-    return _value(look.scores[rows, columns], targets, most=most)
-
-
-def _value(part: Tensor, targets: Sequence[int], *, most: bool) -> float:
-    """The highest of scores `(..., K)` of the classes, or the sum of the highest of each place."""
+        part = glance.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)]
+    else:
+        look = glance.gist
+        assert look is not None
+        x1, y1, x2, y2 = window.cells
+        left, top = look.first
+        box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
+        columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
+        rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
+        part = look.scores[rows, columns]
     scores = (part[..., [target - 1 for target in targets]] if len(targets) else part).amax(-1)
     if not scores.numel():
         return 0.0
