@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from eval.comparison.saliency import SaliencyStore, saliency_table
+from eval.comparison.saliency import SaliencyStore, saliency_map, saliency_table
 from eval.comparison.settings import ComparedConfig
 from semfov.belief.grid import Grid
 from semfov.errors import lookup
@@ -43,9 +43,9 @@ class ComparedLooking(PolicyLooking):
 
     def __init__(self, config: ComparedConfig) -> None:
         super().__init__(config)
-        folder, sensor = store_folder(config.cache) / "saliency", self.eye.settings()["sensor"]
+        folder, eye, how = store_folder(config.cache) / "saliency", self.eye.settings(), config.saliency
         self.saliency_stores = {
-            name: SaliencyStore(folder, name, config.saliency.view, config.saliency.reduction, sensor, config.cells)
+            name: SaliencyStore(folder, name, how.view, how.reduction, eye["sensor"], config.cells, eye["detector"])
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }
@@ -67,7 +67,7 @@ class ComparedLooking(PolicyLooking):
         if saliency is None:
             image, how = self.scenes[index].image, self.config.saliency
             seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
-            saliency = saliency_table(name, how.view, how.reduction, *seen)
+            saliency = saliency_table(saliency_map(name, self.eye.detector), how.view, how.reduction, *seen)
             if self.config.store:
                 store.save(digest, saliency)
         return saliency

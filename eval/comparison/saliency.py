@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.detection.detector import Detector
 from semfov.detection.placement import resize
-from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.gaze.saliency import VOCUS2, FixationDensity, IttiKoch, cell_saliency
 from semfov.gaze.saliency.cells import Reduction
 from semfov.io.schema import Field, Schema
 from semfov.runs.looks import one_thread
@@ -44,14 +45,17 @@ class SaliencyStore(SceneStore):
         reduction: Reduction,
         sensor: Mapping[str, Any],
         grid: tuple[int, int],
+        detector: Mapping[str, Any] | None = None,
     ) -> None:
-        what = {
+        what: dict[str, Any] = {
             "model": name,
             "view": view,
             "reduction": reduction,
             "sensor": sensor if view == "foveated" else None,
             "grid": list(grid),
         }
+        if name == "people":
+            what["detector"] = detector
         cells = grid[0] * grid[1]
         schema = Schema({"saliency": Field(("F", cells), low=0)})
         super().__init__(folder, what, looks_digest(*_SOURCES), schema)
@@ -67,11 +71,24 @@ class SaliencyStore(SceneStore):
         self.write(digest, {"saliency": saliency})
 
 
+def saliency_map(name: str, detector: Detector) -> _SaliencyMap:
+    """What gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`."""
+    if name != "people":
+        return SALIENCY_CLASSES[name]()
+    density = FixationDensity.for_detector(detector).requires_grad_(False)
+    return lambda image: density(detector.features(image, [*density.layers])).exp()
+
+
 def saliency_table(
-    name: str, view: _SaliencyView, reduction: Reduction, sensor: Sensor, reference: float, image: Tensor, grid: Grid
+    model: _SaliencyMap,
+    view: _SaliencyView,
+    reduction: Reduction,
+    sensor: Sensor,
+    reference: float,
+    image: Tensor,
+    grid: Grid,
 ) -> Tensor:
     """Saliency of every cell of a photograph; image `(3, H, W)` → `(X·Y, X·Y)`."""
-    model = SALIENCY_CLASSES[name]()
     with one_thread(), torch.inference_mode():
         if view == "picture":
             return cell_saliency(model(image[None]), grid.columns, grid.rows, reduction)

@@ -13,11 +13,11 @@ from semfov.runs.settings import Settings, Weight
 
 @dataclass(frozen=True)
 class SaliencyConfig(Settings):
-    """The saliency baselines, `vocus2` and `itti-koch`.
+    """The saliency baselines, `vocus2`, `itti-koch` and `people`.
 
     Args:
         view: `foveated` computes the saliency of the foveated view from each fixation (published); `picture` computes
-            the saliency of the whole sharp photograph, once. Neither depends on the detector.
+            the saliency of the whole sharp photograph, once. Only `people` depends on the detector.
         reduction: the saliency of a cell is the `max` or the `mean` of that of its pixels.
         weight: weight of the saliency map as a prior over the cells, for policies that have one.
     """

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from semfov.io.code import modules_digest
 from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
-from semfov.runs.config import DetectorConfig, SaliencyModel
+from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Range, Whole
 from semfov.runs.setup import detector_options
 from semfov.runs.tables import plus_minus, table
@@ -65,7 +65,7 @@ class ViewingConfig(ViewingData):
     """
 
     detectors: tuple[str | DetectorConfig, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
-    saliency: tuple[SaliencyModel, ...] = ("itti-koch", "vocus2")
+    saliency: tuple[Literal["itti-koch", "vocus2"], ...] = ("itti-koch", "vocus2")
     studied: Whole = 1
     folds: Annotated[int, Range(2, 1000)] = 5
     sequences: Whole = 50
@@ -138,7 +138,7 @@ def _features(detector: DetectorConfig) -> MapSource:
     return features_of(load_detector(detector.name, **detector_options(detector)))
 
 
-def _saliency(name: SaliencyModel) -> MapSource:
+def _saliency(name: str) -> MapSource:
     """The saliency map of a model over the cells of pictures, as if it were a feature map."""
     model = SALIENCY_CLASSES[name]()
 

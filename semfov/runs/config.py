@@ -15,7 +15,7 @@ from semfov.runs.workers import Where
 from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
-SaliencyModel = Literal["vocus2", "itti-koch"]
+SaliencyModel = Literal["vocus2", "itti-koch", "people"]
 Scores = Literal["raw", "calibrated", "learned"]
 
 
@@ -180,8 +180,8 @@ class PolicyConfig(Settings):
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected.
-        saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2` or
-            `itti-koch`.
+        saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2`,
+            `itti-koch`, or `people`, the density of fixations from the features of the detector (`FixationDensity`).
         samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
             `negative-entropy`, `surprise` and `two-peaks` take the expectation; null takes the look with the expected
             scores, as published. The observation model must be one of the densities of scores (`...-published`).

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from eval.comparison import saliency as saliency_store
-from eval.comparison.saliency import SaliencyStore, saliency_table
+from eval.comparison.saliency import SaliencyStore, saliency_map, saliency_table
 from eval.explore import explore
 from eval.explore.run import FUSED, PAINTED, ExploreConfig, ExploreRun
 from semfov import observers
-from semfov.gaze.saliency import VOCUS2
+from semfov.gaze.saliency import VOCUS2, FixationDensity
 from semfov.io.code import _closure
 from semfov.runs.config import DetectorConfig
 from tests.small import run_settings
@@ -115,10 +115,15 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     peak = divmod(int(seen.argmax()), seen.shape[-1])
     peak_cell = int(peak[0] * 3 / seen.shape[0]) * 4 + int(peak[1] * 4 / seen.shape[1])
     assert stored[5].argmax() == peak_cell
-    picture = saliency_table("vocus2", "picture", "mean", sensor, 640.0, image, grid)
+    picture = saliency_table(VOCUS2(), "picture", "mean", sensor, 640.0, image, grid)
     assert picture.shape == (1, 12)
     expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
     torch.testing.assert_close(picture, expected)
+    detector = run.eye.detector
+    people = saliency_table(saliency_map("people", detector), "picture", "mean", sensor, 640.0, image, grid)
+    density = FixationDensity.for_detector(detector)
+    log = density(detector.features(image[None], [*density.layers]))
+    torch.testing.assert_close(people, log.exp().unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1))
 
 
 def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
@@ -141,8 +146,8 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     run, folder = ExploreRun(finished), finished.cache / "saliency"
     settings = run.eye.settings()["sensor"]
 
-    def key(name="vocus2", view="foveated", reduction="max", sensor=settings, grid=(4, 3)):
-        return SaliencyStore(folder, name, view, reduction, sensor, grid).key
+    def key(name="vocus2", view="foveated", reduction="max", sensor=settings, grid=(4, 3), detector=None):
+        return SaliencyStore(folder, name, view, reduction, sensor, grid, detector).key
 
     other = {**settings, "sigma": 50.0}
     keys = [
@@ -152,8 +157,10 @@ def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
         key(reduction="mean"),
         key(sensor=other),
         key(grid=(3, 4)),
+        key(name="people"),
+        key(name="people", detector={"name": "yolox-nano"}),
     ]
-    assert len(set(keys)) == 6
+    assert len(set(keys)) == len(keys)
     assert key() == run.saliency_stores["vocus2"].key
     # The whole photograph looks the same to every sensor.
     assert key(view="picture", sensor=other) == key(view="picture")
