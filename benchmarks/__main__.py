@@ -17,7 +17,7 @@ from benchmarks.fits import dirichlets
 from benchmarks.interleave import in_turn
 from benchmarks.kernels import fixations, half, lookahead, pictures, pyramid, roc_curve
 from benchmarks.rollouts import rollouts
-from benchmarks.saliency import saliency
+from benchmarks.saliency import saliency, where_people_look
 from benchmarks.sensor import foveation
 from benchmarks.tables import begin, command, comparison_rows, page, ratios_of, table, write
 from benchmarks.timing import Comparison, measure
@@ -42,6 +42,7 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     roc_curve,
     lambda: saliency("VOCUS2"),
     lambda: saliency("Itti-Koch"),
+    where_people_look,
     in_turn,
     rollouts,
 )

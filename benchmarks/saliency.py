@@ -1,4 +1,4 @@
-"""Comparison of both saliency models with the same models in OpenCV, for one photograph.
+"""Comparison of both saliency models with the same models in OpenCV, and of where people look with the detector alone.
 
 The OpenCV programs do the same work in the same order; they, too, average maps before enlarging them.
 """
@@ -15,7 +15,8 @@ from torch import Tensor
 
 from benchmarks.machine import photograph
 from benchmarks.timing import Comparison
-from semfov.gaze.saliency import VOCUS2, IttiKoch
+from semfov.detection.load import load_detector
+from semfov.gaze.saliency import VOCUS2, FixationDensity, IttiKoch
 
 Array = NDArray[Any]
 
@@ -130,3 +131,19 @@ def saliency(name: str) -> Comparison:
         torch.testing.assert_close(model(image)[0], torch.from_numpy(peer()), rtol=0, atol=1e-5)
 
     return Comparison(f"saliency, {name}", lambda: model(image), {"OpenCV": peer}, {}, agree)
+
+
+def where_people_look(name: str = "yolov3-tiny") -> Comparison:
+    """Detections and density of fixations of a photograph from one pass, compared with that pass for detections."""
+    image, detector = photograph(), load_detector(name)
+    density = FixationDensity.for_detector(detector)
+
+    def looked() -> Tensor:
+        return density(detector.features(image, [*density.layers]))
+
+    def agree() -> None:
+        seen = detector.features(image, [*density.layers]).detections
+        torch.testing.assert_close(seen.scores, detector(image).scores)
+        torch.testing.assert_close(looked().exp().sum((1, 2)), torch.ones(1))
+
+    return Comparison(f"where people look, {name}", looked, {"the detector alone": lambda: detector(image)}, {}, agree)
