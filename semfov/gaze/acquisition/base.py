@@ -65,7 +65,7 @@ class AcquisitionFunction(nn.Module, ABC):
         # What it passes on by `**` are arguments of its base.
         cls.takes = {**getattr(cls, "takes", {}), **named} if Parameter.VAR_KEYWORD in kinds else named
         cls.needs_model = "model" in cls.takes and not cls.needs_map
-        if "name" in cls.__dict__:
+        if cls.__dict__.get("name"):
             taken = FUNCTIONS.get(cls.name, cls)
             # A cell of a notebook that is run again defines its class again.
             again = taken.__qualname__ == cls.__qualname__
