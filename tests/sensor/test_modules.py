@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.sensor import Foveation, LogPolar, MultiScaleFovea, RandomFoveation
-from tests.base_tester import GraphTester, TensorTester
+from tests.base_tester import GraphTester, Host, TensorTester
 from tests.refusals import refused
 from tests.small import close, draw, rand
 
@@ -18,16 +18,20 @@ class TestFoveation(GraphTester):
     batched = (0, 1)
     differentiable = (0, 1)
 
-    def make(self):
-        return Foveation(9.0, levels=2, learnable=True)
+    def make(self, levels=2):
+        return Foveation(9.0, levels=levels, learnable=True)
+
+    def traced(self):
+        """All levels have the same graph."""
+        return Host(self.make(levels=1), self.call)
 
     def inputs(self):
         return rand(2, 3, 48, 64), GAZES
 
 
 class TestFoveationAsOpenCV(TestFoveation):
-    def make(self):
-        return Foveation(9.0, levels=2, convention="opencv")
+    def make(self, levels=2):
+        return Foveation(9.0, levels=levels, convention="opencv")
 
     def inputs(self):
         return rand(2, 3, 33, 47), GAZES
@@ -45,6 +49,8 @@ class TestLogPolar(GraphTester):
 
 
 class TestMultiScaleFovea(TestFoveation):
+    traced = GraphTester.traced
+
     def make(self):
         return MultiScaleFovea(16, 3)
 
