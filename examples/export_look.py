@@ -21,10 +21,9 @@ from semfov.detection.onnx import OnnxDetector, probe
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
-from semfov.zoom.evidence import GlimpseEvidence, pool_spans
+from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_spans
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import FINEST, Gist
-from semfov.zoom.networks import STEPS
 
 _LOOK_METADATA_KEY = "semfov.look"
 

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import WindowStep, look_by_look
-from semfov.zoom.evidence import GlimpseEvidence, pool
+from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
-from semfov.zoom.networks import STEPS
 from semfov.zoom.policy import WindowChoice, best_hit
 
 

@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from semfov.detection.detections import Detections
-from semfov.envs.scenery import Scenery
-from semfov.envs.zoom_scenery import ZoomScenery
+from semfov.envs.scenery import Scenery, ZoomScenery
 from semfov.errors import check, check_number, check_whole
 
 Arrays = dict[str, Any]

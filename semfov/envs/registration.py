@@ -10,9 +10,8 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, ZoomEnv
-from semfov.envs.vector import GazeVectorEnv
-from semfov.envs.zoom_scenery import open_zoom_scenery
+from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, GazeVectorEnv, ZoomEnv
+from semfov.envs.scenery import open_zoom_scenery
 from semfov.errors import lookup
 
 _IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}

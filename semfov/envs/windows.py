@@ -15,7 +15,7 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interp
 from semfov.agents.windows import WindowEpisode
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes, Score
-from semfov.envs.zoom_scenery import ZoomScenery
+from semfov.envs.scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath

@@ -62,10 +62,9 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import WindowStep, look_for
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.evidence import GlimpseEvidence, Survey
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance
-from semfov.zoom.networks import Survey
 
 _JUDGED = (1, 4, 8, 16)
 """Numbers of looks after which the probability of presence is evaluated."""

@@ -17,11 +17,10 @@ from semfov.fit.descent import descend
 from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
-from semfov.zoom.evidence import GlimpseEvidence, pool
+from semfov.zoom.evidence import STEPS, GlimpseEvidence, Survey, pool
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.networks import STEPS, Survey
 
 
 class _WindowResult(NamedTuple):

@@ -1,13 +1,12 @@
 """Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
 
-from semfov.paths.base import Record
+from semfov.paths.base import Moment, Record
 from semfov.paths.endings import Ending
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
 from semfov.paths.look import RecordedLook
-from semfov.paths.moment import FoveaMoment, Moment, WindowMoment
-from semfov.paths.scanpath import Scanpath
-from semfov.paths.windows import ZoomPath
+from semfov.paths.scanpath import FoveaMoment, Scanpath
+from semfov.paths.windows import WindowMoment, ZoomPath
 
 __all__ = [
     "Ending",

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
+from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.windowed import LargePicture
-from semfov.errors import InputError
+from semfov.decision import CloseUp
+from semfov.detection.detections import Detections
+from semfov.errors import InputError, check
 from semfov.paths.conversion import Conversion
 from semfov.paths.files import Format
-from semfov.paths.look import LookView, RecordedLook, read_region, whole_pixels
+from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -287,3 +293,80 @@ class Record(Conversion):
         cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Make the other attributes from the tensors and JSON values of a file."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Moment(Record):
+    """Base of the records of one frame of a stream.
+
+    Attributes:
+        number: number of the frame, from 0.
+        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None where nothing
+            is decided.
+
+    Example::
+
+        moment = live.step(frame)
+        print(moment.describe(), moment.objects.boxes)
+    """
+
+    number: int
+
+    @property
+    def seen(self) -> Detections:
+        """Detections of the look at this frame, a batch of one."""
+        return self.looks[-1].detections
+
+    @property
+    def examined(self) -> CloseUp | None:
+        """The closer look, if this frame was spent on one; otherwise None."""
+        last = self.closer[-1] if self.closer else None
+        return last if last is not None and last.number == len(self) - 1 else None
+
+    @property
+    @abstractmethod
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the point that the next look is at."""
+
+    @property
+    def next_region(self) -> Box | None:
+        """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
+        return None
+
+    def draw(self, frame: ImageLike, *, color: Color = "bgr", longest: int = 1280) -> NDArray[np.uint8]:
+        """Draw the look, the belief or the objects, and where the next look goes, into the frame, for a window.
+
+        Matplotlib is not needed.
+
+        Args:
+            frame: the frame of the moment.
+            color: order of the channels of the frame and of the drawing: `bgr`, as OpenCV reads and shows them, or
+                `rgb`.
+            longest: longer side of the drawing in pixels; a larger frame is reduced to it.
+
+        Returns:
+            `(h, w, 3)`, bytes, with even sides.
+
+        Raises:
+            InputError: it is no frame of the size of the moment's.
+
+        Example::
+
+            moment = live.step(frame)
+            cv2.imshow("semfov", moment.draw(frame))
+        """
+        from semfov.viz.live import draw_moment
+
+        image = as_image(frame, argument="frame", color=color)
+        check(
+            tuple(image.shape[:0:-1]) == self.size, "frame", "{} × {} px".format(*self.size), tuple(image.shape[:0:-1])
+        )
+        drawn = draw_moment(image, self, self.describe(), longest)
+        return np.ascontiguousarray(drawn[..., ::-1]) if color == "bgr" else drawn
+
+    def _decided(self) -> str | None:
+        """The decision in words; None without one."""
+        if self.decision is None:
+            return None
+        there = "" if self.decision.place is None else f" (there {self.decision.place:.2f})"
+        return f"{self.target_name}: {self.decision.outcome}, p {self.decision.probability:.2f}{there}"

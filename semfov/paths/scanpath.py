@@ -1,13 +1,13 @@
-"""The record of an episode in a photograph: fixations, detections, beliefs and the decision, from its steps."""
+"""The records of looks of a fovea at cells: an episode in a photograph, from its steps, and a frame of a stream."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,11 +20,14 @@ from semfov.data.windowed import LargePicture
 from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
-from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Text
-from semfov.paths.cells import GRID, CellRecord
+from semfov.io.schema import Anything, Array, Field, Json, Maybe, Number, Object, Text
+from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
+
+_GRID: dict[str, Json] = {"grid": pair(Number(low=1, high=10_000, whole=True)), "size": pair(POSITIVE)}
+"""JSON values of a grid in a file."""
 
 _SENSOR = {
     "sigma": POSITIVE,
@@ -56,7 +59,7 @@ _FORMAT = Format(
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
     {
-        **GRID,
+        **_GRID,
         "seconds": Array(Object(dict.fromkeys(STAGES, Number(low=0)), Number(low=0))),
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
         "settings": Maybe(_SETTINGS),
@@ -84,7 +87,51 @@ class _MadeWhenRead:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Scanpath(CellRecord):
+class _CellRecord(Record):
+    """Base of the records of looks of a fovea at cells; `seconds` are those of each look by stage."""
+
+    grid: Grid
+    seconds: tuple[Mapping[str, float], ...] = ()
+
+    how = "fovea"
+
+    _tensors: ClassVar[tuple[str, ...]]
+    """Attributes that are tensors of a file; those that are None are left out."""
+
+    _plain: ClassVar[tuple[str, ...]] = ()
+    """Attributes that are JSON values of a file."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` of the photograph or frame in pixels."""
+        width, height = (int(side) for side in self.grid.extent)
+        return width, height
+
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
+        tensors = {name: getattr(self, name) for name in self._tensors if getattr(self, name) is not None}
+        record = {name: getattr(self, name) for name in self._plain}
+        record |= {"grid": [self.grid.columns, self.grid.rows], "size": size}
+        return tensors, {**record, "seconds": [dict(each) for each in self.seconds]}
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        looks, seconds, decision = len(shared["detections"]), record["seconds"], shared["decision"]
+        columns, rows = record["grid"]
+        grid = Grid(columns, rows, tuple(record["size"]))
+        check(len(seconds) in (0, looks), "seconds", f"times of {looks} looks, or none", len(seconds))
+        cell = None if decision is None else decision.cell
+        check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
+        for look in shared["closer"]:
+            check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
+        made = {name: tensors.get(name) for name in cls._tensors} | {name: record[name] for name in cls._plain}
+        return {**made, "grid": grid, "seconds": tuple(seconds)}
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Scanpath(_CellRecord):
     """Fixations of one episode in order, with the detections and the belief at each of them.
 
     A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
@@ -312,3 +359,97 @@ class Trace:
                     self._belief = self.beside(before, step.detections, step.fixation, self.grid)
                 self._maps.append((self._belief or step.belief).class_probabilities()[0])
             return torch.stack(self._maps[:looks])
+
+
+_FOVEA = Format(
+    "moment",
+    {
+        "fixation": Field((2,), mixed=True, low=-FARTHEST, high=FARTHEST),
+        "probability": Field(("cells",), mixed=True, low=0, high=1 + 1e-3),
+        "visited": Field(("cells",), dtype=torch.bool),
+    },
+    {
+        "number": WHOLE,
+        **_GRID,
+        "cell": WHOLE,
+        "next_cell": WHOLE,
+        "seconds": Array(Object({}, Number(low=0)), 1),
+    },
+)
+"""Format of the files of moments of a fovea."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class FoveaMoment(_CellRecord, Moment):
+    """Look, belief and decision at one frame that a fovea looks at.
+
+    Beside the attributes of `Moment` it has those of its look.
+
+    Attributes:
+        grid: the cells.
+        cell: the fixated cell, or the one that was looked at closely.
+        fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
+        probability: `(X·Y,)`, probability that each cell holds the target, or any object in an exploration, after the
+            last look that was not a closer one.
+        visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
+        next_cell: the cell to look at in the next frame.
+        seconds: time of the look by stage, one mapping; `open` is the fitting of the frame into the detector's input. A
+            closer look has the stage `detect` alone.
+        belief: belief of one episode that gave the probability; None in a moment from a file.
+
+    Example::
+
+        moment = live.step(frame)
+        print(moment.decision.outcome, moment.probability.max())
+    """
+
+    cell: int
+    fixation: Tensor
+    probability: Tensor
+    visited: Tensor
+    next_cell: int
+    belief: Belief | None = field(default=None, compare=False)
+
+    _format = _FOVEA
+    _tensors = "fixation", "probability", "visited"
+    _plain = "number", "cell", "next_cell"
+
+    @property
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the centre of the next cell."""
+        x, y = self.grid.centres[self.next_cell].tolist()
+        return x, y
+
+    def _looks(self) -> Iterator[RecordedLook]:
+        """The look at the frame, with the whole frame as its region."""
+        (x, y), (width, height) = self.fixation.tolist(), self.size
+        more = {"frame": self.number, **cell_columns(self.grid, self.cell, self.probability)}
+        region = (0.0, 0.0, float(width), float(height))
+        yield RecordedLook(0, (x, y), region, self.detections[0], sum(self.seconds[0].values()), None, more)
+
+    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+        """The probability of the target, or of any object, in each cell."""
+        return self.grid, self.probability
+
+    def describe(self) -> str:
+        """Describe belief and decision at the frame in a few words."""
+        highest = float(self.probability.max())
+        if self.target is None:
+            return f"p(object) up to {highest:.2f}"
+        return self._decided() or f"p({self.target_name}) up to {highest:.2f}"
+
+    def _lines(self) -> list[str]:
+        row, column = divmod(self.cell, self.grid.columns)
+        return [f"frame {self.number}, at (column, row): ({column}, {row})"]
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        check(len(shared["detections"]) == 1, "lengths", "one look", len(shared["detections"]))
+        made = super()._fields(tensors, record, shared)
+        cells, visited = len(made["grid"]), len(tensors["visited"])
+        check(visited == cells, "visited", f"{cells} cells", visited)
+        for name in ("cell", "next_cell"):
+            check(record[name] < cells, name, f"a cell number below {cells}", record[name])
+        return made

@@ -1,4 +1,4 @@
-"""The record of a search or an exploration of a large picture: windows, objects and the decision."""
+"""The records of looks at windows: of a search or an exploration of a picture, and of a frame of a stream."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
-from semfov.paths.base import Record
+from semfov.paths.base import Moment, Record
 from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
-from semfov.paths.look import RecordedLook
+from semfov.paths.look import Box, RecordedLook
 from semfov.zoom.certainty import SPREAD, number_of, reacts
 from semfov.zoom.closer import SEEN
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
 
-_WINDOW = {
+_WINDOW_VALUES = {
     "fixation": Array((Number(), Number(), POSITIVE)),
     "level": WHOLE,
     "cells": Array(Number(whole=True), 4),
     "within": Maybe(Array(Number(), 4)),
 }
-WINDOW = Object(_WINDOW, None, tuple(_WINDOW))
+_WINDOW = Object(_WINDOW_VALUES, None, tuple(_WINDOW_VALUES))
 """A window in a file."""
 
 _LATTICE = {
@@ -40,7 +40,7 @@ _LATTICE = {
 }
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
-TENSORS = {
+_TENSORS = {
     "values": Field(("n",), mixed=True, finite=False),
     "cut": Field(("M",), dtype=torch.bool),
     "show": Field(("n", "C-1"), mixed=True),
@@ -51,9 +51,9 @@ TENSORS = {
 }
 """Tensors of the files of looks at windows."""
 
-VALUES: dict[str, Json] = {
+_VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
-    "windows": Array(WINDOW, "n"),
+    "windows": Array(_WINDOW, "n"),
     "unseen": Maybe(pair(Number(low=0))),
     "spread": Maybe(Number(low=0)),
     "seconds": Array(Number(low=0)),
@@ -100,7 +100,7 @@ class ZoomPath(Record):
     found: bool = field(init=False)
 
     how = "windows"
-    _format = Format("zoom path", TENSORS, VALUES)
+    _format = Format("zoom path", _TENSORS, _VALUES)
     _sentences = WINDOWS
 
     def __post_init__(self) -> None:
@@ -235,7 +235,7 @@ class ZoomPath(Record):
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
-        windows = [window_values(glance.window) for glance in self.glances]
+        windows = [_window_values(glance.window) for glance in self.glances]
         unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
         numbers = {"unseen": unseen, "spread": self.spread, "seconds": list(self.seconds)}
@@ -254,7 +254,7 @@ class ZoomPath(Record):
         for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
             fits = not len(values) or int(values.max()) < most
             check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
-        windows = [window_from(each, lattice) for each in record["windows"]]
+        windows = [_window_from(each, lattice) for each in record["windows"]]
         cuts = tensors["cut"].split(record["lengths"])
         return {
             "lattice": lattice,
@@ -270,12 +270,73 @@ class ZoomPath(Record):
         }
 
 
-def window_values(window: Window) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class WindowMoment(ZoomPath, Moment):
+    """The looks that count at one frame whose windows are looked at, and what they show.
+
+    It is the record of these looks, the last of which is at this frame. Its objects are merged from them. Those of
+    earlier frames are where they were then.
+
+    Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
+
+    Attributes:
+        next_window: the window to look at in the next frame.
+
+    Example::
+
+        moment = agent.live("person", how="windows").step(frame)
+        print(moment.window.fixation, moment.describe())
+    """
+
+    next_window: Window
+
+    _format = Format("window moment", _TENSORS, {**_VALUES, "number": WHOLE, "next_window": _WINDOW})
+
+    @property
+    def next_point(self) -> tuple[float, float]:
+        """`(x, y)` in pixels, the centre of what the next window shows."""
+        return self.next_window.centre(self.lattice)
+
+    @property
+    def next_region(self) -> Box:
+        """`(x1, y1, x2, y2)` in pixels, what the next window shows."""
+        return self.next_window.region(self.lattice)
+
+    @property
+    def window(self) -> Window:
+        """The window that was looked at in this frame."""
+        return self.glances[-1].window
+
+    def describe(self) -> str:
+        """Describe objects or decision at the frame in a few words."""
+        return self._decided() or self.objects_in_words()
+
+    def _lines(self) -> list[str]:
+        """The frame and the windows."""
+        return [f"frame {self.number}", *super()._lines()]
+
+    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors, record = super()._contents()
+        return tensors, {**record, "number": self.number, "next_window": _window_values(self.next_window)}
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        fields = super()._fields(tensors, record, shared)
+        return {
+            **fields,
+            "number": record["number"],
+            "next_window": _window_from(record["next_window"], fields["lattice"]),
+        }
+
+
+def _window_values(window: Window) -> dict[str, Any]:
     """The JSON values of a window."""
-    return {name: getattr(window, name) for name in _WINDOW}
+    return {name: getattr(window, name) for name in _WINDOW_VALUES}
 
 
-def window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:
+def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:
     """The window with these JSON values; raises `InputError` where the picture has no such level."""
     check(values["level"] < lattice.levels, "windows", f"levels below {lattice.levels}", values["level"])
     within = values["within"] and tuple(values["within"])

@@ -21,7 +21,7 @@ from semfov.errors import DataError, check
 from semfov.io.files import replacing
 from semfov.paths import Record
 from semfov.viz.drawing import photograph_of
-from semfov.viz.fixation import LookFigure, views_of
+from semfov.viz.scanpath import LookFigure, views_of
 from semfov.viz.style import STYLE
 
 Frame = NDArray[np.uint8]

@@ -15,7 +15,6 @@ from semfov.data.inputs import ImageLike, as_image
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check, check_shape
 from semfov.paths import Record
-from semfov.paths.look import LookView
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
@@ -128,15 +127,6 @@ def draw_cross(axes: Axes, point: Tensor | Sequence[float]) -> list[Artist]:
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
         *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
     ]
-
-
-def draw_view(axes: Axes, record: Record, number: int, view: LookView, most: int) -> list[Artist]:
-    """Draw gaze and most confident detections of a look into its view; labels do not cover the point of gaze."""
-    look, (x, y), reach = record.looks[number].detections, view.gaze, 8 * per_point(axes)
-    detections = confident_detections(Detections(view.boxes[None], look.scores, look.mask), most)
-    gaze = (x + 0.5 - reach, y + 0.5 - reach, x + 0.5 + reach, y + 0.5 + reach)
-    drawn = draw_look(axes, detections, record.classes, view.size, target=record.target, obstacles=[gaze])
-    return [*draw_cross(axes, view.gaze), *drawn]
 
 
 def confident_detections(detections: Detections, most: int) -> Detections:

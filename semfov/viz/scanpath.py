@@ -1,4 +1,4 @@
-"""Figures of scanpaths: where the gaze went, and what was seen from each fixation."""
+"""Figures of scanpaths: where the gaze went, what was seen from each fixation, and which objects were found."""
 
 from __future__ import annotations
 
@@ -11,31 +11,102 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.inputs import ImageLike
+from semfov.data.large import open_large
+from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
+from semfov.paths.merging import number_of
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
+    LABEL,
+    Tag,
+    check_fixation,
     check_foveal,
     choose_fixations,
+    confident_detections,
     draw_boxes,
+    draw_cross,
     draw_grid,
     draw_image,
+    draw_look,
+    draw_overlay,
     draw_scale,
-    draw_view,
+    draw_tags,
+    per_point,
     photograph_of,
+    picture_array,
 )
-from semfov.viz.objects import LegendEntry, draw_legend, draw_objects
+from semfov.viz.labels import LabelBox
 from semfov.viz.path import GazePath, LookPath
 from semfov.viz.semantic import draw_semantic_map, write_names
 from semfov.viz.style import FOUND, GAZE, TARGET, TRUTH, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-_MOST_BOXES = 6
-"""Largest number of detections of a look that are drawn."""
+_LegendEntry = tuple[str, str, str]
+"""Colour, line style and text of an entry of a legend."""
+
+_NAMED = 15  # largest number of objects whose labels name their class where only one class was searched for
+_LABELLED = 60  # largest number of objects that have labels
+_SMALL = 5.0  # font size of the labels of many objects
+
+
+def _draw_objects(
+    axes: Axes,
+    record: Record,
+    obstacles: Sequence[LabelBox] = (),
+    *,
+    last: int | None = None,
+    tagged: bool = True,
+) -> list[Artist]:
+    """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
+
+    For labels the figure must be laid out, because their positions depend on the layout.
+    """
+    last = len(record) if last is None else last
+    rows = [row for row in record.object_rows() if row["look"] <= last]
+    width, height = record.size
+    refuted = [look.box for look in record.refuted if number_of(look) <= last]
+    drawn = [artist for box in refuted for artist in draw_boxes(axes, box[None], FOUND, ":", 1.6)]
+    tags: list[Tag] = []
+    many = len(rows) > _NAMED
+    single = many and record.target is not None
+    # The most confident objects are drawn last, over the others.
+    for row in reversed(rows):
+        colour, line = (FOUND, 2.0) if row["confirmed"] else (TARGET, 0.8 if many else 1.2)
+        text = f"{row['score']:.2f}" if single else f"{row['class']} {row['score']:.2f}"
+        for turn in (0, width) if row["x2"] > width else (0,):
+            box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
+            drawn += draw_boxes(axes, Tensor([box]), colour, width=line)
+            tags.append(Tag(box, text, colour))
+    if tagged:
+        drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
+    return drawn
+
+
+def _draw_legend(axes: Axes, entries: Sequence[_LegendEntry]) -> None:
+    """Draw a legend below the picture."""
+    from matplotlib.lines import Line2D
+
+    if not entries:
+        return
+    styles: list[dict[str, Any]] = [{"color": colour, "linestyle": line} for colour, line, _ in entries]
+    lines = [Line2D([], [], linewidth=1.8, **style) for style in styles]
+    legend = axes.legend(
+        lines,
+        [text for _, _, text in entries],
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0),
+        ncols=len(entries) if len(entries) < 4 else 2,
+        frameon=False,
+        handlelength=1.6,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
 
 
 @styled
@@ -78,7 +149,7 @@ def plot_scanpath(
     )
     if isinstance(scanpath, Fixations):
         boxes = Tensor([scanpath.box]) if boxes is None and scanpath.box is not None else boxes
-        draw_place(axes, scanpath, image, boxes)
+        _draw_place(axes, scanpath, image, boxes)
         title = f"{len(scanpath)} fixations"
         if scanpath.target is not None:
             title = f"“{scanpath.target}”{ {None: '', True: ', found', False: ', not found'}[scanpath.found] }"
@@ -86,10 +157,10 @@ def plot_scanpath(
         lay_out(figure)
         GazePath(axes, scanpath.points, scanpath.size, found=bool(scanpath.found))
         return figure
-    draw_place(axes, scanpath, image, boxes)
+    _draw_place(axes, scanpath, image, boxes)
     axes.set_title(fill(scanpath.describe(), 80), parse_math=False)
     outlined = any(scanpath.outline(look) is not None for look in scanpath)
-    entries, sure = annotation_entries(scanpath, boxes), scanpath.confirmed
+    entries, sure = _annotation_entries(scanpath, boxes), scanpath.confirmed
     name, count, others = scanpath.target_name or "objects", int(sure.sum()), int((~sure).sum())
     if objects and count:
         entries.append((FOUND, "-", f"confirmed: {name} ({count})"))
@@ -98,11 +169,11 @@ def plot_scanpath(
         entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
     if objects and scanpath.refuted:
         entries.append((FOUND, ":", "not confirmed by a closer look"))
-    draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
+    _draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
     lay_out(figure)
     path = LookPath(axes, scanpath)
     if objects:
-        draw_objects(axes, scanpath, path.number_boxes)
+        _draw_objects(axes, scanpath, path.number_boxes)
     return figure
 
 
@@ -194,9 +265,9 @@ def plot_episode(
     sides: Any = place.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
     left, right = sides
     first = left.subplots()
-    draw_place(first, scanpath, image, boxes)
+    _draw_place(first, scanpath, image, boxes)
     first.set_title(scanpath.describe(), parse_math=False)
-    draw_legend(first, annotation_entries(scanpath, boxes))
+    _draw_legend(first, _annotation_entries(scanpath, boxes))
     panels = right.subplots(2, len(fixations), squeeze=False)
     for (above, below), fixation in zip(panels.T, fixations, strict=True):
         draw_image(above, views[fixation], scanpath.grid)
@@ -214,7 +285,7 @@ def plot_episode(
     return root(first)
 
 
-def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
+def _draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
     """Draw the picture, the cells of a fovea, and the true boxes of the target."""
     believed = record.belief_map(0) if isinstance(record, Record) and record.how == "fovea" else None
     grid = Grid(1, 1, record.size) if believed is None else believed[0]
@@ -224,10 +295,19 @@ def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Ten
         draw_boxes(axes, boxes, TRUTH, "--", 1.8)
 
 
-def annotation_entries(record: Record, boxes: Tensor | None) -> list[LegendEntry]:
+def _annotation_entries(record: Record, boxes: Tensor | None) -> list[_LegendEntry]:
     """Entries of a legend for the true boxes of the target, where there are any."""
     some = boxes is not None and len(boxes)
     return [(TRUTH, "--", f"annotated: {record.target_name or 'target'}")] if some else []
+
+
+def _draw_view(axes: Axes, record: Record, number: int, view: LookView, most: int) -> list[Artist]:
+    """Draw gaze and most confident detections of a look into its view; labels do not cover the point of gaze."""
+    look, (x, y), reach = record.looks[number].detections, view.gaze, 8 * per_point(axes)
+    detections = confident_detections(Detections(view.boxes[None], look.scores, look.mask), most)
+    gaze = (x + 0.5 - reach, y + 0.5 - reach, x + 0.5 + reach, y + 0.5 + reach)
+    drawn = draw_look(axes, detections, record.classes, view.size, target=record.target, obstacles=[gaze])
+    return [*draw_cross(axes, view.gaze), *drawn]
 
 
 def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
@@ -244,4 +324,125 @@ def _label_views(panels: Sequence[Axes], scanpath: Scanpath, fixations: Sequence
     for axes, fixation in zip(panels, fixations, strict=False):
         look = scanpath.looks[fixation]
         view = LookView(views[fixation], scanpath.size, look.detections.boxes[0], look.fixation)
-        draw_view(axes, scanpath, fixation, view, _MOST_BOXES)
+        _draw_view(axes, scanpath, fixation, view, most=6)
+
+
+@styled
+def plot_fixation(
+    scanpath: Record,
+    fixation: int,
+    image: Tensor | None = None,
+    view: Tensor | None = None,
+    *,
+    boxes: Tensor | None = None,
+    axes: Sequence[Axes] | None = None,
+) -> Figure:
+    """Plot one look: the looks and objects so far, what it shows with its detections, and the belief after it.
+
+    The belief is the probability of the target, or of any object if nothing was searched for. Windows have none.
+
+    Args:
+        scanpath: the record, of any kind.
+        fixation: number of the look; -1 is the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the record's own.
+        view: what the look shows, the foveated photograph `(3, h, w)`, of any size; None takes the record's own.
+        boxes: `(M, 4)`, true boxes of the target, drawn dashed.
+        axes: axes to draw in, three, or two for windows; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: the photograph is neither given nor kept by the record, or there is no such look.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_fixation(scanpath, 0), "first.png")
+    """
+    fixation, image = check_fixation(scanpath, fixation), photograph_of(scanpath, image)
+    views = None if view is None else [view] * len(scanpath)
+    seen = views_of(scanpath, image, views)[fixation]
+    return LookFigure(scanpath, image, seen, boxes, axes).show(fixation, seen)
+
+
+def views_of(record: Record, image: Tensor, views: Sequence[Tensor] | None) -> list[LookView]:
+    """What the looks showed, from the given views `(3, h, w)` of the whole picture, or from the picture `(3, H, W)`."""
+    if views is None:
+        return list(record.look_views(open_large(image)))
+    check(len(views) == len(record), "views", f"{len(record)} views, one for each fixation", len(views))
+    return [
+        LookView(view, record.size, look.detections.boxes[0], look.fixation)
+        for look, view in zip(record, views, strict=True)
+    ]
+
+
+class LookFigure:
+    """A figure of one look that can show other looks: it is laid out once, and only differences are redrawn.
+
+    Shapes: image `(3, H, W)`, boxes `(M, 4)`.
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        image: Tensor,
+        view: LookView,
+        boxes: Tensor | None = None,
+        axes: Sequence[Axes] | None = None,
+    ) -> None:
+        self.record, believed = record, record.belief_map(0)
+        panels, aspect = 2 if believed is None else 3, image.shape[-2] / image.shape[-1]
+        wide = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
+        height = max(wide * aspect / 1.05 + 0.3, 3.4)  # the view keeps its height beside a flat panorama
+        self.figure, self.axes = make_figure(1, panels, wide * panels, height, layout="compressed", axes=axes)
+        path_axes, view_axes, *others = self.axes
+        if axes is None:
+            # Hidden axes save the layout of ticks, a tenth of the time.
+            for panel in self.axes:
+                panel.xaxis.set_visible(False)
+                panel.yaxis.set_visible(False)
+        _draw_place(path_axes, record, image, boxes)
+        _draw_legend(path_axes, _annotation_entries(record, boxes))
+        self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")
+        view_axes.set(xticks=[], yticks=[], title="what the eye sees")
+        self.named = isinstance(record, Scanpath) and record.target is None
+        if believed is not None:
+            (belief_axes,), (grid, chances) = others, believed
+            draw_image(belief_axes, image, grid, grey=True)
+            self.belief = draw_overlay(belief_axes, grid, chances)
+            if self.named:
+                draw_grid(belief_axes, grid)
+            draw_scale(belief_axes, self.belief, "probability")
+        path_axes.set_title("look 0")
+        lay_out(self.figure)
+        if axes is None:
+            # The layout does not change any more, and computing it again takes as long as drawing.
+            self.figure.set_layout_engine("none")
+        self.path = LookPath(path_axes, record)
+        self.changing: list[Artist] = []
+
+    def show(self, number: int, view: LookView) -> Figure:
+        """Show a look."""
+        record, (path_axes, view_axes, *others) = self.record, self.axes
+        look, (width, height) = record.looks[number], view.size
+        for artist in self.changing:
+            artist.remove()
+        self.path.show(number)
+        path_axes.set_title(f"look {number}" if look.seconds is None else f"look {number}, {look.seconds:.2f} s")
+        self.changing = _draw_objects(path_axes, record, last=number, tagged=False)
+        self.view.set_data(picture_array(view.pixels))
+        self.view.set_extent((0, width, height, 0))
+        view_axes.set(xlim=(0, width), ylim=(height, 0))
+        self.changing += _draw_view(view_axes, record, number, view, most=10)
+        for axes, believed in zip(others, [record.belief_map(number)], strict=False):
+            assert believed is not None
+            grid, chances = believed
+            self.belief.set_data(chances.detach().cpu().reshape(grid.rows, grid.columns).numpy())
+            self.changing += draw_cross(axes, look.fixation)
+            title = f"p({record.target_name or 'any object'}) up to {float(chances.max()):.2f}"
+            if isinstance(record, Scanpath) and self.named:
+                title = f"semantic map after fixation {number}"
+                self.changing += write_names(axes, record, number)
+            axes.set_title(title, parse_math=False)
+        return self.figure

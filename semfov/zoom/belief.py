@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.evidence import STEPS, GlimpseEvidence
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
 from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.sums import Box, Cells, Place, extent, union

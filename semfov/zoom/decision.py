@@ -14,11 +14,10 @@ from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook, candidates
 from semfov.zoom.episode import WindowStep
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.evidence import GlimpseEvidence, features
 from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS, Lattice
-from semfov.zoom.networks import features
 
 
 class _LookFacts(NamedTuple):

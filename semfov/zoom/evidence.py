@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.belief.evidence import neighbourhood_peak
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
@@ -19,21 +20,172 @@ from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.networks import (
-    CROWD,
-    STEPS,
-    SURVEY,
-    Survey,
-    features,
-    hint_maps,
-    memory_maps,
-    neighbourhood_mean,
-    small_network,
-    survey_fields,
-    tapered,
-    through,
-)
 from semfov.zoom.photograph import PHOTOGRAPH, PhotographEvidence, photograph_fields
+
+STEPS = 3
+"""Largest number of octaves between a look and the closer looks that are predicted from it."""
+
+_CROWD = 9
+"""Side in cells of the square over which the networks read the mean of the strongest hints."""
+
+_FLOOR = 1e-4
+
+_CHANNELS, _WIDTH = 8, 48
+_HINTS, _MEMORY = 11, 2
+_NEAR, _WIDE = 5, (_CROWD, 17)
+"""Sides in cells of the squares over which sums of hints are averaged: the neighbours, and the surroundings."""
+_INPUTS = _HINTS + _MEMORY + 2 * _CHANNELS + len(_WIDE) * (_CHANNELS + 2)
+_LOWEST = -0.8
+"""About the feature of a score of 0."""
+_LARGEST = 1e6
+
+
+def features(scores: Tensor) -> Tensor:
+    """Logarithms of scores, shifted and scaled to about [-1, 1.5]."""
+    return (scores + _FLOOR).log().mul_(0.25).add_(1.5)
+
+
+def _hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
+    """List the maps of one look: hints, detections and sizes of objects in and around each cell.
+
+    Shapes: own `(T, rows, columns)`, best `(rows, columns)`, detections `(T, rows, columns)`, size `(rows, columns)`,
+    crowd `(rows, columns)` → `(T, rows, columns)`.
+    """
+
+    def wide(values: Tensor) -> Tensor:
+        return values.expand(own.shape)
+
+    # One call for the peaks of both: after a pass of the detector a call costs more than the work in it.
+    peak, near = neighbourhood_peak(torch.cat([own, detections]), 3).chunk(2)
+    return [
+        own,
+        wide(best),
+        peak,
+        neighbourhood_peak(peak, 7),
+        _neighbourhood_mean(own, 5),
+        wide(crowd),
+        wide(size / 4 - 1),
+        wide((size > 0).to(own)),
+        detections,
+        near,
+        wide(own.amax((-1, -2), keepdim=True)),
+    ]
+
+
+def _memory_maps(own: Tensor, before: Tensor | None) -> list[Tensor]:
+    """What an earlier, coarser look predicted for each cell, and whether there was one, two maps like `own`."""
+    prediction = torch.full_like(own, -1.0) if before is None else before / 4
+    return [prediction, torch.full_like(own, float(before is not None))]
+
+
+def _tapered(border: Tensor, span: int) -> Tensor:
+    """Weights `(span,)` of the cells along a side of a window, from four learned ones `(4,)` from border to middle."""
+    cell = torch.arange(span, device=border.device)
+    ring = torch.minimum(cell, span - 1 - cell) * 8 // span
+    return border.sigmoid()[ring.clamp(max=3)]
+
+
+def _neighbourhood_mean(values: Tensor, side: int) -> Tensor:
+    """Mean of maps `(T, rows, columns)` over the square about each cell; what lies beyond the map counts as 0."""
+    # Products with banded matrices take a tenth of the time of `avg_pool2d`.
+    down, across = (_band(length, side, values.dtype, values.device) for length in values.shape[-2:])
+    return down @ values @ across
+
+
+@constant
+def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix `(length, length)` whose product with a line takes the mean over `side` neighbours."""
+    place = torch.arange(length, device=device)
+    return ((place[:, None] - place).abs() <= side // 2).to(dtype) / side
+
+
+def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
+    """Compute selected outputs of a network without calls of modules, which cost most of the time in one so small."""
+    last = len(network) - 1
+    for place, layer in enumerate(network):
+        if isinstance(layer, nn.Linear):
+            if outputs is None or place < last:
+                values = F.linear(values, layer.weight, layer.bias)
+            else:
+                values = F.linear(values, layer.weight[outputs], layer.bias[outputs])
+        elif isinstance(layer, nn.GELU):
+            values = _gelu(values)
+        elif layer.training:  # dropout
+            values = layer(values)
+    return values
+
+
+def _gelu(values: Tensor) -> Tensor:
+    """GELU of transposed matrices and repeated vectors: torch gives contiguous arrays to oneDNN, whose call is slow."""
+    return F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
+
+
+def _small_network(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """A network of two hidden layers."""
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
+    )
+
+
+class Survey(nn.Module):
+    r"""Predicts how many objects of any class closer looks find that a look did not.
+
+    The expected number in a part w of the window is a sum over its cells. Its weights fall off towards the border of w,
+    which cuts objects that lie there:
+
+    .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
+
+    The rate λ is a network over the hints about a cell. Which classes these are matters, because some come in numbers.
+    The network therefore reads, besides the strongest hint, a few sums over the hints of all classes with learned
+    weights, in the cell itself and averaged over its neighbours.
+    """
+
+    def __init__(self, classes: int, *, foresight: float = 0.35) -> None:
+        super().__init__()
+        self.foresight = foresight
+        self.mix = nn.Linear(classes, _CHANNELS, bias=False)
+        nn.init.normal_(self.mix.weight, std=0.3)
+        self.rate = _small_network(_INPUTS, _WIDTH, STEPS)
+        self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
+
+    def rates(self, look: Gist, targets: Tensor | None = None, before: Tensor | None = None) -> Tensor:
+        """Predict how many objects centred in each cell closer looks find that this look did not.
+
+        Shapes: targets `(1,)`, before `(1, rows, columns)` → `(1, 3, rows, columns)`.
+        """
+        hints, best = features(look.scores), features(look.best)
+        # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
+        detections = look.found.to(best).amax(-1)
+        mix = self.mix.weight
+        kinds = torch.addmm(-_LOWEST * mix.sum(1, keepdim=True), mix, hints.flatten(0, 1).mT).unflatten(1, best.shape)
+        around = torch.cat([kinds, best[None], detections[None]])
+        surroundings = [_neighbourhood_mean(around, side) for side in _WIDE]
+        crowd = surroundings[_WIDE.index(_CROWD)][_CHANNELS]
+        best_maps = [
+            *_hint_maps(best[None], best, detections[None], look.size, crowd),
+            *_memory_maps(best[None], before),
+        ]
+        maps = torch.cat([*best_maps, kinds, _neighbourhood_mean(kinds, _NEAR), *surroundings])
+        value = through(self.rate, maps.movedim(0, -1)) - 6
+        return value.clamp(max=3).movedim(-1, 0)[None]
+
+    def taper(self, span: int) -> Tensor:
+        """Weights r of the cells along a side of a window; objects at its border are cut; → `(span,)`."""
+        return _tapered(self.border, span)
+
+
+def _survey_fields() -> dict[str, Field]:
+    """Tensors of a survey in a file, K classes."""
+    return {
+        "survey.mix.weight": Field((_CHANNELS, "K"), low=-_LARGEST, high=_LARGEST),
+        **perceptron("survey.rate", _INPUTS, _WIDTH, STEPS),
+        "survey.border": Field((4,), low=-1e3, high=1e3),
+    }
+
+
+_SURVEY = Object({"foresight": Number(0, 1)})
+"""Settings of a survey in a file."""
+
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
@@ -106,7 +258,7 @@ class GlimpseEvidence(Pretrained):
             **perceptron("judge", CASE, _JUDGE_WIDTH),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
-            **survey_fields(),
+            **_survey_fields(),
             "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
             "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
             **photograph_fields(),
@@ -117,7 +269,7 @@ class GlimpseEvidence(Pretrained):
             "patience": Number(above=0, high=_LARGEST),
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
-            "survey": SURVEY,
+            "survey": _SURVEY,
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
             "photograph": PHOTOGRAPH,
@@ -150,9 +302,9 @@ class GlimpseEvidence(Pretrained):
         self.company = nn.Sequential(
             nn.Linear(classes + _SUMMARY + 1, width), nn.GELU(), nn.Dropout(0.4), nn.Linear(width, classes)
         )
-        self.shape = small_network(_SHAPE, _SHAPE_WIDTH, 1)
-        self.rate = small_network(_RATE, _RATE_WIDTH, STEPS)
-        self.judge = small_network(CASE, _JUDGE_WIDTH, 1)
+        self.shape = _small_network(_SHAPE, _SHAPE_WIDTH, 1)
+        self.rate = _small_network(_RATE, _RATE_WIDTH, STEPS)
+        self.judge = _small_network(CASE, _JUDGE_WIDTH, 1)
         with torch.no_grad():
             # Until the network is fitted, the best score is the probability.
             for parameter in self.judge[-1].parameters():
@@ -249,8 +401,8 @@ class GlimpseEvidence(Pretrained):
         best, own = hints[0], hints[1:]
         detections = look.found.index_select(-1, columns).movedim(-1, 0).to(own)
         usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
-        crowd = neighbourhood_mean(best[None], CROWD)[0]
-        maps = [*hint_maps(own, best, detections, look.size, crowd), usual.expand_as(own), *memory_maps(own, before)]
+        crowd = _neighbourhood_mean(best[None], _CROWD)[0]
+        maps = [*_hint_maps(own, best, detections, look.size, crowd), usual.expand_as(own), *_memory_maps(own, before)]
         value: Tensor = through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
@@ -276,7 +428,7 @@ class GlimpseEvidence(Pretrained):
         Returns:
             `(span,)`, from 0 to 1.
         """
-        return tapered(self.border, span)
+        return _tapered(self.border, span)
 
     def certainty_in(self, lattice: Lattice) -> Certainty | None:
         """Choose the certainty of a picture.

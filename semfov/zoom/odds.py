@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.scene import boxes_meet
-from semfov.zoom.evidence import GlimpseEvidence, pool_spans
+from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_spans
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.networks import STEPS
 from semfov.zoom.sums import Box, Cells, Place, extent, union
 
 _UNKNOWN = -4.0

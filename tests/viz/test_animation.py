@@ -14,7 +14,7 @@ from PIL import Image
 from semfov import Detections, Grid
 from semfov.viz import animate, plot_fixation
 from semfov.viz.animation import Film, _in_one_palette, _look_frames, render
-from semfov.viz.fixation import LookFigure, views_of
+from semfov.viz.scanpath import LookFigure, views_of
 from tests import small
 from tests.refusals import refused
 

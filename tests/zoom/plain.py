@@ -6,10 +6,9 @@ import numpy as np
 import torch
 
 from semfov.zoom import GlimpseEvidence, Lattice
-from semfov.zoom.evidence import pool
+from semfov.zoom.evidence import STEPS, pool
 from semfov.zoom.glances import Glance
 from semfov.zoom.hints import Gist
-from semfov.zoom.networks import STEPS
 
 
 def cells_shown(lattice: Lattice, look: Gist) -> tuple[slice, slice]:

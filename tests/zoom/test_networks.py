@@ -6,13 +6,13 @@ from torch.nn import functional
 
 from semfov.belief.evidence import neighbourhood_peak
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, neighbourhood_mean, small_network, through
+from semfov.zoom.evidence import _neighbourhood_mean, _small_network, features, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
 def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     torch.manual_seed(0)
-    network, values = small_network(5, 16, 3).to(device), torch.randn(shape, device=device)
+    network, values = _small_network(5, 16, 3).to(device), torch.randn(shape, device=device)
     expected = network(values)
     torch.testing.assert_close(through(network, values), expected)
     torch.testing.assert_close(through(network, values, slice(1, 2)), expected[..., 1:2])
@@ -20,7 +20,7 @@ def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
 
 def test_a_network_called_layer_by_layer_has_the_gradient_of_the_module():
     torch.manual_seed(0)
-    network, values = small_network(5, 16, 3), torch.randn(40, 5)
+    network, values = _small_network(5, 16, 3), torch.randn(40, 5)
     (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)
@@ -55,6 +55,6 @@ def test_means_and_peaks_of_neighbourhoods_equal_pooling(side, shape, device):
     values = torch.randn(shape, device=device)
     settings = {"kernel_size": side, "stride": 1, "padding": side // 2}
     expected = functional.avg_pool2d(values[:, None], **settings)[:, 0]
-    torch.testing.assert_close(neighbourhood_mean(values, side), expected)
+    torch.testing.assert_close(_neighbourhood_mean(values, side), expected)
     expected = functional.max_pool2d(values[:, None], **settings)[:, 0]
     torch.testing.assert_close(neighbourhood_peak(values, side), expected, rtol=0, atol=0)

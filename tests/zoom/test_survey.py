@@ -8,9 +8,9 @@ from semfov.errors import InputError
 from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.evidence import Survey
 from semfov.zoom.glances import half_steps, on_lattice
 from semfov.zoom.hints import Gist
-from semfov.zoom.networks import Survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
 CLASSES = 3
