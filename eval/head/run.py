@@ -26,10 +26,9 @@ from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
-from semfov.head.scenes import Flat, Panorama
+from semfov.head.scenes import Flat, Panorama, World
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
-from semfov.head.world import World
 from semfov.metrics.exploration import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight

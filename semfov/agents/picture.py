@@ -15,7 +15,7 @@ from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, is_scene, open_scene
-from semfov.head.world import World
+from semfov.head.scenes import World
 from semfov.zoom.lattice import Lattice
 
 KindOfLook = Literal["fovea", "windows", "head"]

@@ -98,7 +98,7 @@ def closer_features(
 
     1. the probability that the image holds the target, before the closer look,
     2. the probability that the cell holds it,
-    3. the evidence of the looks before, score times `soft` footprint (`semfov.decision.strength`),
+    3. the evidence of the looks before, score times `soft` footprint,
     4. :math:`s_{mt} o_m`, 5. :math:`\max_l s_{lt}`,
     6. :math:`\max_l o_l \max_{k \ne t} s_{lk}`, the evidence for other classes there,
     7. :math:`s_{mt}`,

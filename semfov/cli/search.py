@@ -41,7 +41,7 @@ from semfov.data.classes import class_index
 from semfov.data.sources import embedded_picture
 from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import DataError, InputError, SemfovError, check, check_options, lookup
-from semfov.head.world import World
+from semfov.head.scenes import World
 from semfov.io.files import check_writable, plain_name, sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained

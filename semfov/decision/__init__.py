@@ -1,15 +1,17 @@
 """Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
 
 from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
-from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
 from semfov.decision.rule import (
     OUTCOMES,
     CloseUp,
     Decision,
     Outcome,
+    cell_of,
     check_thresholds,
     conclude,
+    confirms,
     decide,
+    goal_cells,
     outcome_by_gain,
     outcome_of,
     place_known,
@@ -39,7 +41,5 @@ __all__ = [
     "outcome_of",
     "place_known",
     "settle",
-    "strength",
-    "strongest",
     "verified",
 ]

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -12,8 +12,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.verification import closer_features
-from semfov.decision.evidence import cell_of
-from semfov.decision.rule import CloseUp, place_known
+from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou
@@ -100,7 +99,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look; box `(4,)`."""
         self._known.append((self._frame, place))
-        return CloseUp(self._fixation, self.target, self._cell(box), box, place, presence, self._number)
+        return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._number)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
         """Look closely at a candidate, unless a look showed it so, and dismiss it; → `(7,)`."""
@@ -123,11 +122,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._examined = [place for place in self._examined if place[0] >= oldest]
         self._known = [known for known in self._known if known[0] >= oldest]
 
-    def move(self, look: CloseUp, box: Tensor) -> CloseUp:
-        """The record of a closer look whose target has moved to another box, and its cell."""
-        return replace(look, box=box, cell=self._cell(box))
-
-    def _cell(self, box: Tensor) -> int | None:
+    def cell(self, box: Tensor) -> int | None:
+        """The cell that a box `(4,)` covers most; None where places are no cells."""
         return None if self.grid is None else cell_of(box, self.grid)
 
     def _again(self, boxes: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The decision of a search: whether the image holds the target, where, and with what probability."""
+"""The decision of a search: whether the image holds the target, where, and with what probability, on what evidence."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,10 +11,9 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision.evidence import confirms, strength, strongest
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check
+from semfov.errors import check, check_finite, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.io.schema import is_number
 
@@ -106,9 +105,10 @@ def conclude(
         return Decision(OUTCOMES[outcome], probability)
     if cell is None:
         cells = belief.probability(target)[0]
-        strengths = torch.stack([cells.new_zeros(len(grid)), *(strength(look, grid, target) for look in looks)]).amax(0)
-        cell = int((cells * strengths if bool(strengths.any()) else cells).argmax())
-    return Decision("found", probability, cell, strongest(looks, grid, cell, target)[1])
+        strengths = (_strength(look, grid, target) for look in looks)
+        evidence = torch.stack([cells.new_zeros(len(grid)), *strengths]).amax(0)
+        cell = int((cells * evidence if bool(evidence.any()) else cells).argmax())
+    return Decision("found", probability, cell, _strongest(looks, grid, cell, target)[1])
 
 
 def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
@@ -165,3 +165,52 @@ def check_thresholds(confirm: float | None, give_up: float | None) -> None:
     """Raise `InputError` unless each threshold is None or a probability."""
     for name, value in (("confirm", confirm), ("give_up", give_up)):
         check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
+
+
+def _strength(detections: Detections, grid: Grid, target: int) -> Tensor:
+    """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
+    scores = detections.mask[0] * detections.scores[0, :, target]
+    by_detection = grid.footprint(detections.boxes, "soft")[0] * scores[:, None]
+    return by_detection.amax(0) if len(by_detection) else by_detection.sum(0)
+
+
+def _strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
+    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint; → `(4,)`."""
+    evidence, box = 0.0, None
+    for look in looks:
+        weight = grid.footprint(look.boxes, "soft")[0, :, cell] * look.mask[0]
+        scores = weight * look.scores[0, :, target]
+        if scores.numel() and float(scores.max()) > evidence:
+            evidence, box = float(scores.max()), look.boxes[0, int(scores.argmax())]
+    return evidence, box
+
+
+def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
+    """Whether a detection over each cell `(B,)` has `target` as its best class with at least this score, `(B,)`."""
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
+    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    return (there & sure).any(-1)
+
+
+def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
+    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
+
+    Shapes: boxes `(M, 4)` → `(X·Y,)`.
+    """
+    tensor = torch.as_tensor(boxes).to(like)
+    check_shape(tensor, "boxes", None, 4)
+    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
+    check_finite(tensor, "boxes")
+    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
+    check(
+        full,
+        "boxes",
+        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
+        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
+    )
+    return grid.footprint(tensor).any(-2)
+
+
+def cell_of(box: Tensor, grid: Grid) -> int:
+    """The cell that a box `(4,)` covers most (its `soft` footprint)."""
+    return int(grid.footprint(box[None], "soft")[0].argmax())

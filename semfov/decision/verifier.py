@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Generic, NamedTuple
 
 import torch
@@ -92,7 +93,8 @@ class Verifier(Generic[LookType]):
             for number, verdict in enumerate(self.verdicts):
                 box = _follow_target(verdict.look.box, self.places.detections, verdict.look.target)
                 if box is not verdict.look.box:
-                    self.verdicts[number] = verdict._replace(look=self.places.move(verdict.look, box))
+                    moved = replace(verdict.look, box=box, cell=self.places.cell(box))
+                    self.verdicts[number] = verdict._replace(look=moved)
         self._choose(last=last)
 
     def look(self) -> CloseUp:

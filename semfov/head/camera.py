@@ -13,10 +13,8 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
 from semfov.errors import DataError, InputError, check
-from semfov.head.scenes import Flat, Panorama
+from semfov.head.scenes import AROUND, FIELDS, Flat, Panorama, Sphere, World, check_fields
 from semfov.head.speeds import Speeds
-from semfov.head.sphere import AROUND, Sphere
-from semfov.head.world import FIELDS, World, check_fields
 from semfov.sensor.sphere import Camera, panorama_directions
 
 _TRIES = 25

@@ -1,6 +1,5 @@
 """The expected gain of a look from each pose and fixation, and acquisition functions of a head that use it."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import chain
 
@@ -29,17 +28,16 @@ OUT = -1e6
 """Value of actions that must not be chosen."""
 
 
-class LookGain(nn.Module, ABC):
-    """Base of the expected gains of a look."""
+class LookGain(nn.Module):
+    """Base of the expected gains of a look: called with a belief, the present pose `here` and the numbers of `poses`.
+
+    It gives the gains `(A,)` of all actions from these poses; the values of other actions have no meaning.
+    """
 
     def __init__(self, views: Views) -> None:
         super().__init__()
         self.views = views
         self._acuity = [views.acuity(distance) for distance in views.distances]
-
-    @abstractmethod
-    def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)` of all actions from the given poses; the values of other actions have no meaning."""
 
 
 class SearchGain(LookGain):

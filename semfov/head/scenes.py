@@ -1,7 +1,12 @@
-"""Pictures that a head looks around in: panoramas around the viewer, and large pictures in front of it."""
+"""Scenes larger than the eye's field of view, seen through a window that a head moves: their geometry and their views.
+
+Panoramas lie around the viewer, and large pictures in front of it.
+"""
 
 import math
 import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,9 +18,15 @@ from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
-from semfov.head.sphere import Sphere
-from semfov.head.world import BLANK, FIELDS, World, check_fields
+from semfov.io.schema import is_number
 from semfov.sensor.perspective import even_rows, go_around, sample
+from semfov.sensor.sphere import Boxes, Camera, Regions, panorama_directions, panorama_points
+
+FIELDS = (60.0,)
+"""Default fields of view in degrees."""
+
+AROUND = (-180.0, 180.0)
+"""Limits of pan of a head that turns all the way round."""
 
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
@@ -25,6 +36,192 @@ _PROPORTION = 0.1
 
 _DEGREE = 640 / 60
 """Default number of pixels of a flat picture per degree."""
+
+
+def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
+    """Raise `InputError` unless fields of view are ascending angles below 180 degrees."""
+    fits = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
+    fits = fits and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
+    check(fits, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
+    return tuple(float(field) for field in fields)
+
+
+class World(ABC):
+    """Base of the scenes that a head looks around in: their geometry, and the view from each pose.
+
+    A pose of the head has three numbers, all in degrees: pan to the right, tilt up, and the field of view across. A
+    point of the scene has D coordinates. Cameras of your own need less (`semfov.head.PanTiltCamera`).
+
+    Attributes:
+        scene: cells of the whole scene, in pixels of its picture.
+        size: `(w, h)` of a view in pixels.
+        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
+        speeds: of eye and head.
+        centres: `(S, D)`, centres of the cells.
+        area: `(S,)`, relative areas of the cells, 1 on average.
+        closed: whether the left and the right border of the picture meet.
+        still: whether two views from one pose are equal, as those of a picture are.
+    """
+
+    scene: Grid
+    size: tuple[int, int]
+    fields: tuple[float, ...]
+    speeds: Speeds
+    centres: Tensor
+    area: Tensor
+    closed: bool = False
+    still: bool = True
+
+    _drawn: Tensor | LargePicture | None = None
+
+    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """The picture from a pose `(3,)`, `(3, h, w)` in [0, 1], and the pose where it was taken."""
+        raise InputError(
+            "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
+        )
+
+    def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
+        """The view `(3, h, w)` in a direction, pan to the right and tilt up in degrees, of a field of view across."""
+        return self.view(torch.tensor([*direction, field]))[0]
+
+    @abstractmethod
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels `(N, 2)` of the view from a pose at points `(N, D)`, and whether they are inside it `(N,)`."""
+
+    @abstractmethod
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Points `(N, D)` of the scene that pixels `(N, 2)` of the view from a pose show."""
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cells `(N,)` of the scene that contain points `(N, D)`."""
+        return self.scene.cell_of(self.pixels_of(points))
+
+    @abstractmethod
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """Positions `(N, 2)` of points `(N, D)` in the scene's picture."""
+
+    @abstractmethod
+    def angles_of(self, points: Tensor) -> Tensor:
+        """Directions of points `(N, D)`, as a head would turn to them: pan right and tilt up `(N, 2)`."""
+
+    @abstractmethod
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Angles `(...)` in degrees by which the head turns between poses `(..., 3)`."""
+
+    @abstractmethod
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Angles `(...)` in degrees by which the eye turns between pixels `(..., 2)` of a view."""
+
+    @abstractmethod
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene."""
+
+    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
+        """Regions of the scene that boxes `(M, 4)` in the view from a pose cover."""
+        return Boxes(self.boxes(boxes, pose))
+
+    @abstractmethod
+    def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """Smallest boxes `(M, 4)` of the scene's picture around those of a view; a seam does not cut them."""
+
+    def image(self) -> Tensor | LargePicture | None:
+        """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""
+        return self._drawn
+
+
+def _angle_between(one: Tensor, other: Tensor) -> Tensor:
+    r"""Angle between directions `(..., 3)` of any length in degrees, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
+    one, other = torch.broadcast_tensors(one, other)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
+    return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
+
+
+class Sphere(World):
+    """Directions around a perspective camera (`semfov.sensor.sphere.Camera`), without anything to see.
+
+    A pose is pan (yaw), tilt (pitch) and horizontal field of view in degrees. Points are unit directions, so D is 3.
+    The scene's picture is an equirectangular panorama.
+    """
+
+    closed = True
+
+    def __init__(
+        self,
+        picture: tuple[int, int],
+        size: tuple[int, int],
+        *,
+        pan: tuple[float, float] = AROUND,
+        tilt: tuple[float, float] = (-90.0, 90.0),
+        fields: tuple[float, ...] = FIELDS,
+        speeds: Speeds | None = None,
+        cell: float = 6.0,
+    ) -> None:
+        check(picture[0] % 2 == 0, "image", "an even number of columns", picture[0])
+        check(0 < cell <= 90, "cell", "a positive angle of at most 90 degrees", cell)
+        check(-360 <= pan[0] <= pan[1] <= 360, "pan", "limits in degrees, left and right", pan)
+        check(-90 <= tilt[0] <= tilt[1] <= 90, "tilt", "limits from -90 to 90 degrees, down and up", tilt)
+        self.picture, self.size, self.cell = picture, size, cell
+        self.pan, self.tilt, self.fields = pan, tilt, check_fields(fields)
+        self.around = pan[1] - pan[0] >= 360  # whether the head turns all the way round
+        self.speeds = Speeds() if speeds is None else speeds
+        self.scene = Grid(round(360 / cell), round(180 / cell), picture)
+        self.centres = panorama_directions(self.scene.centres, picture)
+        weight = torch.linalg.vector_norm(self.centres[:, ::2], dim=-1)
+        self.area = weight / weight.mean()
+
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels at which directions are seen."""
+        return Camera(pose, self.size).points(points)
+
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Directions of pixels."""
+        return Camera(pose, self.size).directions(points)
+
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """Pixels of the panorama at directions."""
+        return panorama_points(points, self.picture)
+
+    def angles_of(self, points: Tensor) -> Tensor:
+        """Pan from -180 to 180 degrees, and tilt."""
+        x, y, z = points.unbind(-1)
+        return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
+
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Angle between the optical axes of two cameras."""
+        middle = torch.tensor([[0.0, 0.0]])
+        return _angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
+
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Angle between the directions of two pixels."""
+        camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
+        rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
+        return _angle_between(*rays)
+
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Rings of poses around the viewer, or arcs of them between the limits of pan."""
+        high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
+        middle, reach = (self.tilt[0] + self.tilt[1]) / 2, (self.tilt[1] - self.tilt[0]) / 2
+        number = math.floor(reach / (high / 2))
+        left, width = self.pan[0], min(self.pan[1] - self.pan[0], 360)
+        rings = []
+        for row in range(-number, number + 1):
+            pitch = middle + row * high / 2
+            # In a ring that tiles, the sides of neighbouring windows meet even at the corners nearest to the horizon.
+            tiles = (row + number) % 2 == 0
+            low = max(abs(pitch) - high / 2, 0) if tiles else abs(pitch)
+            count = 2 * math.ceil(width * math.cos(math.radians(low)) / field - 1e-9)
+            # The ends of an arc are both poses; those of a ring are the same one.
+            steps = range(count if self.around else count + 1)
+            rings.append([torch.tensor([width * n / max(count, 1) + left, pitch, field]) for n in steps])
+        return rings
+
+    def places(self, boxes: Tensor, pose: Tensor) -> Regions:
+        """Regions of the sphere."""
+        return Regions(boxes, Camera(pose.expand(len(boxes), 3), self.size))
+
+    def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
+        """Smallest boxes around the regions in the panorama."""
+        return self.places(boxes, pose).panorama_boxes(self.picture)
 
 
 class Panorama(Sphere):
@@ -82,7 +279,7 @@ class Panorama(Sphere):
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Render the view of the camera."""
         if self._source is None:
-            raise InputError(BLANK)
+            return super().view(pose)
         return sample(self._source, pose, self.size).clamp(0, 1), pose
 
 
@@ -159,7 +356,7 @@ class Flat(World):
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """The content of the window, resampled to the size of a view."""
         if self.opened is None:
-            raise InputError(BLANK)
+            return super().view(pose)
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 

@@ -9,8 +9,8 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.errors import check
+from semfov.head.scenes import World, check_fields
 from semfov.head.speeds import Speeds
-from semfov.head.world import World, check_fields
 
 CELL_POINTS = 10
 """Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
@@ -53,6 +53,9 @@ class Views:
         self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.cell_of(self.gaze)
+        centres = self.view_grid.centres
+        # For each field of view, angles between the cells of a view, `(cells, cells)`.
+        self._shifts = [world.shift(centres[:, None], centres[None], field) for field in fields]
         self.visible: list[Tensor] = []
         self.points: list[Tensor] = []
         for pose in self.poses:
@@ -103,12 +106,6 @@ class Views:
     def acuity(self, distance: Tensor) -> Tensor:
         """Relative acuity of the fovea, 1 / (1 + d / σ), at distances d `(...)`; 0 for cells that were never seen."""
         return 1 / (1 + distance / self.fovea)
-
-    @cached_property
-    def _shifts(self) -> list[Tensor]:
-        """For each field of view, angles between the cells of a view, `(cells, cells)`."""
-        centres = self.view_grid.centres
-        return [self.world.shift(centres[:, None], centres[None], field) for field in self.fields]
 
     def durations(self, action: int, speeds: Speeds) -> Tensor:
         """Time from one action to each other one, the look there included, `(A,)` in seconds."""

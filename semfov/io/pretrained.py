@@ -50,7 +50,8 @@ class Pretrained(StatedModule):
 
     def _stated(self) -> dict[str, Any]:
         """The values of the record that tell what the numbers are of."""
-        return {name: value for name, value in self._record().items() if name in ("classes", "edges", "epsilon")}
+        told = self._record()
+        return {name: value for name, value in told.items() if name in ("classes", "edges", "epsilon", "layers")}
 
     @classmethod
     @abstractmethod
@@ -72,7 +73,7 @@ class Pretrained(StatedModule):
         Returns:
             The sha256 in hexadecimal.
         """
-        return checksum(without_settings(self.state_dict()), {"kind": self.kind, **self._record()})
+        return checksum(self._tensors(), {"kind": self.kind, **self._record()})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:

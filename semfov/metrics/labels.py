@@ -34,13 +34,14 @@ def as_outcomes(values: Any, argument: str) -> Tensor:
     return tensor == 1
 
 
-def as_labels(labels: Any, argument: str) -> list[Hashable]:
-    """Labels as values that are equal where they are; a tensor's elements are each equal to themselves alone."""
+def as_labels(labels: Any, argument: str, *, least: int = 0) -> list[Hashable]:
+    """At least `least` labels, as values that are equal where they are; a tensor's elements equal themselves alone."""
     check(hasattr(labels, "__iter__"), argument, "labels in a row", f"a {type(labels).__name__}")
     given = labels if isinstance(labels, Tensor | np.ndarray) else [*labels]
     check(not hasattr(given, "ndim") or given.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(given))}")
     values = given.tolist() if isinstance(given, Tensor | np.ndarray) else [_plain(each) for each in given]
     check(not any(isinstance(each, float) and math.isnan(each) for each in values), argument, "labels", "NaN")
+    check(len(values) >= least, argument, "at least one label", "none")
     return values
 
 

@@ -18,10 +18,8 @@ from semfov.detection.objects import Objects
 from semfov.detection.placement import resize
 from semfov.errors import InputError, check
 from semfov.head.camera import CameraScene
-from semfov.head.scenes import Flat, Panorama
-from semfov.head.sphere import Sphere
+from semfov.head.scenes import Flat, Panorama, Sphere, World
 from semfov.head.views import Views
-from semfov.head.world import World
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS

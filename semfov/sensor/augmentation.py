@@ -74,7 +74,10 @@ class RandomFoveation(IntensityAugmentationBase2D):
         check(growth > 0, "growth", "a positive number", growth)
         check(0 <= p <= 1, "p", "a probability from 0 to 1", p)
         lookup(convention, get_args(Convention), "pyramid convention")
-        self._param_generator = _Fixations(float(low), float(high))
+        widths, whole = (float(low), float(high)), (0.0, 1.0)
+        self._param_generator = _Fixations(
+            (widths, "sigma", None, None), (whole, "x", None, None), (whole, "y", None, None)
+        )
         self.flags = {"levels": levels, "growth": growth, "convention": convention}
 
     def apply_transform(
@@ -98,10 +101,6 @@ class RandomFoveation(IntensityAugmentationBase2D):
 
 class _Fixations(PlainUniformGenerator):
     """Random fixations, uniform over an image, and random widths."""
-
-    def __init__(self, low: float, high: float) -> None:
-        whole = (0.0, 1.0)
-        super().__init__(((low, high), "sigma", None, None), (whole, "x", None, None), (whole, "y", None, None))
 
     def __repr__(self) -> str:
         return f"sigma={self.samplers[0][0]}"

@@ -11,7 +11,7 @@ from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_poi
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
-from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, pixel_positions, widened
+from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, widened
 from semfov.threads import one_thread_if_small
 
 # Elements of the views that are made together on a CPU; those of many views leave the processor's cache.
@@ -263,13 +263,19 @@ def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tens
     return list(zip(pieces[0::2], pieces[1::2], strict=True))
 
 
+def _pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
+    """Positions of the `count` pixels of band k along an image side of `length` pixels: `(count,)`, float64."""
+    place = torch.arange(count, dtype=torch.float64)
+    return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5
+
+
 @constant
 def _layout(
     sizes: tuple[tuple[int, int], ...], convention: Convention, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Positions of the pixels along x and y of every band, exponents of the growth, and indices of axes and widths."""
     lines = [(axis, k) for k in range(len(sizes)) for axis in (0, 1)]
-    place = [pixel_positions(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
+    place = [_pixel_positions(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
     counts = torch.tensor([sizes[k][1 - axis] for axis, k in lines])
     axes, levels = (torch.tensor(n).repeat_interleave(counts) for n in zip(*lines, strict=True))
     power = torch.arange(len(sizes))

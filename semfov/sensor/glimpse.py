@@ -72,10 +72,12 @@ def glimpse(
     windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image)
     value = 0.0 if padding_mode == "zeros" else fill_value
 
-    def view(b: int, g: int) -> Tensor:
-        return _window(image[b], windows[b, g], size, padding_mode, value)
-
-    result = stacked_views(view, batch, windows.shape[1], image.new_empty(image.shape[1], size[1], size[0]))
+    result = stacked_views(
+        lambda b, g: _window(image[b], windows[b, g], size, padding_mode, value),
+        batch,
+        windows.shape[1],
+        image.new_empty(image.shape[1], size[1], size[0]),
+    )
     return result if boxes.ndim == 3 else result[:, 0]
 
 

@@ -197,13 +197,10 @@ def _product(image: Tensor, lines: Lines) -> Tensor:
     _, edge, span = lines.ends.shape
     made = lines.rows + lines.middle.shape[:2].numel()
     top = lines.ends[0, : lines.rows] @ image[..., :span, :]
-    inner = (lines.middle @ _windows(image, lines)).flatten(-3, -2)
-    bottom = lines.ends[1, edge - lines.length + made :] @ image[..., image.shape[-2] - span :, :]
-    return torch.cat([top, inner, bottom], -2)
-
-
-def _windows(image: Tensor, lines: Lines) -> Tensor:
-    """The overlapping input windows of the tiles, `(..., tiles, window, w)`."""
     tiles, _, window = lines.middle.shape
     stop = lines.start + (tiles - 1) * lines.shift + window
-    return image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT
+    # The overlapping input windows of the tiles, `(..., tiles, window, w)`.
+    windows = image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT
+    inner = (lines.middle @ windows).flatten(-3, -2)
+    bottom = lines.ends[1, edge - lines.length + made :] @ image[..., image.shape[-2] - span :, :]
+    return torch.cat([top, inner, bottom], -2)

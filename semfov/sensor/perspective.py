@@ -50,10 +50,12 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     poses = as_positions(pose if pose.ndim == 3 else pose[:, None], panorama)
     source = go_around(even_rows(panorama) if antialias else panorama)
 
-    def view(b: int, g: int) -> Tensor:
-        return sample(source[b], poses[b, g], size, antialias=antialias)
-
-    result = stacked_views(view, batch, poses.shape[1], panorama.new_empty(panorama.shape[1], size[1], size[0]))
+    result = stacked_views(
+        lambda b, g: sample(source[b], poses[b, g], size, antialias=antialias),
+        batch,
+        poses.shape[1],
+        panorama.new_empty(panorama.shape[1], size[1], size[0]),
+    )
     return result if pose.ndim == 3 else result[:, 0]
 
 

@@ -43,12 +43,6 @@ class Bands:
         return height, width
 
 
-def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
-    """Positions of the `count` pixels of band k along an image side of `length` pixels: `(count,)`, float64."""
-    place = torch.arange(count, dtype=torch.float64)
-    return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5
-
-
 def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """Blur an image and halve its size.
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid, InputError
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import Decision, conclude, decide, goal_cells, strength, strongest
+from semfov.decision import Decision, conclude, decide, goal_cells
+from semfov.decision.rule import _strength, _strongest
 from semfov.gaze.policies import Policy
 from tests.small import Coloured
 
@@ -130,7 +131,7 @@ def test_strongest_detection_equals_a_loop(seed):
                     score = weight * float(looks.scores[look, detection, target])
                     if score > best * (1 + 1e-6):
                         best, expected = score, box
-            evidence, got = strongest(parts, grid, cell, target)
+            evidence, got = _strongest(parts, grid, cell, target)
             assert evidence == pytest.approx(best)
             assert (got is None) == (expected is None)
             if expected is not None:
@@ -139,12 +140,12 @@ def test_strongest_detection_equals_a_loop(seed):
 
 def test_strongest_detection_without_overlapping_detections_is_none():
     grid = Grid(4, 3, SIZE)
-    assert strongest([], grid, 0, 1) == (0.0, None)
-    assert strongest([Detections.empty(1, 3)], grid, 0, 1) == (0.0, None)
+    assert _strongest([], grid, 0, 1) == (0.0, None)
+    assert _strongest([Detections.empty(1, 3)], grid, 0, 1) == (0.0, None)
     far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
-    assert strongest([far], grid, 0, 1) == (0.0, None)
-    assert strongest([far], grid, 11, 1)[1].tolist() == [130, 100, 150, 110]
-    assert strongest([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) == (0.0, None)
+    assert _strongest([far], grid, 0, 1) == (0.0, None)
+    assert _strongest([far], grid, 11, 1)[1].tolist() == [130, 100, 150, 110]
+    assert _strongest([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) == (0.0, None)
 
 
 class Square(Coloured):
@@ -248,14 +249,14 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     ]
     decision = conclude(1, belief, parts, grid, 2)
     assert decision.cell == value.index(max(value))
-    assert torch.equal(decision.box, strongest(parts, grid, decision.cell, 2)[1])
+    assert torch.equal(decision.box, _strongest(parts, grid, decision.cell, 2)[1])
     assert decision.probability == 0.75
     assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
     # Without detections the belief alone decides.
     nothing = [Detections.empty(1, 3)]
     assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
-    assert strength(nothing[0], grid, 2).tolist() == [0.0] * 12
+    assert _strength(nothing[0], grid, 2).tolist() == [0.0] * 12
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from semfov.head import CameraFrame, PanTiltCamera, PerSecond, SearchGain, Speed
 from semfov.head.belief import SceneObserver
 from semfov.head.camera import CameraScene
 from semfov.head.gain import OUT
-from semfov.head.sphere import Sphere
+from semfov.head.scenes import Sphere
 from semfov.head.views import Views
 from semfov.paths import HeadPath
 from tests.refusals import refused, unusable

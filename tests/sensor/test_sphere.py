@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semfov.head.sphere import _angle_between
+from semfov.head.scenes import _angle_between
 from semfov.sensor.sphere import Camera, Regions, panorama_directions, panorama_points
 from tests.refusals import refused
 

@@ -127,11 +127,12 @@ def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.
     return numbers
 
 
-def as_path(points: Any, argument: str) -> NDArray[np.float64]:
-    """Points of fixations, `(n, 2)`, finite."""
+def as_path(points: Any, argument: str, *, least: int = 0) -> NDArray[np.float64]:
+    """Points of fixations, `(n, 2)`, finite; `least` is 1 where there must be one."""
     path = as_array(points, argument, finite=True)
     path = path.reshape(0, 2) if path.shape == (0,) else path
     check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
+    check(len(path) >= least, argument, "at least one fixation", "none")
     return path
 
 

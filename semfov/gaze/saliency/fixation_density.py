@@ -21,7 +21,6 @@ from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
-from semfov.io.storage import checksum
 from semfov.sensor.lines import constant
 
 _CELLS = 52
@@ -380,14 +379,6 @@ class FixationDensity(Pretrained):
         tensors = super()._tensors()
         return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
 
-    def _stated(self) -> dict[str, Any]:
-        """The layers that the weights belong to."""
-        return self._record()
-
-    def digest(self) -> str:
-        """Checksum of everything that results depend on."""
-        return checksum(self._tensors(), {"kind": self.kind, **self._record()})
-
     def _record(self) -> dict[str, Any]:
         return {"layers": [[name, channels] for name, channels in self.layers.items()]}
 
@@ -448,12 +439,9 @@ def _interpolation(
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
     """Maps `(..., rows, columns)` blurred by a Gaussian of σ cells, whose weights sum to 1 at the border, too."""
-    return _gaussian(maps.shape[-2], sigma) @ maps @ _gaussian(maps.shape[-1], sigma).mT
-
-
-def _gaussian(cells: int, sigma: Tensor) -> Tensor:
-    """Blur of a line of cells by a Gaussian, whose weights within the line sum to 1, `(cells, cells)`."""
-    return (_squares(cells, sigma.dtype, sigma.device) / (-2 * sigma.square())).softmax(-1)
+    squares = (_squares(cells, sigma.dtype, sigma.device) for cells in maps.shape[-2:])
+    down, across = ((each / (-2 * sigma.square())).softmax(-1) for each in squares)
+    return down @ maps @ across.mT
 
 
 @constant

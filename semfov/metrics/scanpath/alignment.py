@@ -62,7 +62,7 @@ def scanmatch(
     for count in cells:
         check_whole(count, "cells", 1, 1000)
     words = []
-    for number, path in enumerate((_path(ours, "ours"), _path(theirs, "theirs"))):
+    for number, path in enumerate((as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1))):
         word = cell_labels(path, *cells, size)
         if durations is not None:
             lasting = as_array(durations[number], "durations")
@@ -102,7 +102,7 @@ def dynamic_time_warping(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> dynamic_time_warping([[0, 0], [3, 0]], [[0, 0], [0, 0], [3, 4]])
     4.0
     """
-    a, b = _path(ours, "ours"), _path(theirs, "theirs")
+    a, b = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
     cost = np.linalg.norm(a[:, None] - b[None], axis=-1)
     return float(cost[aligned(cost)].sum())
 
@@ -129,14 +129,8 @@ def time_delay_embedding(ours: ArrayLike, theirs: ArrayLike, *, length: int = 3)
     1.0
     """
     check_whole(length, "length", 1, 1000)
-    a, b = _path(ours, "ours"), _path(theirs, "theirs")
+    a, b = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
     if min(len(a), len(b)) < length:
         return float("nan")
     one, other = (np.stack([path[i : i + length].ravel() for i in range(len(path) - length + 1)]) for path in (a, b))
     return float((np.linalg.norm(one[:, None] - other[None], axis=-1).min(1) / length).mean())
-
-
-def _path(points: ArrayLike, name: str) -> _Array:
-    path = as_path(points, name)
-    check(len(path) > 0, name, "at least one fixation", "none")
-    return path

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,16 +143,9 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
     def matched(dimension: str) -> _Measure:
         return paired(lambda one, other: float(getattr(multimatch(one, other, size), dimension)))
 
-    def spelled(score: Callable[[list[int], list[int]], float]) -> _Measure:
+    def placed(score: Callable[[Any, Any], float], of: Callable[[FixationValues], Any] = inside) -> _Measure:
         def pair(one: FixationValues, other: FixationValues) -> float:
-            a, b = words(one), words(other)
-            return score(a, b) if a and b else float("nan")
-
-        return paired(pair)
-
-    def placed(score: Callable[[FixationValues, FixationValues], float]) -> _Measure:
-        def pair(one: FixationValues, other: FixationValues) -> float:
-            a, b = inside(one), inside(other)
+            a, b = of(one), of(other)
             return score(a, b) if len(a) and len(b) else float("nan")
 
         return paired(pair)
@@ -171,8 +164,8 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
 
     return {
         **{f"MultiMatch {name}": matched(name) for name in ("shape", "direction", "length", "position")},
-        "sequence score": spelled(sequence_score),
-        "edit distance": spelled(lambda a, b: edit_distance(a, b) / max(len(a), len(b))),
+        "sequence score": placed(sequence_score, words),
+        "edit distance": placed(lambda a, b: edit_distance(a, b) / max(len(a), len(b)), words),
         "ScanMatch": placed(lambda a, b: scanmatch(a, b, size)),
         "time warping": placed(lambda a, b: dynamic_time_warping(a, b) / max(size)),
         "time delay embedding": placed(lambda a, b: time_delay_embedding(a, b) / max(size)),

@@ -31,7 +31,7 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     >>> found_at([[0, 0], [5, 5], [6, 6]], [4, 4, 8, 8])
     1
     """
-    x, y = _points(points).T
+    x, y = as_path(points, "points", least=1).T
     x1, y1, x2, y2 = _corners(box)
     on = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
     return int(on.argmax()) if on.any() else -1
@@ -158,19 +158,13 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
     >>> scanpath_ratio([[0, 0], [0, 6], [8, 6]], [7, 5, 9, 7])
     0.7142857142857143
     """
-    path, edges = _points(points), _corners(box)
+    path, edges = as_path(points, "points", least=1), _corners(box)
     last = found_at(path, edges)
     if last < 1:
         return float("nan")
     way = np.linalg.norm(np.diff(path[: last + 1], axis=0), axis=1).sum()
     straight = np.linalg.norm((edges[:2] + edges[2:]) / 2 - path[0])
     return float(min(straight / way, 1.0))
-
-
-def _points(points: ArrayLike) -> _Array:
-    path = as_path(points, "points")
-    check(len(path) > 0, "points", "at least one fixation", "none")
-    return path
 
 
 def _corners(box: ArrayLike) -> _Array:

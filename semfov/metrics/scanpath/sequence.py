@@ -115,7 +115,7 @@ def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> floa
     >>> sequence_score(["cup", "cup", "fork"], ["cup", "fork", "oven", "fork"])
     0.5
     """
-    a, b = _word(ours, "ours"), _word(theirs, "theirs")
+    a, b = as_labels(ours, "ours", least=1), as_labels(theirs, "theirs", least=1)
     return float(_rapidfuzz().LCSseq.normalized_similarity(a, b))
 
 
@@ -139,13 +139,8 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
     >>> edit_distance([3, 7, 7, 1], [3, 7, 1])
     1
     """
-    return int(_rapidfuzz().Levenshtein.distance(_word(ours, "ours"), _word(theirs, "theirs")))
-
-
-def _word(labels: Sequence[Hashable], argument: str) -> list[Hashable]:
-    word = as_labels(labels, argument)
-    check(len(word) > 0, argument, "at least one label", "none")
-    return word
+    a, b = as_labels(ours, "ours", least=1), as_labels(theirs, "theirs", least=1)
+    return int(_rapidfuzz().Levenshtein.distance(a, b))
 
 
 def _rapidfuzz() -> Any:
