@@ -17,8 +17,7 @@ from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.averages import FloatArray
 from semfov.paths.stimulus import Stimulus
 from semfov.report.episode import Data, episode_data
-from semfov.report.looks import table_html
-from semfov.report.page import pictures_of, write_page
+from semfov.report.page import pictures_of, table_html, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 

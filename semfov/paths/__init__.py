@@ -1,7 +1,7 @@
 """Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
 
 from semfov.paths.base import Moment, Record
-from semfov.paths.endings import Ending
+from semfov.paths.files import Ending
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
 from semfov.paths.look import RecordedLook

@@ -21,7 +21,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.errors import InputError, check
+from semfov.errors import DataError, InputError, check
 from semfov.paths.conversion import Conversion
 from semfov.paths.files import Format
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
@@ -279,7 +279,8 @@ class Record(Conversion):
             tensors, record, shared = cls._format.read(path)
             fields = {**shared, **cls._fields(tensors, record, shared)}
         except InputError as error:
-            raise cls._format.refused(path, error) from None
+            got = " ".join(str(error).split())
+            raise DataError(f"{path}: expected a complete {cls._format.kind}, got: {got}") from None
         made = {each.name for each in fields_of(cls) if each.init}
         return cls(**{name: value for name, value in fields.items() if name in made})
 

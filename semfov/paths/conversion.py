@@ -22,7 +22,6 @@ from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
-from semfov.paths.look import look_columns
 from semfov.paths.merging import number_of
 from semfov.paths.outcome import Outcome
 from semfov.words import RECORD_WORDS, not_there
@@ -67,7 +66,24 @@ class Conversion(Outcome):
         """
         closer = {number_of(look): look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
-        return [look_columns(look, self.classes, closer.get(look.number), brought[look.number]) for look in self]
+        rows: list[dict[str, Any]] = []
+        for look in self:
+            count = int(look.detections.count.sum())
+            rows.append(
+                {
+                    "look": look.number,
+                    **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
+                    "detections": count,
+                    "seen": self.classes[int(look.detections.labels.flatten()[0])] if count else None,
+                    "score": float(look.detections.confidence.flatten()[0]) if count else None,
+                    "seconds": look.seconds,
+                    "value": look.value,
+                    "closer": closer.get(look.number),
+                    "brought": brought[look.number],
+                    **look.more,
+                }
+            )
+        return rows
 
     def to_dict(self) -> dict[str, Any]:
         """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.

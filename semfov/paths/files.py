@@ -5,19 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, InputError, check
+from semfov.errors import check
 from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Schema, Text
 from semfov.io.storage import read, write_file
-from semfov.paths.endings import Ending
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
+
+Ending = Literal[
+    "box", "decision", "detection", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
+]
+"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, a detection
+showed the target at the gaze in a search whose belief has no thresholds, no look was worth it, all gaze shifts were
+made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
+machine was over, the time of the scene was over, or the caller stopped it."""
 
 WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
 
@@ -127,10 +134,6 @@ class Format:
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
         return tensors, record, _restored(tensors, record)
-
-    def refused(self, path: str | PathLike[str], error: InputError) -> DataError:
-        """The error that reports a file with wrong content."""
-        return DataError(f"{path}: expected a complete {self.kind}, got: {' '.join(str(error).split())}")
 
 
 def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:

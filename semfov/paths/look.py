@@ -74,23 +74,6 @@ def read_region(source: LargePicture, region: Sequence[float], size: tuple[int, 
     return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255
 
 
-def look_columns(look: RecordedLook, classes: Sequence[str], closer: float | None, brought: int) -> dict[str, Any]:
-    """Columns of a table on a look (`Record.rows`), with what the record tells of it: closer looks, and objects."""
-    count = int(look.detections.count.sum())
-    return {
-        "look": look.number,
-        **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
-        "detections": count,
-        "seen": classes[int(look.detections.labels.flatten()[0])] if count else None,
-        "score": float(look.detections.confidence.flatten()[0]) if count else None,
-        "seconds": look.seconds,
-        "value": look.value,
-        "closer": closer,
-        "brought": brought,
-        **look.more,
-    }
-
-
 def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]:
     """Columns of a table on a fixated cell: its place, its probability `(cells,)`, and the most probable cell."""
     row, column = divmod(cell, grid.columns)

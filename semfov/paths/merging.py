@@ -1,19 +1,15 @@
-"""Objects of a record: merged from the detections of its looks, and confirmed by closer looks and the decision."""
+"""Objects of a record, merged from the detections of its looks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from semfov.decision import SAME, CloseUp
+from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
-from semfov.observation.matching import box_iou
-
-CONFIRMED = 0.5
-"""Probability from which on a closer look confirms that the target is there."""
 
 
 def merge_fixations(
@@ -73,28 +69,3 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
 def number_of(look: CloseUp) -> int:
     """Number of the look that a closer look is, or after which it was made."""
     return (look.fixation if look.number is None else look.number) or 0
-
-
-def confirm(
-    candidates: Objects,
-    places: Sequence[tuple[Tensor, int, float, int]],
-    counting: Callable[[Objects], Tensor],
-) -> tuple[Objects, Tensor]:
-    """The candidates that count, and those that were confirmed; and which of all these were, `(M,)`."""
-    boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
-    sure, counts = torch.zeros(len(candidates), dtype=torch.bool), counting(candidates)
-    for place, label, chance, look in places:
-        box, probability = place[None].to(boxes), scores.new_tensor([chance])
-        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
-        same = overlap.argmax()[None] if len(overlap) else overlap.long()
-        if not bool((overlap[same] >= SAME).any()):
-            same = torch.tensor([len(boxes)])
-            boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
-            labels = torch.cat([labels, labels.new_tensor([label])])
-            looks = torch.cat([looks, looks.new_tensor([look])])
-            sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
-        scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
-        sure[same] = True
-    order = scores.argsort(descending=True, stable=True)
-    order = order[(counts | sure)[order]]
-    return Objects(boxes, scores, labels, looks)[order], sure[order]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.decision import CloseUp, Decision
+from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
-from semfov.paths.endings import FIXATIONS, Ending
+from semfov.observation.matching import box_iou
+from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
-from semfov.paths.merging import CONFIRMED, confirm, distances_to, merge_fixations, number_of
+from semfov.paths.merging import distances_to, merge_fixations, number_of
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -43,7 +44,21 @@ class Outcome(ABC):
     how: ClassVar[Literal["fovea", "windows", "head"]]
     """Kind of look: of a fovea, at windows, or of a head that turns."""
 
-    _sentences: ClassVar[Mapping[str, str]] = FIXATIONS
+    _sentences: ClassVar[Mapping[str, str]] = {
+        "box": "The gaze is on a box of the target.",
+        "detection": "A detection shows the target at the gaze.",
+        "worth": "No look is expected to classify enough more cells correctly.",
+        "cells": "Every cell was fixated.",
+        "duration": "The next look would end after the time limit of the scene.",
+        "seconds": "The time was over.",
+        "stopped": "It was stopped.",
+        "found": "The target is probable enough, and was looked at closely enough.",
+        "absent": "No remaining cell is worth a look, and the target is probably absent.",
+        "undecided": "No remaining cell is worth a look, but the target is probably there.",
+        "closer found": "A closer look confirmed the target.",
+        "closer undecided": "No closer look was sure enough, but the target is probably there.",
+    }
+    """Why it ended, by the ending, or by the outcome of the decision that ended the search."""
 
     @abstractmethod
     def _looks(self) -> Iterator[RecordedLook]:
@@ -204,7 +219,8 @@ class Outcome(ABC):
         """Box, class, probability and look of the places that closer looks and the decision confirmed."""
         decision, closer = self.decision, self.closer
         box = decision.box if decision is not None and decision.outcome == "found" else None
-        others = [look for look in closer if look.place >= CONFIRMED and (box is None or not look.box.equal(box))]
+        # From a probability of one half on a closer look confirms that the target is there.
+        others = [look for look in closer if look.place >= 0.5 and (box is None or not look.box.equal(box))]
         places = [(look.box, look.target, look.place, number_of(look)) for look in others]
         if box is not None and decision is not None and self.target is not None:
             number = next((number_of(look) for look in closer if look.box.equal(box)), len(self) - 1)
@@ -215,7 +231,7 @@ class Outcome(ABC):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        objects, sure = confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
+        objects, sure = _confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
         return replace(objects, classes=self.classes), sure
 
     def _counts(self, candidates: Objects) -> Tensor:
@@ -258,3 +274,28 @@ class Outcome(ABC):
     def summary(self) -> str:
         """Describe the outcome, and explain why the search or the exploration ended."""
         return f"{self.describe()}. {self.why_it_ended()}".rstrip()
+
+
+def _confirm(
+    candidates: Objects,
+    places: Sequence[tuple[Tensor, int, float, int]],
+    counting: Callable[[Objects], Tensor],
+) -> tuple[Objects, Tensor]:
+    """The candidates that count, and those that were confirmed; and which of all these were, `(M,)`."""
+    boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
+    sure, counts = torch.zeros(len(candidates), dtype=torch.bool), counting(candidates)
+    for place, label, chance, look in places:
+        box, probability = place[None].to(boxes), scores.new_tensor([chance])
+        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
+        same = overlap.argmax()[None] if len(overlap) else overlap.long()
+        if not bool((overlap[same] >= SAME).any()):
+            same = torch.tensor([len(boxes)])
+            boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
+            labels = torch.cat([labels, labels.new_tensor([label])])
+            looks = torch.cat([looks, looks.new_tensor([look])])
+            sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
+        scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
+        sure[same] = True
+    order = scores.argsort(descending=True, stable=True)
+    order = order[(counts | sure)[order]]
+    return Objects(boxes, scores, labels, looks)[order], sure[order]

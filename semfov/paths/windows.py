@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -15,7 +15,6 @@ from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
-from semfov.paths.endings import WINDOWS
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
 from semfov.paths.look import Box, RecordedLook
 from semfov.zoom.certainty import SPREAD, number_of, reacts
@@ -101,7 +100,22 @@ class ZoomPath(Record):
 
     how = "windows"
     _format = Format("zoom path", _TENSORS, _VALUES)
-    _sentences = WINDOWS
+    _sentences: ClassVar[Mapping[str, str]] = {
+        "worth": "No remaining look is expected to show enough new objects.",
+        "seconds": "The time was over.",
+        "stopped": "It was stopped.",
+        "windows": "No window is left that can show more.",
+        "detection": "A detection shows the target.",
+        "found": "The probability is high enough, and a detection shows the target.",
+        "absent": "No remaining look is worth a pass, and the target is probably absent.",
+        "undecided": "No remaining look is worth a pass, but the target is probably there.",
+        "unseen": "No look shows a candidate: the probability is how frequent the class is, not something seen.",
+        "first found": "The first look shows the target closely enough.",
+        "closer found": "A closer look confirmed the target.",
+        "closer absent": "No closer look was sure enough, and the target is probably absent.",
+        "closer undecided": "No closer look was sure enough, but the target is probably there.",
+    }
+    # `unseen` is for a photograph in which no look shows a place that may hold the target.
 
     def __post_init__(self) -> None:
         """Derive what the looks and the decision tell."""

@@ -21,7 +21,8 @@ def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
     """
     (width, height), (wide, high) = lattice.size, (min(64, length) for length in lattice.size)
     corners = [(x, y, x + wide, y + high) for y in (0, height - high) for x in (0, width - wide)]
-    colours = {colour for box in corners if (colour := _only_colour(picture.pixels(box))) is not None}
+    parts = [picture.pixels(box) for box in corners]
+    colours: set[tuple[int, ...]] = {tuple(part[0, 0].tolist()) for part in parts if (part == part[0, 0]).all()}
     if not colours and picture.nothing is None:
         return None
     reduction = picture.reduction(1 / lattice.magnifications[0])
@@ -49,12 +50,6 @@ def not_blank(windows: Sequence[Window], blank: Tensor | None) -> list[Window]:
         return [*windows]
     seen = [each for each in windows if not blank[each.cells[1] : each.cells[3], each.cells[0] : each.cells[2]].all()]
     return seen or [*windows]
-
-
-def _only_colour(pixels: NDArray[np.uint8]) -> tuple[int, ...] | None:
-    """The colour of all pixels; None where there are several."""
-    colour = pixels[0, 0]
-    return tuple(colour.tolist()) if (pixels == colour).all() else None
 
 
 def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], down: _Spans, across: _Spans) -> NDArray[np.bool_]:

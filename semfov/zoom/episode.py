@@ -54,12 +54,12 @@ class _Recent(Generic[_Belief]):
         self.looks: list[Glance] = []
         self.windows: set[Window] = set()
         self.renewed = False
-        self._frames: list[float] = []
+        self.frames: list[float] = []
 
     def add(self, glance: Glance, frame: float) -> None:
         """Add a look at a frame, and forget those that it replaces and those that are too old."""
         self.looks.append(glance)
-        self._frames.append(frame)
+        self.frames.append(frame)
         if self.forgetting is not None and self._forgets(glance, frame):
             self.windows = {look.window for look in self.looks}
             if self.belief is not None:
@@ -71,17 +71,12 @@ class _Recent(Generic[_Belief]):
         if self.belief is not None:
             self.belief.add(glance)
 
-    @property
-    def oldest(self) -> Window:
-        """The window that was looked at longest ago."""
-        return min(zip(self._frames, self.looks, strict=True), key=lambda dated: dated[0])[1].window
-
     def _forgets(self, glance: Glance, frame: float) -> bool:
         """Forget the looks that no longer count; returns whether any were forgotten."""
         assert self.forgetting is not None
         first, span = self.looks[0].window, self.forgetting.span
         again = glance.window in self.windows
-        dated: list[tuple[float, Glance]] = list(zip(self._frames, self.looks, strict=True))
+        dated: list[tuple[float, Glance]] = list(zip(self.frames, self.looks, strict=True))
         if again and glance.window == first:
             dated = [dated[-1], *dated[1:-1]]
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
@@ -90,8 +85,8 @@ class _Recent(Generic[_Belief]):
             for when, look in dated
             if look is glance or (look.window != glance.window and (look.window == first or frame - when <= span))
         ]
-        self._frames, self.looks = [when for when, _ in recent], [look for _, look in recent]
-        self.renewed = frame + 1 - self._frames[0] > span
+        self.frames, self.looks = [when for when, _ in recent], [look for _, look in recent]
+        self.renewed = frame + 1 - self.frames[0] > span
         return len(recent) < len(dated) or again
 
 
@@ -120,7 +115,8 @@ def look_by_look(
     def choose() -> Sequence[WindowChoice]:
         choices = order(recent.looks, recent.windows)
         if forgetting is not None and (recent.renewed or not choices):
-            return [(first, choices[0][1])] if choices else [(recent.oldest, 0.0)]
+            oldest = min(zip(recent.frames, recent.looks, strict=True), key=lambda dated: dated[0])[1].window
+            return [(first, choices[0][1])] if choices else [(oldest, 0.0)]
         return choices
 
     def prepare(window: Window) -> None:

@@ -109,15 +109,11 @@ def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None
             else:
                 values = F.linear(values, layer.weight[outputs], layer.bias[outputs])
         elif isinstance(layer, nn.GELU):
-            values = _gelu(values)
+            # torch gives contiguous arrays to oneDNN, whose call is slow: transposed matrices and repeated vectors.
+            values = F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
         elif layer.training:  # dropout
             values = layer(values)
     return values
-
-
-def _gelu(values: Tensor) -> Tensor:
-    """GELU of transposed matrices and repeated vectors: torch gives contiguous arrays to oneDNN, whose call is slow."""
-    return F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
 
 
 def _small_network(inputs: int, width: int, outputs: int) -> nn.Sequential:
@@ -174,25 +170,11 @@ class Survey(nn.Module):
         return _tapered(self.border, span)
 
 
-def _survey_fields() -> dict[str, Field]:
-    """Tensors of a survey in a file, K classes."""
-    return {
-        "survey.mix.weight": Field((_CHANNELS, "K"), low=-_LARGEST, high=_LARGEST),
-        **perceptron("survey.rate", _INPUTS, _WIDTH, STEPS),
-        "survey.border": Field((4,), low=-1e3, high=1e3),
-    }
-
-
-_SURVEY = Object({"foresight": Number(0, 1)})
-"""Settings of a survey in a file."""
-
-
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
 CASE, _JUDGE_WIDTH = 10, 16
 """Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.decision`)."""
-_LARGEST = 1e6
 
 
 class GlimpseEvidence(Pretrained):
@@ -258,7 +240,9 @@ class GlimpseEvidence(Pretrained):
             **perceptron("judge", CASE, _JUDGE_WIDTH),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
-            **_survey_fields(),
+            "survey.mix.weight": Field((_CHANNELS, "K"), low=-_LARGEST, high=_LARGEST),
+            **perceptron("survey.rate", _INPUTS, _WIDTH, STEPS),
+            "survey.border": Field((4,), low=-1e3, high=1e3),
             "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
             "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
             **photograph_fields(),
@@ -269,7 +253,7 @@ class GlimpseEvidence(Pretrained):
             "patience": Number(above=0, high=_LARGEST),
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
-            "survey": _SURVEY,
+            "survey": Object({"foresight": Number(0, 1)}),
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
             "photograph": PHOTOGRAPH,

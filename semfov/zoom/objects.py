@@ -1,16 +1,18 @@
 """Objects of a large picture, merged from the detections of several windows."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
+from semfov.detection.objects import FAINTEST, Objects, intersection, merge_looks, neighbours, unlike
 from semfov.observation.matching import box_iou
-from semfov.zoom.certainty import FACTS, Certainty, object_facts, overlapping
+from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 
@@ -18,6 +20,12 @@ _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
 
 _SAME = 0.5
+
+_LEAST, _MOST = 0.01, 0.999
+_SMALLEST = 6.0
+"""Side in canvas pixels from which on a look should show an object."""
+_EDGE = 2.0
+"""Canvas pixels from the border of a window within which it may cut an object."""
 
 
 def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
@@ -100,7 +108,7 @@ def merge_with_facts(
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]
-    facts = object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
+    facts = _object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
     own = boxes[index] if latest else fused(index, boxes, scores, labels, cut, sharpness)
     return Objects(own, scores[index], labels[index], looks[index]), facts
 
@@ -118,7 +126,7 @@ def fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Ten
 
     Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, cut `(L,)`, magnifications `(L,)` → `(M, 4)`.
     """
-    first, second, shared, area = overlapping(boxes.float().numpy())
+    first, second, shared, area = _overlapping(boxes.float().numpy())
     chosen, kinds, whole = index.numpy(), labels.numpy(), ~cut.numpy()
     weight = (scores * magnifications.square()).double().numpy()
     place = np.full(len(boxes), -1)
@@ -188,3 +196,133 @@ def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> 
     number = torch.arange(len(looks)).repeat_interleave(counts)
     closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]
     return detections.boxes[0], value, label, number, torch.cat([glance.cut for glance in glances]), closer
+
+
+def _object_facts(
+    index: Tensor,
+    boxes: Tensor,
+    scores: Tensor,
+    labels: Tensor,
+    looks: Tensor,
+    cut: Tensor,
+    windows: Tensor,
+    magnifications: Tensor,
+    size: tuple[int, int],
+    finest: float,
+    *,
+    latest: bool = False,
+) -> Tensor:
+    """Compute the facts about each object (`FACTS`) from all looks.
+
+    A look shows an object with a box of its class that overlaps it by half, or that the border of the window cuts and
+    of which four fifths lie in it. A look should show an object of 6 canvas pixels or more that lies in its window and
+    not at its border.
+
+    Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, looks `(L,)`, cut `(L,)`, windows `(N, 4)`,
+    magnifications `(N,)`, size `(width, height)` → `(M, 14)`.
+    """
+    count = len(index)
+    if not count:
+        return scores.new_zeros(0, len(FACTS))
+    corners, value, label, look, broken, view, scale = (
+        each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
+    )
+    chosen, scale = index.numpy(), scale.astype(np.float32)
+    first, second, shared, area = _overlapping(corners)
+    union = area[first] + area[second] - shared
+    overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    part = shared / np.maximum(area[second], 1e-6)
+    place = np.full(len(corners), -1)
+    place[chosen] = np.arange(count)
+    object_, same = place[first] >= 0, label[first] == label[second]
+    whole = object_ & same & (overlap >= 0.5)
+    shows = whole | (object_ & same & broken[second] & (part >= 0.8) & (look[first] != look[second]))
+
+    # The highest score of each object in each look.
+    best_of = np.zeros((count, len(view)), np.float32)
+    best_of[np.arange(count), look[chosen]] = value[chosen]
+    np.maximum.at(best_of, (place[first[shows]], look[second[shows]]), value[second[shows]])
+    visible, side = _visible(corners[chosen], view, scale, size, latest=latest)
+    detected = best_of > 0
+    usable = visible | detected
+    sharpness = np.where(usable, scale, 0)
+    sharpest = sharpness.max(1)
+    odds = _logit(best_of)
+    agree = whole & ~broken[second]
+    number = np.bincount(place[first[agree]], minlength=count)
+    agreement = np.bincount(place[first[agree]], overlap[agree], minlength=count) / np.maximum(number, 1)
+    best = odds.max(1)
+
+    # Among objects: the better one of a pair is the one with the higher best score.
+    pair = np.flatnonzero(object_ & (place[second] >= 0))
+    one, other = place[first[pair]], place[second[pair]]
+    worse = (best[other] > best[one]) | ((best[other] == best[one]) & (other < one))
+    pair, one, other = pair[worse], one[worse], other[worse]
+    weight, alike = 1 / (1 + np.exp(-best[other])), same[pair]
+    near = [each[pair] * weight for each in (overlap, shared / np.maximum(area[first], 1e-6), part)]
+    double, inside, around, rival = np.zeros((4, count), np.float32)
+    measures = (double, near[0], alike), (inside, near[1], alike), (around, near[2], alike), (rival, near[0], ~alike)
+    for into, values, which in measures:
+        np.maximum.at(into, one[which], values[which])
+
+    extent = (side + np.log2(sharpest) - 5) / 2
+    facts = [
+        _logit(value[chosen]),
+        best,
+        np.where(sharpness >= sharpest[:, None] * (1 - 1e-6), odds, -np.inf).max(1),
+        np.log1p(detected.sum(1)),
+        np.log1p((visible & ~detected).sum(1)),
+        broken[chosen],
+        extent,
+        extent**2,
+        np.where(number > 0, agreement - 0.6, 0),
+        double,
+        inside,
+        around,
+        np.maximum(math.log2(finest) - np.log2(sharpest), 0),
+        rival,
+    ]
+    return torch.from_numpy(np.stack(facts, -1).astype(np.float32))
+
+
+def _logit(scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    inside = np.clip(scores, _LEAST, _MOST)
+    odds: NDArray[np.float32] = np.log(inside / (1 - inside))
+    return odds
+
+
+def _overlapping(
+    boxes: NDArray[np.float32],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """Pairs of boxes that overlap, in both orders, the areas that they share `(P,)`, and the areas of all `(L,)`."""
+    x1, y1, x2, y2 = np.ascontiguousarray(boxes.T)
+    order = x1.argsort(kind="stable")
+    one, other = neighbours(x1[order], x2[order])
+    one, other = order[one], order[other]
+    shared = intersection(x1, y1, x2, y2, one, other)
+    meets = shared > 0
+    one, other, shared = one[meets], other[meets], shared[meets]
+    area = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)
+    return np.concatenate([one, other]), np.concatenate([other, one]), np.concatenate([shared, shared]), area
+
+
+def _visible(
+    boxes: NDArray[np.float32],
+    windows: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    size: tuple[int, int],
+    *,
+    latest: bool,
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which looks should show each box, `(M, N)`, and the logarithms (base 2) of the sides of the boxes, `(M,)`."""
+    side = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(1)
+    # The border of the picture cuts no object.
+    low = np.where(windows[:, :2] > 0, windows[:, :2] + _EDGE / scale[:, None], -np.inf)
+    high = np.where(windows[:, 2:] < np.array(size) - 0.5, windows[:, 2:] - _EDGE / scale[:, None], np.inf)
+    inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
+    visible = inside & (side[:, None] + np.log2(scale) >= math.log2(_SMALLEST))
+    if latest:
+        for number in range(len(scale) - 1):
+            later = visible[:, number + 1 :] & (scale[number + 1 :] >= scale[number])
+            visible[:, number] &= ~later.any(1)
+    return visible, side

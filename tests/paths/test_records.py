@@ -21,7 +21,6 @@ from semfov.detection import Placement
 from semfov.head.views import Views
 from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, HeadPath, Record, WindowMoment, ZoomPath
-from semfov.paths.endings import FIXATIONS, WINDOWS
 from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.viz import plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
 from semfov.viz.style import FOUND, TARGET
@@ -358,7 +357,7 @@ def test_a_look_is_at_the_centre_of_what_it_shows(make):
     assert next(iter(record)).fixation == (199.5, 149.5)
 
 
-@pytest.mark.parametrize("sentences", [FIXATIONS, WINDOWS])
+@pytest.mark.parametrize("sentences", [Scanpath._sentences, ZoomPath._sentences])
 def test_only_a_search_that_found_something_speaks_of_a_confirmed_target(sentences):
     """Closer looks confirm objects from 0.5 on; a decision may ask for more, and then stays undecided beside them."""
     assert [each for each, text in sentences.items() if "confirmed" in text] == ["closer found"]

@@ -14,7 +14,7 @@ from eval.comparison.curves_html import curves_html
 from semfov.decision import Decision
 from semfov.report import write_page
 from semfov.report.episode import episode_data
-from semfov.report.looks import table_html
+from semfov.report.page import table_html
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 

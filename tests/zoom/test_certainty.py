@@ -18,10 +18,10 @@ from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, Lattice
-from semfov.zoom.certainty import FACTS, SPREAD, Certainty, object_facts
+from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.episode import find_everything
 from semfov.zoom.glances import Glance, on_lattice
-from semfov.zoom.objects import merge, merge_with_facts
+from semfov.zoom.objects import _object_facts, merge, merge_with_facts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
 
@@ -101,7 +101,7 @@ def test_facts_equal_a_plain_loop(latest, dtype):
     kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
     assert 5 < len(kept) < count - 5
     every = boxes, scores, labels, looks, cut
-    facts = object_facts(kept, *every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
+    facts = _object_facts(kept, *every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
     plain = plain_facts(kept.tolist(), *(each.tolist() for each in every), latest)
     assert facts.shape == (len(kept), len(FACTS))
     torch.testing.assert_close(facts, torch.tensor(plain), rtol=1e-4, atol=1e-4)
