@@ -69,7 +69,16 @@ class SearchGain(LookGain):
         self.foresight = foresight
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)`, in probabilities of a find."""
+        """Expected gain of each action.
+
+        Args:
+            belief: the belief over the scene.
+            here: number of the present pose.
+            poses: numbers of the poses whose looks are valued.
+
+        Returns:
+            `(A,)`, in probabilities of a find; the values of actions from other poses have no meaning.
+        """
         views = self.views
         chance = belief.probability(0)[0]
         sharpness = views.acuity(belief.closest[0])
@@ -115,7 +124,16 @@ class ExploreGain(LookGain):
         self._landings = (third[:, None] * CELL_POINTS + third).flatten()
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)`, in cells of average area; the lowest value where the eye does not land."""
+        """Expected gain of each action.
+
+        Args:
+            belief: the belief over the scene.
+            here: number of the present pose.
+            poses: numbers of the poses whose looks are valued.
+
+        Returns:
+            `(A,)`, in cells of average area; the lowest value where the eye does not land.
+        """
         views = self.views
         probabilities = belief.class_probabilities()
         has_view = belief.owner[0] >= 0
