@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_number
-from semfov.metrics.presence import scores_by_presence
+from semfov.metrics.episodes import scores_by_presence
 
 
 def _threshold_for(absent: Tensor, share: float) -> float:

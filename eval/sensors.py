@@ -34,7 +34,7 @@ from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.fit.observation import FitObservationConfig
 from semfov.io.files import plain_name, write_text
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command

@@ -16,7 +16,7 @@ from semfov import as_image
 from semfov.agents.picture import open_picture
 from semfov.data.fixations import Fixations, read_table, suspicions
 from semfov.data.large import open_large
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 
 _KINDS = ("u1", "u2", "i2", "u4", "f4", "f8", "f2")
 _WITHOUT_WHITE = ("u1", "u2")

@@ -11,7 +11,7 @@ import torch
 
 import semfov
 from semfov import policies, viz
-from semfov.metrics.exploration import answers_of, count_right
+from semfov.metrics.episodes import answers_of, count_right
 
 torch.set_grad_enabled(False)
 

@@ -14,7 +14,7 @@ from eval.comparison.curves_html import curves_html
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.replay import replay
 from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
-from semfov.metrics.averages import FloatArray
+from semfov.metrics.episodes import FloatArray
 from semfov.paths.stimulus import Stimulus
 from semfov.report.episode import Data, episode_data
 from semfov.report.page import pictures_of, table_html, write_page

@@ -19,7 +19,7 @@ from semfov.io.files import inside, replacing, write_text
 from semfov.io.state import without_settings
 from semfov.io.storage import checksum
 from semfov.io.tables import csv_text
-from semfov.metrics.averages import FloatArray, standard_error
+from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import observation_name
 from semfov.runs.tables import percent

@@ -12,7 +12,7 @@ from eval.chance import errors_by_chance
 from eval.presence import hits_at
 from semfov.data.scene import Scenes
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from semfov.runs.tables import plus_minus, table
 
 _SHARES = (0.01, 0.02, 0.05)

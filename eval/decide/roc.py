@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from eval.presence import roc
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from semfov.viz.style import COLOURS, LINES, make_figure, styled
 
 if TYPE_CHECKING:

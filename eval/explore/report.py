@@ -18,8 +18,7 @@ from eval.comparison.summary import (
 )
 from eval.explore.run import ExploreRun
 from semfov.errors import DataError
-from semfov.metrics.averages import FloatArray
-from semfov.metrics.exploration import success_rate
+from semfov.metrics.episodes import FloatArray, success_rate
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure

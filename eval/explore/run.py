@@ -17,7 +17,7 @@ from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
-from semfov.metrics.exploration import answers_of
+from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig
 from semfov.runs.exploration_protocol import (
     COUNTS,

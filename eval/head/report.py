@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eval.comparison.records import gather
 from eval.comparison.summary import announce, by_scene, write_summary
 from eval.head.run import OURS, HeadConfig, HeadRun
-from semfov.metrics.averages import standard_error
+from semfov.metrics.episodes import standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import percent, plus_minus, table

@@ -29,7 +29,7 @@ from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Flat, Panorama, World
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
-from semfov.metrics.exploration import right_cells
+from semfov.metrics.episodes import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
 from semfov.runs.results import ResultRecord

@@ -20,7 +20,7 @@ from semfov.fit.viewing import Events, MapSource, Viewed, no_detections
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.code import modules_digest
-from semfov.metrics.averages import standard_error
+from semfov.metrics.episodes import standard_error
 from semfov.runs.tables import plus_minus, table
 from semfov.sensor.foveation import foveate
 

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.comparison.summary import Curve, by_scene, curve_of
-from semfov.metrics.averages import FloatArray, standard_error
-from semfov.metrics.exploration import success_rate
-from semfov.metrics.search import cumulative_performance
+from semfov.metrics.episodes import FloatArray, cumulative_performance, standard_error, success_rate
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus
 

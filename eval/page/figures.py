@@ -13,7 +13,7 @@ from eval.page.findings import LAST, TESTED
 from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
-from semfov.metrics.averages import FloatArray
+from semfov.metrics.episodes import FloatArray
 from semfov.viz.curves import draw_curves
 from semfov.viz.style import make_figure, save_figure, styled
 

@@ -12,7 +12,7 @@ from eval.page import paper
 from eval.page.curves import OBJECTS, behind, corrected_signs, paired_difference, points, spans
 from eval.page.experiments import DETECTORS
 from eval.page.tables import Runs, published_columns
-from semfov.metrics.averages import FloatArray
+from semfov.metrics.episodes import FloatArray
 from semfov.runs.tables import table
 
 LAST = {"search": 30, "explore": 20}

@@ -6,7 +6,7 @@ from eval.page.curves import points
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
 from eval.page.findings import COUNTED, EXPLORE, SEARCH, TESTED, VERDICTS, Answer, Finding, Measure, legend
 from eval.page.tables import Runs
-from semfov.metrics.averages import FloatArray
+from semfov.metrics.episodes import FloatArray
 from semfov.runs.tables import table
 
 

@@ -25,8 +25,7 @@ from eval.comparison.summary import (
 from eval.search.run import SearchRun
 from semfov.errors import DataError
 from semfov.io.files import inside, plain_name
-from semfov.metrics.averages import FloatArray
-from semfov.metrics.search import cumulative_performance
+from semfov.metrics.episodes import FloatArray, cumulative_performance
 from semfov.paths.stimulus import Stimulus
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table

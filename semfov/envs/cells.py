@@ -20,7 +20,7 @@ from semfov.envs.scenery import Scenery
 from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks
 from semfov.episode.loop import attend
 from semfov.errors import check, check_whole
-from semfov.metrics.exploration import count_right
+from semfov.metrics.episodes import count_right
 from semfov.paths import Scanpath
 from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, reduced_copy

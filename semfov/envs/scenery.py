@@ -24,7 +24,7 @@ from semfov.data.sources import PHOTOGRAPHS
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.gaze.acquisition.base import Task
-from semfov.metrics.exploration import answers_of
+from semfov.metrics.episodes import answers_of
 from semfov.runs.config import (
     BeliefConfig,
     DataConfig,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from semfov.gaze.acquisition.base import Task
-from semfov.metrics.averages import FloatArray, standard_error
+from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.runs.tables import percent, plus_minus, table
 
 

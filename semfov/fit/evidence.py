@@ -31,10 +31,8 @@ from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strateg
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import Policy
-from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.presence import area_under_roc
-from semfov.metrics.search import cumulative_performance
+from semfov.metrics.episodes import FloatArray, area_under_roc, cumulative_performance
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track

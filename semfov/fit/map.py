@@ -27,9 +27,8 @@ from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strateg
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
-from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.exploration import answers_of, success_rate
+from semfov.metrics.episodes import FloatArray, answers_of, success_rate
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking

@@ -24,9 +24,8 @@ from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FitConfig
 from semfov.io.manifest import Part
-from semfov.metrics.averages import FloatArray
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import FloatArray, area_under_roc
 from semfov.runs.config import DataConfig
 from semfov.runs.settings import Count, Positive, Range, Share, Side
 from semfov.runs.tables import mean_or_dash, share, table

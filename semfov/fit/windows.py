@@ -49,7 +49,7 @@ from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, PictureKin
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.metrics.calibration import BinarySums
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
 from semfov.runs.scene_run import store_folder

@@ -21,7 +21,7 @@ from semfov.fit.windows_evidence import (
 )
 from semfov.fit.windows_settings import FitZoomConfig
 from semfov.io.manifest import Part
-from semfov.metrics.averages import FloatArray
+from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes

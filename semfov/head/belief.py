@@ -24,10 +24,6 @@ class _SceneLook(Look):
     inner: EvidenceLook
     gaze: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> "_SceneLook":
-        """The look itself, as there is only one."""
-        return self
-
     @classmethod
     def join(cls, looks: object) -> "_SceneLook":
         """Raise an error, because looks from several poses cannot be joined."""

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from semfov.errors import InputError
 from semfov.metrics.calibration import BinarySums
+from semfov.metrics.episodes import area_under_roc
 from semfov.metrics.labels import as_numbers, as_outcomes
-from semfov.metrics.presence import area_under_roc
 
 try:
     from torchmetrics import Metric
@@ -17,7 +17,7 @@ except ImportError:
 
 
 class AreaUnderRoc(Metric):
-    """Area under the receiver operating characteristic of all cases so far (`semfov.metrics.presence.area_under_roc`).
+    """Area under the receiver operating characteristic of all cases so far (`semfov.metrics.episodes.area_under_roc`).
 
     It keeps the scores, as the area needs all of them.
 

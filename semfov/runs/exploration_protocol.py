@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.metrics.exploration import count_right
+from semfov.metrics.episodes import count_right
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy

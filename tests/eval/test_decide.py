@@ -9,7 +9,7 @@ from eval.decide.plain import PLAIN, plain_rules
 from eval.decide.report import decision_summary
 from eval.presence import hits_at
 from semfov.decision import OUTCOMES
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from semfov.runs.tables import mean_or_dash, share
 from tests.lab.commands.table import small_run
 from tests.small import cells_of

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import bootstrap, norm
 
 from eval.bootstrap import Bootstrap
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from tests.refusals import refused
 
 GROUPS = ["a", "b", "a", "c", "b", "b"]

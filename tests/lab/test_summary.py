@@ -10,7 +10,7 @@ import pytest
 from eval.comparison.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv
 from eval.explore import report as explore_report
 from eval.search import report as search_report
-from semfov.metrics.exploration import success_rate
+from semfov.metrics.episodes import success_rate
 from semfov.runs.tables import percent
 from tests.small import cells_of
 

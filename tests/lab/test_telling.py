@@ -8,7 +8,7 @@ import torch
 from eval.comparison.telling import Telling, _tells, calibrated, class_frequencies
 from eval.presence import hits_at
 from semfov import EmbeddedScenes
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 from tests.small import cells_of
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from semfov.metrics.averages import standard_error
+from semfov.metrics.episodes import standard_error
 
 
 def test_standard_error():

@@ -5,7 +5,7 @@ import torch
 
 from semfov import Grid
 from semfov.data import Annotation
-from semfov.metrics.exploration import answers_of, count_right, success_rate
+from semfov.metrics.episodes import answers_of, count_right, success_rate
 
 
 def test_a_cell_is_right_if_an_object_of_its_single_most_probable_class_overlaps_it():

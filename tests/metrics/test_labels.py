@@ -8,10 +8,8 @@ from sklearn.metrics import roc_auc_score, roc_curve
 from eval.bootstrap import Bootstrap
 from eval.chance import errors_by_chance
 from eval.presence import hits_at, roc
-from semfov.metrics.averages import standard_error
 from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
-from semfov.metrics.exploration import count_right
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc, count_right, cumulative_performance, standard_error
 from semfov.metrics.scanpath import (
     auc,
     cell_labels,
@@ -26,7 +24,6 @@ from semfov.metrics.scanpath import (
     sequence_score,
     tfp_auc,
 )
-from semfov.metrics.search import cumulative_performance
 from tests.refusals import refused
 
 SCORE = [0.9, 0.8, 0.35, 0.2, 0.1]

@@ -11,7 +11,7 @@ from scipy.stats import mannwhitneyu
 
 from eval.presence import _threshold_for, hits_at
 from semfov.errors import InputError
-from semfov.metrics.presence import area_under_roc
+from semfov.metrics.episodes import area_under_roc
 
 # Few values, so that many are tied.
 scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)

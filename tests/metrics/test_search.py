@@ -3,7 +3,7 @@
 import numpy as np
 
 from eval.chance import random_search
-from semfov.metrics.search import cumulative_performance
+from semfov.metrics.episodes import cumulative_performance
 
 
 def test_random_search_equals_simulation():

@@ -11,7 +11,7 @@ from semfov import Detections, FovealObservationModel, Grid, policies
 from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
-from semfov.metrics.exploration import answers_of
+from semfov.metrics.episodes import answers_of
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise, run_explorations
 from semfov.strategy import Strategy

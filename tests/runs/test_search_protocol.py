@@ -10,7 +10,7 @@ from eval.chance import random_search
 from semfov import Detections, Grid, fusion, policies
 from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
-from semfov.metrics.search import cumulative_performance
+from semfov.metrics.episodes import cumulative_performance
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.search_protocol import episodes_of, looks_of, run_episodes, tie_noise
 from semfov.strategy import Strategy

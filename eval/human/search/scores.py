@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eval.human.search.trials import in_cells, shift_found
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
-from semfov.metrics.averages import standard_error
+from semfov.metrics.episodes import cumulative_performance, standard_error
 from semfov.metrics.scanpath import (
     edit_distance,
     mean_performance,
@@ -25,7 +25,6 @@ from semfov.metrics.scanpath import (
     tfp_auc,
 )
 from semfov.metrics.scanpath.sequence import fitted_clusters, labels_by
-from semfov.metrics.search import cumulative_performance
 
 _Array = NDArray[np.float64]
 

@@ -394,10 +394,7 @@ class FixationDensity(Pretrained):
         return model
 
 
-@cache
-def _read(path: Path) -> FixationDensity:
-    """The model of a file that does not change."""
-    return FixationDensity.from_pretrained(path)
+_read = cache(FixationDensity.from_pretrained)  # shipped files do not change
 
 
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:

@@ -71,11 +71,3 @@ def double_opponency(image: Tensor) -> Tensor:
         blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
         parts.append(torch.stack([bright, reds - greens, blues - yellows], 1))
     return torch.cat(parts, 2)
-
-
-def anchor(channels: Tensor) -> Tensor:
-    """Subtract the first pixel from every channel; channels `(B, C, H, W)`.
-
-    Contrasts do not depend on it. The contrasts of a uniform image are then exactly 0, without rounding errors.
-    """
-    return channels - channels[..., :1, :1]

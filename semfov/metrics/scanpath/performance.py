@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import check
+from semfov.metrics.episodes import cumulative_performance
 from semfov.metrics.labels import as_labels, as_numbers
-from semfov.metrics.search import cumulative_performance
 
 _Array = NDArray[np.float64]
 

@@ -1,0 +1,97 @@
+"""Measures of searches, of deciding whether a target is present, and of explorations; standard errors of means."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Annotation
+from semfov.errors import check
+from semfov.metrics.labels import as_numbers, as_outcomes
+
+FloatArray = NDArray[np.float64]
+
+
+def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArray:
+    """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
+
+    Shapes: found_at `(..., episodes)` → `(..., shifts+1)`.
+    """
+    steps = np.arange(shifts + 1)
+    when = np.asarray(found_at)[..., None]
+    found = (when >= 0) & (when <= steps)
+    return np.asarray(found.mean(-2), dtype=np.float64)
+
+
+def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Scores of the cases with the target, and of those without; there is at least one of each."""
+    scores = as_numbers(score, "score")
+    there = as_outcomes(present, "present").to(scores.device)
+    check(there.shape == scores.shape, "present", f"one outcome for each score {(*scores.shape,)}", (*there.shape,))
+    check(bool(there.any() and not there.all()), "present", "both true and false values", "only one of the two")
+    return scores[there].double(), scores[~there].double()
+
+
+def area_under_roc(score: Tensor, present: Tensor) -> float:
+    """Area under the receiver operating characteristic (Hanley and McNeil, 1982); score `(M,)`, present `(M,)`.
+
+    It is the probability that a case with the target scores higher than one without:
+
+    .. math:: P(s_+ > s_-) + P(s_+ = s_-) / 2
+    """
+    hit, miss = scores_by_presence(score, present)
+    miss = miss.sort().values
+    below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
+    return float(below.double().mean() / (2 * len(miss)))
+
+
+def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
+    """The classes that are correct for each cell: those of the objects whose boxes overlap it; → `(X·Y, K+1)`."""
+    overlap = grid.footprint(annotation.boxes)
+    classes = F.one_hot(annotation.labels, components)
+    return overlap.T.float() @ classes.float() > 0
+
+
+def count_right(beta: Tensor, answers: Tensor) -> Tensor:
+    """Number of cells whose most probable class is that of an overlapping object.
+
+    A cell where several classes are tied for the most probable one counts as wrong, so a cell without information does.
+
+    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B,)`.
+    """
+    return right_cells(beta, answers).sum(-1)
+
+
+def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
+    """The cells whose most probable class is that of an overlapping object; `count_right` counts them.
+
+    >>> import torch
+    >>> right_cells(torch.tensor([[[0.5, 0.7], [0.5, 0.5]]]), torch.tensor([[False, True]] * 2))
+    tensor([[ True, False]])
+
+    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B, X·Y)`.
+    """
+    best = beta == beta.amax(-1, keepdim=True)
+    # Sums of a short dimension take a seventh of the time of `any`.
+    return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
+
+
+def success_rate(right: Sequence[int], cells: int) -> FloatArray:
+    """Fraction of the cells with objects whose most probable class is correct, after each gaze shift."""
+    return np.asarray(right) / cells
+
+
+def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
+    r"""Standard error of the mean along one axis.
+
+    .. math:: \mathrm{SE} = \sqrt{\frac{1}{n (n - 1)} \sum_i (x_i - \bar x)^2}
+    """
+    values = np.asarray(values, dtype=np.float64)
+    count = values.shape[axis]
+    if count < 2:
+        return np.full(np.delete(values.shape, axis), np.nan)
+    return np.asarray(values.std(axis, ddof=1) / np.sqrt(count))
