@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov.detection import Detections, Detector
-from semfov.detection.onnx import load_onnx
+from semfov.detection.load import load_detector
 
 SIDES = (1, 7, 48, 100_000, 2**40, 0, -1, "w")
 TYPES = (TensorProto.DOUBLE, TensorProto.INT64, TensorProto.BOOL, TensorProto.STRING)
@@ -61,7 +61,7 @@ def onnx_files(draw: Draw, folder: Path) -> Case:
     path.write_bytes(changed(model.SerializeToString(), damage, draw.rng))
 
     def detect() -> tuple[Detector, Detections]:
-        detector = load_onnx(path, threads=1, **options)
+        detector = load_detector(path, threads=1, **options)
         return detector, detector(torch.rand(1, 3, 40, 30))
 
     def check(found: tuple[Detector, Detections]) -> None:
