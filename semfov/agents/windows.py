@@ -26,7 +26,7 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import candidates, closer_window, look_closely
-from semfov.zoom.decision import USUAL_SCORE, WindowDecisions, decide_by_score
+from semfov.zoom.decision import WindowDecisions
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
@@ -277,7 +277,7 @@ class WindowEpisode(Episode[ZoomPath]):
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
         self.batch, self.worth, self._least = batch, worth, least
-        self._confirm = USUAL_SCORE if confirm is None else confirm
+        self._confirm = 0.5 if confirm is None else confirm
         self._decisions: WindowDecisions | None = None
         if evidence is not None and target is not None:
             self._decisions = WindowDecisions(
@@ -414,7 +414,7 @@ class WindowEpisode(Episode[ZoomPath]):
             return self._decisions.decision()
         if not self.searches or self.target is None:
             return None
-        return decide_by_score(self.glances, self.target, self._confirm)
+        return _decide_by_score(self.glances, self.target, self._confirm)
 
     @property
     def belief(self) -> ZoomBelief | None:
@@ -496,3 +496,14 @@ class WindowEpisode(Episode[ZoomPath]):
     def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
         return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None
+
+
+def _decide_by_score(looks: Sequence[Glance], target: int, confirm: float) -> Decision:
+    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
+    best, box = 0.0, None
+    for detections in (look.detections for look in looks):
+        scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
+        if len(scores) and float(scores.max()) > best:
+            best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
+    found = best >= confirm
+    return Decision("found" if found else "undecided", best, None, box if found else None)

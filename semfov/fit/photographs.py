@@ -28,11 +28,10 @@ from semfov.runs.search_protocol import choose_classes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, overview
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import usual_slices
 
 _FOLDS = 5

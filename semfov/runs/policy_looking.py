@@ -19,7 +19,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.looking import Looking
 from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
-from semfov.runs.scene_run import digest_of
+from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
 
@@ -68,9 +68,7 @@ class PolicyLooking(Looking):
             "policies": policies,
         }
 
-    def stored(self, index: int) -> bytes | None:
-        """Nothing: the records are all that a comparison needs."""
-        return None
+    stored = SceneRun.stored  # nothing: the records are all that a comparison needs
 
 
 class _Models(NamedTuple):

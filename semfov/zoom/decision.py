@@ -106,9 +106,6 @@ class SearchFacts:
 CLOSER = 100
 """Largest number of closer looks in a large picture: as many as there are passes for."""
 
-USUAL_SCORE = 0.5
-"""Default for the score from which on a detection alone counts as found."""
-
 _DEFAULTS = Thresholds(0.9, 0.005)
 """Thresholds of searches whose evidence has none."""
 
@@ -220,14 +217,3 @@ class WindowDecisions:
         presence = self._facts.presence(self._ahead) if self._presence is None else self._presence
         outcome = OUTCOMES[self.outcome]
         return Decision(outcome, presence, None, self._facts.box if outcome == "found" else None)
-
-
-def decide_by_score(looks: Sequence[Glance], target: int, confirm: float) -> Decision:
-    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
-    best, box = 0.0, None
-    for detections in (look.detections for look in looks):
-        scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
-        if len(scores) and float(scores.max()) > best:
-            best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
-    found = best >= confirm
-    return Decision("found" if found else "undecided", best, None, box if found else None)

@@ -20,7 +20,6 @@ from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.photograph import PHOTOGRAPH, PhotographEvidence, photograph_fields
 
 STEPS = 3
 """Largest number of octaves between a look and the closer looks that are predicted from it."""
@@ -170,6 +169,55 @@ class Survey(nn.Module):
         return _tapered(self.border, span)
 
 
+class PhotographEvidence(nn.Module):
+    r"""Whether a photograph holds a class, by a look at the whole and by closer looks at places that seem to hold it.
+
+    After the look at the whole the log odds follow from the highest score s of the class in any hint, and from the
+    share :math:`q_t` of photographs that hold the class:
+
+    .. math:: \operatorname{logit} P(t) = a \operatorname{logit} s + b \operatorname{logit} q_t + c
+
+    `verification` has the probabilities after a closer look, and `certainty` that of an object.
+
+    Shapes: usual `(K,)`, :math:`\operatorname{logit} q`.
+    """
+
+    usual: Tensor
+
+    def __init__(
+        self, classes: int, *, thresholds: Thresholds | None = None, certainty: Certainty | None = None
+    ) -> None:
+        super().__init__()
+        self.register_buffer("usual", torch.zeros(classes))
+        self.whole = nn.Linear(2, 1)
+        self.verification = Verification(thresholds=thresholds)
+        self.certainty = certainty
+
+    def presence(self, best: Tensor, target: Tensor) -> Tensor:
+        """Log odds that the photograph holds classes 1..K, by their highest scores; shapes `(...)`."""
+        facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
+        odds: Tensor = self.whole(facts)[..., 0]
+        return odds
+
+    def record(self) -> dict[str, Any]:
+        """Thresholds and certainty as JSON."""
+        thresholds, certainty = self.verification.thresholds, self.certainty
+        return {
+            "thresholds": None if thresholds is None else vars(thresholds),
+            "certainty": None if certainty is None else certainty.numbers,
+        }
+
+    @classmethod
+    def of(cls, classes: int, record: Mapping[str, Any]) -> Self:
+        """The module of a record, before its tensors are loaded."""
+        thresholds, certainty = record["thresholds"], record["certainty"]
+        return cls(
+            classes,
+            thresholds=None if thresholds is None else Thresholds(**thresholds),
+            certainty=None if certainty is None else Certainty.of(certainty),
+        )
+
+
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
@@ -245,7 +293,16 @@ class GlimpseEvidence(Pretrained):
             "survey.border": Field((4,), low=-1e3, high=1e3),
             "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
             "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
-            **photograph_fields(),
+            **{
+                f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True)
+                for name, shape in {
+                    "usual": ("K",),
+                    "whole.weight": (1, 2),
+                    "whole.bias": (1,),
+                    "verification.linear.weight": (2, CLOSER_FEATURES),
+                    "verification.linear.bias": (2,),
+                }.items()
+            },
         },
         {
             "classes": Number(size="K"),
@@ -256,7 +313,9 @@ class GlimpseEvidence(Pretrained):
             "survey": Object({"foresight": Number(0, 1)}),
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
-            "photograph": PHOTOGRAPH,
+            "photograph": Maybe(
+                Object({"thresholds": THRESHOLDS, "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST)))})
+            ),
         },
     )
 

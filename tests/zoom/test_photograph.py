@@ -12,8 +12,8 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import SEEN, PhotographPlaces, WindowLook, candidates, closer_window
+from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.glances import LiveGlances, overview
-from semfov.zoom.photograph import PhotographEvidence
 from semfov.zoom.slices import ranked, raw, usual_slices
 
 SIZE = (192, 144)
