@@ -15,7 +15,28 @@ from semfov.zoom.evidence import STEPS, GlimpseEvidence, PhotographEvidence, poo
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.sums import Box, Cells, Place, extent, union
+
+Cells = NDArray[np.float32]
+
+_Box = tuple[int, int, int, int]
+"""Cells `(x1, y1, x2, y2)` of a lattice."""
+
+_Place = tuple[slice, slice]
+"""Rows and columns of an array."""
+
+
+def _union(box: _Box, other: _Box | None) -> _Box:
+    """The smallest box that contains both boxes; the first one if there is no other."""
+    if other is None:
+        return box
+    return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
+
+
+def _extent(marked: NDArray[np.bool_]) -> _Box:
+    """Find the smallest box that contains all marked cells; marked `(rows, columns)`."""
+    rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
 
 _UNKNOWN = -4.0
 """Log odds that are used where no earlier look gave any."""
@@ -33,7 +54,7 @@ class _Table(NamedTuple):
         """View of the rows of an array of the look that belong to these windows, `(down, across, ...)`."""
         return values[self.rows].reshape(*self.shape, *values.shape[1:])
 
-    def holding(self, changed: Box) -> Place:
+    def holding(self, changed: _Box) -> _Place:
         """Windows that hold one of the changed cells of the gist."""
         (x1, y1, x2, y2), reach = changed, self.span - 1
         return slice(max(y1 - reach, 0), min(y2, self.shape[0])), slice(max(x1 - reach, 0), min(x2, self.shape[1]))
@@ -59,7 +80,7 @@ class _Look:
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
         self.gist = gist
         (x, y), scale, (rows, columns) = gist.first, gist.scale, gist.scores.shape[:2]
-        self.box: Box = (x, y, x + columns * scale, y + rows * scale)
+        self.box: _Box = (x, y, x + columns * scale, y + rows * scale)
         self.fresh = True
         self.left = np.ones((rows, columns), np.float32)
         self.visible = self.scores = gist.scores.numpy()
@@ -92,9 +113,9 @@ class _Look:
             differs = (self.gist.best.numpy() > 0) & (self.left != before)
             if not differs.any():
                 return
-            changed = extent(differs)
+            changed = _extent(differs)
         if differs.any():
-            self._cover(extent(differs))
+            self._cover(_extent(differs))
         if not self.tables:
             return
         places = [table.holding(changed) for table in self.tables.values()]
@@ -108,7 +129,7 @@ class _Look:
             facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
             yield _Pooled(level - self.gist.level, top, summary, facts, stale)
 
-    def _cover(self, changed: Box) -> None:
+    def _cover(self, changed: _Box) -> None:
         """Multiply the scores by the share that is left to see, where it has changed."""
         if self.visible is self.scores:
             self.visible = self.scores.copy()
@@ -147,11 +168,11 @@ class _WindowOdds:
         self._odds: dict[int, Cells] = {
             level: np.full(lattice.places(level)[::-1], -np.inf, np.float32) for level in range(1, lattice.levels)
         }
-        self._changed: Box | None = None
+        self._changed: _Box | None = None
 
-    def mark(self, changed: Box) -> None:
+    def mark(self, changed: _Box) -> None:
         """Have the log odds computed anew where less or more is left to see."""
-        self._changed = union(changed, self._changed)
+        self._changed = _union(changed, self._changed)
 
     @torch.no_grad()
     def update(self) -> Mapping[int, Cells]:
@@ -253,17 +274,17 @@ class _WindowSums:
     summed again. A window that reaches beyond the cells sums those that it holds.
     """
 
-    def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[Place], Cells]) -> None:
+    def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[_Place], Cells]) -> None:
         self._span, self._cells = len(weight), cells
         places = np.arange(max(max(n - self._span, 0) + 1 for n in shape))
         self._band = np.zeros((len(places) + self._span - 1, len(places)), np.float32)
         self._band[places + np.arange(self._span)[:, None], places] = weight[:, None]
         self._sums = np.zeros([max(n - self._span, 0) + 1 for n in shape], np.float32)
-        self._changed: Box | None = (0, 0, shape[1], shape[0])
+        self._changed: _Box | None = (0, 0, shape[1], shape[0])
 
-    def mark(self, changed: Box) -> None:
+    def mark(self, changed: _Box) -> None:
         """Have the windows summed again that hold one of some cells."""
-        self._changed = union(changed, self._changed)
+        self._changed = _union(changed, self._changed)
 
     def update(self) -> Cells:
         """Sum the cells of every window, `(down, across)`; the next call changes the result."""
@@ -281,7 +302,7 @@ class _WindowSums:
         return self._sums
 
 
-_EVERYWHERE: Place = (slice(None), slice(None))
+_EVERYWHERE: _Place = (slice(None), slice(None))
 
 
 class ZoomBelief:
@@ -354,7 +375,7 @@ class ZoomBelief:
         differs = before != now
         if differs.any():
             np.copyto(now, before)
-            self._mark(extent(differs))
+            self._mark(_extent(differs))
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
@@ -381,14 +402,14 @@ class ZoomBelief:
                 part[:] = 0
                 self._mark((x1, y1, x2, y2))
 
-    def _mark(self, changed: Box, *, left: bool = True) -> None:
+    def _mark(self, changed: _Box, *, left: bool = True) -> None:
         """Mark stored values of windows as outdated where cells, or the share of them that is left, changed."""
         for sums in self._sums.values():
             sums.mark(changed)
         if left and self._odds is not None:
             self._odds.mark(changed)
 
-    def _box(self, look: Gist) -> Box:
+    def _box(self, look: Gist) -> _Box:
         """The cells that a look shows."""
         (x, y), (rows, columns) = look.first, look.scores.shape[:2]
         return x, y, min(x + columns * look.scale, self.lattice.columns), min(y + rows * look.scale, self.lattice.rows)
@@ -424,7 +445,7 @@ class ZoomBelief:
         clear = float(expected[expected >= _CLEAR].sum())
         return clear, float(expected.sum()) - clear
 
-    def expected(self, level: int, at: Place = _EVERYWHERE) -> Cells:
+    def expected(self, level: int, at: _Place = _EVERYWHERE) -> Cells:
         """Number of objects that looks of a level are expected to find in each cell, in some rows and columns."""
         self._predict()
         expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
@@ -454,7 +475,7 @@ class ZoomBelief:
         """Sums over the windows of a level; → `(down, across)`."""
         if (level, octaves) not in self._sums:
             source = self.source.numpy()  # where it is below a level, no look has shown a cell at it or closer
-            cells: Callable[[Place], Cells] = (
+            cells: Callable[[_Place], Cells] = (
                 lambda at: self.left.numpy()[at] * (source[at] < level),
                 lambda at: self.expected(level, at),
                 lambda at: self.expected(level + 1, at) * (source[at] < level),

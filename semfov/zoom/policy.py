@@ -5,10 +5,9 @@ from functools import reduce
 
 import numpy as np
 
-from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.belief import Cells, ZoomBelief
 from semfov.zoom.glances import Window, on_lattice
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.sums import Cells
 
 WindowChoice = tuple[Window, float]
 """A window and the value of a look at it."""
