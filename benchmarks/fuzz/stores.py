@@ -57,7 +57,7 @@ def part_files(draw: Draw, folder: Path) -> Case:
 
 
 def look_files(draw: Draw, folder: Path) -> Case:
-    """`LookStore.load`: the stored looks bit for bit, or none."""
+    """`DetectionStore.load`: the stored looks bit for bit, or none."""
     store = cell_store(folder, {"detector": "toy"}, 2, 1, 3)
     generator = torch.Generator().manual_seed(int(draw.rng.integers(2**31)))
     whole = {

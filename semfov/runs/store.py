@@ -8,11 +8,10 @@ of a run, and never its result.
 import hashlib
 import json
 import platform
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from semfov.eye import Eye
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import read_tensors, write_tensors
-from semfov.runs.looks import LOOK_SOURCES, BoxKey, one_thread, photograph_looks
+from semfov.runs.looks import LOOK_SOURCES, one_thread, photograph_looks
 from semfov.version import __version__
 
 _Action = TypeVar("_Action", bound=Hashable)
@@ -56,10 +55,15 @@ class SceneStore:
         write_tensors(self.path(digest), self.key, tensors)
 
 
-class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
-    """Looks at scenes by action, with the looks at a scene in one file."""
+class DetectionStore(SceneStore):
+    """Looks at scenes by action, with the looks at a scene in one file.
 
-    width: ClassVar[int]
+    The looks consist of detections. An action is a number, such as that of a cell, or the box of a closer look.
+    """
+
+    width = 5
+    """Number of numbers of an action."""
+
     more: Mapping[str, Field] = {}  # names, shapes and ranges of the tensors that a look has besides its detections
 
     def __init__(
@@ -74,7 +78,7 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
         code = modules_digest(*sources, __name__)
         super().__init__(folder, what, code, Schema(fields | {**self.more}))
 
-    def load(self, digest: str) -> dict[_Action, _StoredLook]:
+    def load(self, digest: str) -> dict[Any, Any]:
         """Read the looks at a scene."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
@@ -82,45 +86,22 @@ class LookStore(SceneStore, ABC, Generic[_Action, _StoredLook]):
         actions = [self.decode(row) for row in tensors["actions"].tolist()]
         return dict(zip(actions, self.unpack(tensors, actions), strict=True))
 
-    def save(self, digest: str, looks: Mapping[_Action, _StoredLook]) -> None:
+    def save(self, digest: str, looks: Mapping[Any, Any]) -> None:
         """Store the looks at a scene."""
         rows = {action: tuple(map(float, self.encode(action))) for action in looks}
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
         self.write(digest, {"actions": numbers, **self.pack([looks[action] for action in actions])})
 
-    @abstractmethod
-    def encode(self, action: _Action) -> Sequence[float]:
-        """Write an action as `width` numbers."""
-
-    @abstractmethod
-    def decode(self, row: Sequence[float]) -> _Action:
-        """Read an action from its numbers."""
-
-    @abstractmethod
-    def pack(self, looks: Sequence[_StoredLook]) -> dict[str, Tensor]:
-        """Convert looks to tensors for a file."""
-
-    @abstractmethod
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[_Action]) -> list[_StoredLook]:
-        """Convert the tensors of a file back to the looks of these actions."""
-
-
-class DetectionStore(LookStore[Any, Detections]):
-    """Looks that consist of detections. An action is a number, such as that of a cell, or the box of a closer look."""
-
-    width = 5
-
-    def encode(self, action: int | BoxKey) -> Sequence[float]:
-        """A number, or -1 and the corners of a box."""
+    def encode(self, action: Any) -> Sequence[float]:
+        """An action as numbers: itself, or -1 and the corners of a box."""
         return (-1, *action) if isinstance(action, tuple) else (action, 0, 0, 0, 0)
 
-    def decode(self, row: Sequence[float]) -> int | BoxKey:
-        """A number or a box."""
+    def decode(self, row: Sequence[float]) -> Any:
+        """The action of some numbers."""
         return tuple(row[1:]) if row[0] < 0 else int(row[0])
 
-    @staticmethod
-    def pack(looks: Sequence[Detections]) -> dict[str, Tensor]:
+    def pack(self, looks: Sequence[Any]) -> dict[str, Tensor]:
         """Join the detections of looks without padding, which makes up most of a padded batch."""
         return {
             "count": torch.cat([look.mask.sum(-1) for look in looks]),
@@ -128,8 +109,7 @@ class DetectionStore(LookStore[Any, Detections]):
             "scores": torch.cat([look.scores[look.mask] for look in looks]),
         }
 
-    @staticmethod
-    def unpack(tensors: Mapping[str, Tensor], actions: Sequence[object]) -> list[Detections]:
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Any]) -> list[Any]:
         """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
         counts = tensors["count"].tolist()
         looks = zip(tensors["boxes"].split(counts), tensors["scores"].split(counts), strict=True)
@@ -159,7 +139,7 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
     def __init__(
         self,
         open_scene: Callable[[], Callable[[_Action], _StoredLook]],
-        store: LookStore[_Action, _StoredLook] | None = None,
+        store: DetectionStore | None = None,
         digest: Callable[[], str] = lambda: "",
     ) -> None:
         self._open, self._store, self._digest = open_scene, store, digest

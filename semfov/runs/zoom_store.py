@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.io.schema import Field
-from semfov.runs.store import DetectionStore, LookStore, RememberedLooks
+from semfov.runs.store import DetectionStore, RememberedLooks
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.hints import Gist
@@ -20,7 +20,7 @@ WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.ima
 """Modules that turn a large picture into glances; all modules that they import count, too."""
 
 
-class GlanceStore(LookStore[Window, Glance]):
+class GlanceStore(DetectionStore):
     """Glances at pictures by window, on disk."""
 
     width = 12
@@ -53,7 +53,7 @@ class GlanceStore(LookStore[Window, Glance]):
     def pack(self, looks: Sequence[Glance]) -> dict[str, Tensor]:
         """Convert glances to tensors for a file."""
         return {
-            **DetectionStore.pack([glance.detections for glance in looks]),
+            **super().pack([glance.detections for glance in looks]),
             "cut": torch.cat([glance.cut for glance in looks]),
             "show": torch.stack([glance.show for glance in looks]),
             **_pack_gists([glance.gist for glance in looks], self.classes),
@@ -61,7 +61,7 @@ class GlanceStore(LookStore[Window, Glance]):
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
         """Convert the tensors of a file back to the glances at these windows."""
-        seen = DetectionStore.unpack(tensors, actions)
+        seen = super().unpack(tensors, actions)
         cut, gists = tensors["cut"].split(tensors["count"].tolist()), _unpack_gists(tensors, actions)
         return [Glance(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
 

@@ -101,23 +101,17 @@ def animate(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         animate(scanpath, "search.gif", seconds=0.5)
     """
-    check(seconds > 0, "seconds", "a positive time", seconds)
-    check(hold >= 0, "hold", "0 seconds or more", hold)
-    frames = _look_frames(scanpath, photograph_of(scanpath, image), views, boxes)
-    film = Film(frames, seconds, hold, scanpath.describe())
-    return film if path is None else film.save(path)[0]
-
-
-def _look_frames(
-    record: Record, image: Tensor, views: Sequence[Tensor] | None, boxes: Tensor | None = None
-) -> list[Frame]:
-    """Frames of a record, all drawn in one figure; each is the figure of `plot_fixation`."""
     from matplotlib import rc_context
 
-    shown = views_of(record, image, views)
+    check(seconds > 0, "seconds", "a positive time", seconds)
+    check(hold >= 0, "hold", "0 seconds or more", hold)
+    picture = photograph_of(scanpath, image)
+    shown = views_of(scanpath, picture, views)
     with rc_context(STYLE):
-        figure = LookFigure(record, image, shown[0], boxes)
-        return render(figure.show(number, view) for number, view in enumerate(shown))
+        figure = LookFigure(scanpath, picture, shown[0], boxes)  # one for all frames
+        frames = render(figure.show(number, view) for number, view in enumerate(shown))
+    film = Film(frames, seconds, hold, scanpath.describe())
+    return film if path is None else film.save(path)[0]
 
 
 def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from semfov import Detections, Grid
 from semfov.viz import animate, plot_fixation
-from semfov.viz.animation import Film, _in_one_palette, _look_frames, render
+from semfov.viz.animation import Film, _in_one_palette, render
 from semfov.viz.scanpath import LookFigure, views_of
 from tests import small
 from tests.refusals import refused
@@ -60,7 +60,7 @@ def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
 def test_frames_equal_figures_drawn_one_by_one(searched):
     """All frames are drawn with one figure, but each equals the figure of `plot_fixation`."""
     scanpath, image, views = searched
-    frames = _look_frames(scanpath, image, views)
+    frames = animate(scanpath, image=image, views=views).frames
     assert len(frames) == len(scanpath)
     for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
         (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
@@ -102,5 +102,5 @@ def test_frames_share_their_colours_and_do_not_depend_on_earlier_ones(searched):
     (again,) = render([figure.show(2, seen[2])])
     np.testing.assert_array_equal(last, again)
     # Parts that do not change must not flicker.
-    first, *others = _in_one_palette(_look_frames(*searched))
+    first, *others = _in_one_palette(animate(scanpath, image=image, views=views).frames)
     assert all(frame.getpalette() == first.getpalette() for frame in others)
