@@ -131,9 +131,9 @@ class CandidatePlaces(ABC, Generic[LookType]):
         examined = torch.cat([boxes.new_zeros(0, 4), *(pair for _, pair, _ in self._examined)])
         return (box_iou(boxes, examined) >= SAME).any(-1)
 
+    @abstractmethod
     def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
-        raise NotImplementedError(f"{type(self).__name__} has no belief towards which closer looks could fade")
 
 
 @dataclass(frozen=True)

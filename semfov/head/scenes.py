@@ -25,9 +25,6 @@ from semfov.sensor.sphere import Boxes, Camera, Regions, panorama_directions, pa
 FIELDS = (60.0,)
 """Default fields of view in degrees."""
 
-AROUND = (-180.0, 180.0)
-"""Limits of pan of a head that turns all the way round."""
-
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
 
@@ -150,7 +147,7 @@ class Sphere(World):
         picture: tuple[int, int],
         size: tuple[int, int],
         *,
-        pan: tuple[float, float] = AROUND,
+        pan: tuple[float, float] = (-180.0, 180.0),
         tilt: tuple[float, float] = (-90.0, 90.0),
         fields: tuple[float, ...] = FIELDS,
         speeds: Speeds | None = None,

@@ -36,15 +36,12 @@ class _NamedSensor:
         return {**self.settings, **changes}
 
 
-def _foveation(sigma: float, growth: float, *, published: bool = False) -> _NamedSensor:
-    settings = {"sigma": sigma, "growth": growth, "levels": 5, "convention": "kornia"}
-    return _NamedSensor(Foveation, settings, published)
-
+_PYRAMID = {"levels": 5, "convention": "kornia"}
 
 SENSORS: dict[SensorName, _NamedSensor] = {
-    "published": _foveation(100.0, 1.0, published=True),
-    "published-narrow": _foveation(50.0, 1.0, published=True),
-    "gradual": _foveation(100.0, 2.0),
+    "published": _NamedSensor(Foveation, {"sigma": 100.0, "growth": 1.0, **_PYRAMID}, published=True),
+    "published-narrow": _NamedSensor(Foveation, {"sigma": 50.0, "growth": 1.0, **_PYRAMID}, published=True),
+    "gradual": _NamedSensor(Foveation, {"sigma": 100.0, "growth": 2.0, **_PYRAMID}),
     "log-polar": _NamedSensor(LogPolar, {"fovea": 60.0, "spacing": 1.0, "pooling": 1.0}),
     "multi-scale": _NamedSensor(MultiScaleFovea, {"side": 160, "scales": 4}),
 }
