@@ -36,7 +36,7 @@ METADATA: tuple[dict[str, str], ...] = (
 
 
 def onnx_files(draw: Draw, folder: Path) -> Case:
-    """`load_onnx`: a detector with finite boxes and scores on the simplex, or an error that names the fault."""
+    """`load_detector`: a detector with finite boxes and scores on the simplex, or an error that names the fault."""
     faults = draw.data.draw(st.sets(st.sampled_from(FAULTS), max_size=2), label="faults")
 
     def faulty(fault: str, odd: Iterable[Any], usual: Any) -> Any:
