@@ -227,6 +227,21 @@ class Detector(StatedModule, ABC):
         """
         raise no_features(self.name)
 
+    def feature_maps(self, canvas: Tensor, layers: Sequence[str] | None = None) -> dict[str, Tensor]:
+        """Compute the feature maps of `propose_with_features` alone.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+            layers: names of the maps, as for `features`.
+
+        Returns:
+            The maps by name.
+
+        Raises:
+            InputError: the detector hides its feature maps, or has no map of this name.
+        """
+        return self.propose_with_features(canvas, layers)[1]
+
     def head_input(self, canvas: Tensor) -> Tensor:
         """Compute the features that the first head reads, and nothing after them.
 

@@ -92,7 +92,15 @@ class OnnxDetector(Detector):
     def propose_with_features(
         self, canvas: Tensor, layers: Sequence[str] | None = None
     ) -> tuple[Candidates, dict[str, Tensor]]:
-        """Compute all boxes and feature maps in one run of a session that has the maps as further outputs."""
+        outputs, maps = self._outputs(canvas, layers)
+        own = {name: outputs[name] for name, _ in self.session.outputs}
+        return self.decode(own, (canvas.shape[-1], canvas.shape[-2])), maps
+
+    def feature_maps(self, canvas: Tensor, layers: Sequence[str] | None = None) -> dict[str, Tensor]:
+        return self._outputs(canvas, layers)[1]
+
+    def _outputs(self, canvas: Tensor, layers: Sequence[str] | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The outputs and the maps by name, in one run of a session that has the maps as further outputs."""
         self._check_canvas(canvas)
         if self._layers is None:
             steps = network_steps(self.session.path, self.session.image, (canvas.shape[-1], canvas.shape[-2]))
@@ -103,9 +111,7 @@ class OnnxDetector(Detector):
         if not set(tensors.values()) <= {name for name, _ in self._wide.outputs}:
             self._wide = self.session.widened([*tensors.values()])
         outputs = self._wide(self.preprocessing(canvas.detach()))
-        own = {name: outputs[name] for name, _ in self.session.outputs}
-        candidates = self.decode(own, (canvas.shape[-1], canvas.shape[-2]))
-        return candidates, {layer: outputs[name] for layer, name in tensors.items()}
+        return outputs, {layer: outputs[name] for layer, name in tensors.items()}
 
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""

@@ -24,7 +24,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
-from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
 from semfov.paths.base import Record
@@ -50,7 +50,7 @@ class GazePrediction:
     """Where people look in a picture that they view freely, without a task.
 
     Attributes:
-        model: the model.
+        model: the model; predictions share the one that is shipped, so copy it to change it.
         terms: its terms for this picture (`FixationDensity.terms`).
         size: `(width, height)` of the picture in pixels.
         photograph: `(3, h, w)`, bytes, the reduced picture.
@@ -112,12 +112,12 @@ class GazePrediction:
         check(model is None or isinstance(model, FixationDensity), "model", expected, type(model).__name__)
         if model is not None:
             model.check_compatible(detector)
-        model = FixationDensity.for_detector(detector) if model is None else deepcopy(model)
+        model = shared_density(detector) if model is None else deepcopy(model).cpu()
         size = int(image.shape[-1]), int(image.shape[-2])
         with torch.no_grad():
             if seen is None:
                 canvas, placement = detector.fit(image[None])
-                _, maps = detector.propose_with_features(canvas, [*model.layers])
+                maps = detector.feature_maps(canvas, [*model.layers])
                 features = FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
             elif isinstance(looking, Eye):
                 seen = _fixations_of(seen, "seen", size, source)
@@ -126,9 +126,10 @@ class GazePrediction:
                 features = features_so_far(views, points, points[None])
             else:
                 raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
-            terms = model.to(image).terms(features, size[::-1])
+            there = image.dtype == model.read.dtype and image.device == model.read.device
+            terms = (model if there else deepcopy(model).to(image)).terms(features, size[::-1])
         terms, looks = {name: each.cpu() for name, each in terms.items()}, None if seen is None else len(seen)
-        return cls(model.cpu(), terms, size, reduced_copy(image), source, looks)
+        return cls(model, terms, size, reduced_copy(image), source, looks)
 
     @cached_property
     def density(self) -> Tensor:

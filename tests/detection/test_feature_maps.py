@@ -135,6 +135,9 @@ def test_maps_of_an_onnx_model_equal_a_torch_twin(network):
     }  # fmt: skip
     for each, twin in zip(features.maps.values(), expected, strict=True):
         torch.testing.assert_close(each, twin, rtol=1e-4, atol=1e-5)
+    alone = detector.feature_maps(detector.fit(image)[0], ["backbone16"])
+    assert alone.keys() == {"backbone16"}
+    assert torch.equal(alone["backbone16"], features.maps["backbone16"])
     inside = detector.features(image, ["conv1"]).maps["conv1"]
     torch.testing.assert_close(inside.relu(), expected[1], rtol=1e-4, atol=1e-5)
     refused("did you mean 'head32'", detector.features, image, ["head23"])

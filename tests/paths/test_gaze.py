@@ -152,6 +152,9 @@ def test_what_a_fovea_has_seen_is_known_alone():
         torch.testing.assert_close(predicted(each[None]), GazePrediction.of(eye, view, model=model).terms["map"][0])
     halves = torch.cat([views[0][..., :40], views[1][..., 40:]], -1)
     torch.testing.assert_close(predicted(points), GazePrediction.of(eye, halves, model=model).terms["map"][0])
+    double = GazePrediction.of(eye, image.double(), model=model)
+    assert double.model.read.dtype == model.read.dtype == torch.float32
+    torch.testing.assert_close(double.terms["map"].float(), GazePrediction.of(eye, image, model=model).terms["map"])
     seen = Fixations("a", "1", points, (80, 60))
     refused("looking: expected an eye", GazePrediction.of, detector, image, model=model, seen=seen)
     with pytest.raises(InputError, match="sensor: expected a Foveation"):

@@ -155,16 +155,8 @@ class FixationDensity(Pretrained):
         Raises:
             InputError: none is shipped for it; the message has the command that fits one.
         """
-        path = cls.shipped / f"{detector.name}.safetensors"
-        if not path.is_file():
-            names = ", ".join(sorted(path.stem for path in cls.shipped.glob("*.safetensors")))
-            raise InputError(
-                f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
-                f"fixations with `semfov fit {detector.name} --gaze.fixations FILE --gaze.pictures FOLDER`"
-            )
-        model = deepcopy(_read(path))
+        model = deepcopy(shared_density(detector))
         assert isinstance(model, cls)
-        model.check_compatible(detector)
         return model
 
     def check_compatible(self, detector: Detector) -> None:
@@ -395,6 +387,21 @@ class FixationDensity(Pretrained):
 
 
 _read = cache(FixationDensity.from_pretrained)  # shipped files do not change
+
+
+def shared_density(detector: Detector) -> FixationDensity:
+    """The model of `FixationDensity.for_detector`, one for all who do not change it."""
+    folder = FixationDensity.shipped
+    path = folder / f"{detector.name}.safetensors"
+    if not path.is_file():
+        names = ", ".join(sorted(path.stem for path in folder.glob("*.safetensors")))
+        raise InputError(
+            f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
+            f"fixations with `semfov fit {detector.name} --gaze.fixations FILE --gaze.pictures FOLDER`"
+        )
+    model = _read(path)
+    model.check_compatible(detector)
+    return model
 
 
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:
