@@ -264,8 +264,8 @@ class FixationDensity(Pretrained):
             shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
             (top, bottom), (left, right) = map(_needed, _placed(features, shape), shape)
             value = F.conv2d(maps[name][..., top:bottom, left:right].to(weight), weight[..., None, None])
-            joined[shape] = joined[shape] + value if shape in joined else value
-        hidden = self.shift[:, None, None]
+            joined[shape] = joined[shape].add_(value) if shape in joined else value
+        hidden: Tensor | None = None
         for shape, value in joined.items():
             for axis, (start, end) in enumerate(_placed(features, shape)):
                 if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
@@ -273,7 +273,8 @@ class FixationDensity(Pretrained):
                     line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
                     line = line[:, first:last]
                     value = value @ line.mT if axis else line @ value
-            hidden = hidden + value
+            hidden = value + self.shift[:, None, None] if hidden is None else hidden.add_(value)
+        assert hidden is not None
         units = self.mix.shape[-1]
         hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, units))
         hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
