@@ -135,7 +135,10 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     if isinstance(source, Path):
         _check_there(source, "source")
         if source.is_dir():
-            raise DataError(f"source: expected a video, got the folder {source}; semfov find takes these")
+            raise DataError(
+                f"source: expected a video, got the folder {source}; ffmpeg makes a video of its frames, "
+                f"and semfov find takes folders of pictures"
+            )
         check_regular(source)
         with suppress(OSError), source.open("rb") as file:
             if file.read(len(_PLAYLIST)) == _PLAYLIST:

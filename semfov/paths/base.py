@@ -72,8 +72,11 @@ class Record(Conversion):
     def __repr__(self) -> str:
         """The summary, the looks, and the most confident objects."""
         objects, sure = self.objects, self.confirmed.tolist()
-        rows = zip(objects.labels.tolist()[:_NAMED], objects.scores.tolist(), sure, strict=False)
-        named = [f"{self.classes[label]} {score:.2f}{' (confirmed)' * confirmed}" for label, score, confirmed in rows]
+        rows = zip(self.object_rows()[:_NAMED], sure, strict=False)
+        named = [
+            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){' (confirmed)' * confirmed}"
+            for row, confirmed in rows
+        ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
         found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"
         return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])

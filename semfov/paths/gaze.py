@@ -398,9 +398,10 @@ class GazePrediction:
     def describe(self) -> str:
         """Describe the prediction in one line."""
         first, plural = self.peaks(1)[0], "" if self.seen == 1 else "s"
+        reach = _REACH * max(self.size)
         known = "" if self.seen is None else f", after {self.seen} fixation{plural} seen by the fovea"
         return (
-            f"{first['share']:.0%} of fixations within {_REACH:.0%} of ({first['x']:.0f}, {first['y']:.0f}); "
+            f"{first['share']:.0%} of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
             f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{known}"
         )
 

@@ -168,7 +168,7 @@ class Outcome(ABC):
 
     @property
     def confirmed(self) -> Tensor:
-        """Which of the objects a closer look or the decision confirmed, `(M,)` boolean."""
+        """Which of the objects a closer look or the decision confirmed, `(M,)` boolean; none if no target was found."""
         return self._outcome[1]
 
     @property
@@ -232,6 +232,10 @@ class Outcome(ABC):
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
         objects, sure = _confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
+        if self.decision is not None and self.decision.outcome != "found":
+            # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
+            objects = objects[~sure | (objects.scores >= self.least)]
+            sure = torch.zeros(len(objects), dtype=torch.bool)
         return replace(objects, classes=self.classes), sure
 
     def _counts(self, candidates: Objects) -> Tensor:

@@ -288,7 +288,7 @@ class Scanpath(_CellRecord):
         path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
         width, height = grid.extent.tolist()
         of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
-        return [f"at (column, row): {' '.join(path)} of {of}"]
+        return [f"looks at (column, row): {' '.join(path)} of {of}"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()

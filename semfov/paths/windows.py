@@ -242,7 +242,7 @@ class ZoomPath(Record):
         looks = [f"({x:.0f}, {y:.0f}) × {magnification:.2f}" for x, y, magnification in points]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         width, height = self.size
-        return [f"at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
+        return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}

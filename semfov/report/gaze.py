@@ -106,6 +106,6 @@ def _facts(prediction: GazePrediction) -> str:
         f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
         '<div class="wide" tabindex="0" role="region" aria-label="Places">'
         '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
-        f'<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 %</th></tr></thead><tbody>{rows}'
-        "</tbody></table></div>"
+        '<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 % of the longer side</th></tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
     )

@@ -44,13 +44,16 @@ def plot_gaze(
     for order, each in enumerate(scanpaths):
         points = each.resized(prediction.size).points + 0.5
         axes.plot(*points.T, "-o", color=line_style(order, len(scanpaths))["color"], markersize=3, linewidth=1)
-    for number, peak in enumerate(prediction.peaks() if cells is None else [], 1):
+    peaks = prediction.peaks() if cells is None else []
+    for number, peak in enumerate(peaks, 1):
         place = peak["x"] + 0.5, peak["y"] + 0.5
         axes.annotate(
             str(number), place, color="white", ha="center", va="center",
             bbox={"boxstyle": "circle", "facecolor": GAZE, "edgecolor": "white"},
         )  # fmt: skip
-    axes.set(title=fill(prediction.describe(), 80), xlim=(0, width), ylim=(height, 0))
+    # Without the words, the numbers look like the order of a viewer's fixations.
+    numbers = f"; 1 to {len(peaks)}: places with most fixations first" if peaks else ""
+    axes.set(title=fill(prediction.describe() + numbers, 80), xlim=(0, width), ylim=(height, 0))
     return figure
 
 

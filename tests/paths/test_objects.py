@@ -59,6 +59,24 @@ def test_the_nearest_fixation_and_the_closer_look_have_the_box():
     assert refuted.objects.boxes.tolist() == [RIGHT]
 
 
+def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed():
+    """It is listed by its probability, from the threshold on."""
+    path = scanpath(
+        look((LEFT, 1, 0.2)), look((LEFT, 1, 0.1)), target=1, decision=Decision("undecided", 0.9, None, None)
+    )
+    unsure = replace(path, closer=(CloseUp(0, 1, 0, torch.tensor(LEFT), 0.55, 0.9),))
+    assert unsure.objects.scores.tolist() == pytest.approx([0.55])
+    assert unsure.confirmed.tolist() == [False]
+    assert len(replace(unsure, least=0.6).objects) == 0
+    assert "(confirmed)" not in repr(unsure)
+
+
+def test_the_text_form_tells_where_the_objects_are():
+    path = scanpath(look((LEFT, 1, 0.8)), look((RIGHT, 1, 0.1)), target=None)
+    assert "cup 0.80 at (20, 20)" in repr(path)
+    assert "looks at (column, row): " in repr(path)
+
+
 def test_what_the_decision_found_is_among_the_objects():
     """Also where no detection has the score, or there is none at the place."""
     weak = scanpath(look((LEFT, 1, 0.2)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.31)), target=1)
