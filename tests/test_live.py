@@ -1,6 +1,7 @@
 """Live perception of a camera or a video: beliefs persist and fade, and equal those of a search if nothing changes."""
 
 import math
+from dataclasses import FrozenInstanceError
 from itertools import pairwise
 
 import numpy as np
@@ -180,6 +181,14 @@ def test_cells_count_as_visited_up_to_an_age():
     ]
     for rate in (-0.1, math.nan, True, "fast"):
         refused("rate: expected a number from 0", Forgetting, rate)
+
+
+def test_forgetting_is_a_value_whose_share_and_span_cannot_outlive_its_rate():
+    forgetting = Forgetting(0.1)
+    assert (repr(forgetting), forgetting) == ("Forgetting(rate=0.1)", Forgetting(0.1))
+    assert forgetting != Forgetting(0.2)
+    with pytest.raises(FrozenInstanceError):
+        forgetting.rate = 0.2
 
 
 class Deciding(Semantic):

@@ -1,7 +1,7 @@
 """The state of episodes between two looks: belief, visited cells and their ages, and forgetting."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from semfov.episode.looks import Looks
 from semfov.errors import check_number
 
 
+@dataclass(frozen=True)
 class Forgetting:
     r"""Forgetting in a scene that changes between looks.
 
@@ -19,11 +20,8 @@ class Forgetting:
     fixated cell for :math:`\ln 2 / r` looks, until half of its evidence is left. If all cells are inhibited, the one
     that was fixated longest ago is free.
 
-    Args:
-        rate: r, 0 or more; 0 forgets nothing.
-
     Attributes:
-        rate: as given.
+        rate: r, 0 or more; 0 forgets nothing.
         keep: share of the evidence that is left after a look, :math:`e^{-r}`.
         span: number of looks for which a fixated cell is inhibited, :math:`\ln 2 / r`.
 
@@ -34,10 +32,14 @@ class Forgetting:
     (0.905, 6.9)
     """
 
-    def __init__(self, rate: float = 0.0) -> None:
-        check_number(rate, "rate", 0, 100)
-        self.rate, self.keep = rate, math.exp(-rate)
-        self.span = math.log(2) / rate if rate else math.inf
+    rate: float = 0.0
+    keep: float = field(init=False, repr=False, compare=False)
+    span: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        check_number(self.rate, "rate", 0, 100)
+        object.__setattr__(self, "keep", math.exp(-self.rate))
+        object.__setattr__(self, "span", math.log(2) / self.rate if self.rate else math.inf)
 
     def visited(self, age: Tensor) -> Tensor:
         """Cells that inhibition of return keeps the gaze from.
