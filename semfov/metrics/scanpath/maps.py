@@ -330,11 +330,7 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
 
 
 def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
-    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`.
-
-    >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
-    array([1.])
-    """
+    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`."""
     values = as_array(maps, "maps")
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
     column, row = (np.floor(as_array(each, "x, y") + 0.5) for each in (x, y))
