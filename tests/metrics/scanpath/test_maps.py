@@ -154,6 +154,27 @@ def test_correlation_and_similarity_equal_their_formulas():
     assert similarity(first, 3 * first) == pytest.approx(1)
 
 
+def test_figures_of_maps_equal_those_of_pysaliency(monkeypatch):
+    theirs = pytest.importorskip("pysaliency.metrics", exc_type=ImportError)
+    roc = pytest.importorskip("pysaliency.roc", exc_type=ImportError)
+    monkeypatch.setattr(np, "trapz", np.trapezoid, raising=False)
+    rng = np.random.default_rng(8)
+    first, second = rng.random((2, *SHAPE))
+    x, y, other_x, other_y = (rng.integers(side, size=9) for side in (17, 12, 17, 12))
+    p, q = first / first.sum(), second / second.sum()
+    free = np.ones(SHAPE, bool)
+    free[y, x] = False
+    assert nss(first, x, y).mean() == pytest.approx(theirs.NSS(first, x, y).mean())
+    assert correlation(first, second) == pytest.approx(theirs.CC(first, second))
+    assert similarity(p, q) == pytest.approx(theirs.SIM(p, q))
+    divergence = theirs.probabilistic_image_based_kl_divergence(np.log(q), np.log(p))
+    assert kullback_leibler(p, q) == pytest.approx(divergence)
+    assert auc(first, x, y).mean() == pytest.approx(roc.general_roc(first[y, x], first.ravel())[0])
+    assert auc_judd(first, x, y) == pytest.approx(roc.general_roc(first[y, x], first[free], judd=1)[0])
+    shuffled = roc.general_roc(first[y, x], first[other_y, other_x])[0]
+    assert auc_shuffled(first, x, y, other_x, other_y) == pytest.approx(shuffled)
+
+
 def test_the_expectation_of_auc_borji_is_the_mean_auc():
     rng = np.random.default_rng(6)
     saliency, x, y = rng.random(SHAPE), rng.integers(17, size=30), rng.integers(12, size=30)
