@@ -74,6 +74,7 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | No
                 count += 1
                 if count == 1 and live.criterion is not None:
                     print(f"  found: when {live.criterion} (--confirm)")
+                    print("  absent: when p is below one half, and no look is worth a frame (--give-up)")
                 if count >= _WARM_UP:
                     ends.append(perf_counter())
                     began = began or ends[0]
