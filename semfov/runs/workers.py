@@ -261,8 +261,12 @@ def _started(processes: int) -> Iterator[Executor]:
             yield pool
         except BaseException:
             # Running tasks may be killed: their files are written atomically, either completely or not at all.
-            for child in set(multiprocessing.active_children()) - set(before):
+            children = set(multiprocessing.active_children()) - set(before)
+            for child in children:
                 child.terminate()
+            for child in children:
+                child.join(5)
+                child.kill()  # one that began to wait as the signal came does not see it
             raise
 
 
