@@ -66,6 +66,17 @@ class StudiedFold(Fold):
         return [others_of(group, each, self.centres[group.source]) for each in pictures]
 
 
+def spread(number: int, count: int) -> list[int]:
+    """Up to `count` of so many pictures, evenly spread."""
+    return [*dict.fromkeys(number * each // count for each in range(count))]
+
+
+def in_first(fold: Fold, picture: int) -> tuple[Viewed, int]:
+    """The group of a picture of the first data set, and its place there."""
+    places = [(group, place) for group in fold.groups if group.source == 0 for place in range(len(group))]
+    return places[picture]
+
+
 def viewed_by(group: Viewed, subjects: Collection[str]) -> Viewed:
     """The same pictures, viewed by some of the people."""
     some = tuple(tuple(each for each in people if each.subject in subjects) for people in group.people)

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from eval.human.folds import in_first
 from semfov.belief.grid import Grid
 from semfov.data.pictures import Pictures
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.fit.gaze import MapsOfPicture, maps_of, score
 from semfov.fit.gaze_folds import Fold, FoldStore
-from semfov.fit.viewing import Events, MapSource, Viewed, no_detections
+from semfov.fit.viewing import Events, MapSource, no_detections
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.code import modules_digest
@@ -33,18 +34,15 @@ TERMS = {"all terms": (), "without oculomotor biases": ("oculomotor biases",)}
 
 
 def glimpsed(
-    name: str, source: MapSource, root: Path, store: FoldStore, folds: Sequence[Fold], count: int
+    name: str, source: MapSource, root: Path, store: FoldStore, folds: Sequence[Fold], pictures: Sequence[int]
 ) -> dict[str, Tensor]:
     """Scores of the sharp picture and of what was seen so far, `(P, 3)` by name, of held-out pictures of data set 1."""
-    places = [(group, place) for group in folds[0].groups if group.source == 0 for place in range(len(group))]
-    chosen = dict.fromkeys(len(places) * each // count for each in range(count))
     rows: dict[str, list[Tensor]] = {}
-    for picture in tqdm(chosen, desc="glimpses", unit="picture"):
-        group, place = places[picture]
+    for picture in tqdm(pictures, desc="glimpses", unit="picture"):
         fold = folds[picture % len(folds)]  # the one that holds it out
 
-        def scores(group: Viewed = group, place: int = place, fold: Fold = fold) -> dict[str, Tensor]:
-            model = store.model(name, fold)
+        def scores(picture: int = picture, fold: Fold = fold) -> dict[str, Tensor]:
+            model, (group, place) = store.model(name, fold), in_first(fold, picture)
             views, fixations = views_of(Pictures(root, [group.people[place][0].picture], ())[0].image, source)
             seen = partial(so_far, model, views, fixations, group.size)
             maps: dict[str, MapsOfPicture] = {"sharp picture": maps_of(model, group, [place])[0], "seen so far": seen}

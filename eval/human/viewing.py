@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.comparison.saliency import SALIENCY_CLASSES
-from eval.human.folds import Maps, StudiedFold, viewed_by
+from eval.human.folds import Maps, StudiedFold, in_first, spread, viewed_by
 from eval.human.glimpses import glimpsed, glimpses_table
 from eval.page.origin import END, PLACE
 from semfov.detection.feature_maps import FeatureMaps
@@ -107,7 +107,8 @@ def compare_viewing(config: ViewingConfig) -> None:
             if config.sequences:
                 drawn |= _sequences(name, store, folds, config)
             if config.glimpses:
-                seen = glimpsed(name, opened, config.pictures[0], store, folds, config.glimpses)
+                chosen = spread(len(config.people(0)), config.glimpses)
+                seen = glimpsed(name, opened, config.pictures[0], store, folds, chosen)
     plain, store = cache(lambda: [_without_maps(group) for group in groups()]), FoldStore(config.out, {"data": data})
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
@@ -250,14 +251,12 @@ def _sequences(
     number = len(config.people(0))
     rows: dict[str, list[dict[str, float]]] = {name: [], PEOPLE: []}
     what = {"name": name, "fit": config.fit.plain(), "folds": config.folds, "code": modules_digest(__name__)}
-    chosen = [number * each // config.sequences for each in range(config.sequences)]
-    for picture in tqdm(dict.fromkeys(chosen), desc="sequences", unit="picture"):
+    for picture in tqdm(spread(number, config.sequences), desc="sequences", unit="picture"):
 
         def measured(picture: int = picture) -> dict[str, Tensor]:
             fold = folds[picture % config.folds]  # the one that holds it out
             model = store.model(name, fold)
-            places = [(group, place) for group in fold.groups if group.source == 0 for place in range(len(group))]
-            group, place = places[picture]
+            group, place = in_first(fold, picture)
             terms = {"map": maps_of(model, group, [place])[0], CENTRE: model.centre_bias(group.size)[None]}
             paths = group.paths[place]
             start, longest = torch.stack([path[0] for path in paths]), max(map(len, paths))

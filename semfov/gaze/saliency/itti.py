@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape
 from semfov.gaze.saliency.blur import rescale
-from semfov.gaze.saliency.opponent import double_opponency
+from semfov.gaze.saliency.opponent import anchor, double_opponency
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import pyrdown
 
@@ -113,9 +113,7 @@ def _conspicuity(image: Tensor) -> Tensor:
     Shapes: image `(B, 3, H, W)` → `(B, 3, h, w)`.
     """
     levels = max(_CENTRES) + max(_DELTAS)
-    colours = double_opponency(image)
-    # Contrasts do not depend on the first pixel. Without it those of a uniform image are exactly 0.
-    pyramid = _dyadic_pyramid(colours - colours[..., :1, :1], levels)
+    pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
     features = [torch.cat([level, _orientation_energy(level[:, :1])], 1) for level in pyramid[min(_CENTRES) :]]
     total = torch.zeros((), dtype=image.dtype, device=image.device)
     for centre in _CENTRES:

@@ -71,3 +71,8 @@ def double_opponency(image: Tensor) -> Tensor:
         blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
         parts.append(torch.stack([bright, reds - greens, blues - yellows], 1))
     return torch.cat(parts, 2)
+
+
+def anchor(channels: Tensor) -> Tensor:
+    """Channels `(B, C, H, W)` less their first pixel: contrasts stay, and those of a uniform image are exactly 0."""
+    return channels - channels[..., :1, :1]

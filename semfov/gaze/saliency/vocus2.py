@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import enlarge, gaussian_blur, rescale
-from semfov.gaze.saliency.opponent import lab_colours, opponent_colours
+from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 _ColorSpace = Literal["opponent", "lab"]
 
@@ -129,9 +129,7 @@ def vocus2_saliency(
     # Contrasts are small differences, so half precision is not enough.
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
-        # Contrasts do not depend on the first pixel. Without it those of a uniform image are exactly 0.
-        channels = channels - channels[..., :1, :1]
-        pyramids = _twin_pyramids(channels, centre_sigma, surround_sigma, layers=layers, scales=scales)
+        pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
         saliency = _combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.

@@ -270,8 +270,7 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     array([[-1.386, -0.288]])
     """
     check_number(floor, "floor", 0, 1)
-    values = as_array(maps, "maps")
-    check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
+    values = _as_maps(maps)
     total = values.sum((-1, -2), keepdims=True)
     usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
@@ -329,10 +328,16 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
 
-def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
-    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`."""
+def _as_maps(maps: ArrayLike) -> _Array:
+    """Maps `(..., H, W)` as an array."""
     values = as_array(maps, "maps")
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
+    return values
+
+
+def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
+    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`."""
+    values = _as_maps(maps)
     column, row = (np.floor(as_array(each, "x, y") + 0.5) for each in (x, y))
     leading = values.shape[:-2]
     fits = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
