@@ -331,4 +331,4 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
         return decision
     pose = views.poses[step.action // views.cells]
     box = None if decision.box is None else views.world.boxes(decision.box[None], pose)[0]
-    return replace(decision, cell=int(cell), box=box)
+    return replace(decision, cell=int(cell), box=box, place=float(cells[0, cell]))

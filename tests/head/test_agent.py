@@ -84,7 +84,7 @@ def test_boxes_of_a_flat_scene_are_in_pixels_of_the_picture(agent):
     assert ((boxes[:, :2] > torch.tensor([470.0, 170])) & (boxes[:, 2:] < torch.tensor([570.0, 270]))).all()
     for path in paths:
         if path.decision.box is not None:
-            assert path.objects.boxes[path.confirmed].shape == (1, 4)
+            assert path.objects.boxes[path.confirmed].tolist() == [path.decision.box.tolist()]
 
 
 def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama):
@@ -115,6 +115,7 @@ def test_a_search_is_found_by_the_cell_at_the_gaze_and_says_so_in_its_decision(a
         assert path.decision.probability == float(path.maps[-1].max())
         if path.found:
             assert path.decision.cell == int(path.views.gaze_cell[path.actions[-1]])
+            assert path.decision.place == at_the_gaze[-1]
             assert path.ending == "decision"
         else:
             # Most of the scene was not seen yet.
@@ -146,7 +147,9 @@ def test_without_a_find_the_rule_of_all_searches_decides(agent, panorama, examin
     step = HeadStep(5, 0.2, belief, Detections.empty(1, 4))
     decision = _decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
     assert decision.outcome == outcome
-    assert decision.cell == (here if outcome == "found" else None)
+    # That of the place, not that of the scene.
+    there = (here, pytest.approx(examined)) if outcome == "found" else (None, None)
+    assert (decision.cell, decision.place) == there
 
 
 def test_every_limit_ends_an_episode_and_a_search_has_a_decision_all_the_same(agent, panorama):
