@@ -161,8 +161,8 @@ class Outcome(ABC):
     def objects(self) -> Objects:
         """The candidates of the targets that have at least the score `least`, or that were confirmed.
 
-        A candidate that was confirmed has the probability that the target is there as its score, where that is higher.
-        The box that a decision found is always among the objects.
+        A candidate that was confirmed has the box that confirmed it, and the probability that the target is there as
+        its score, where that is higher. The box that a decision found is always among the objects.
         """
         return self._outcome[0]
 
@@ -298,7 +298,7 @@ def _confirm(
             labels = torch.cat([labels, labels.new_tensor([label])])
             looks = torch.cat([looks, looks.new_tensor([look])])
             sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
-        scores = scores.index_copy(0, same, torch.maximum(scores[same], probability))
+        boxes, scores = boxes.index_copy(0, same, box), scores.index_copy(0, same, probability.maximum(scores[same]))
         sure[same] = True
     order = scores.argsort(descending=True, stable=True)
     order = order[(counts | sure)[order]]

@@ -78,12 +78,12 @@ def test_the_text_form_tells_where_the_objects_are():
 
 
 def test_what_the_decision_found_is_among_the_objects():
-    """Also where no detection has the score, or there is none at the place."""
+    """With its own box, also where no detection has the score, or there is none at the place."""
     weak = scanpath(look((LEFT, 1, 0.2)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.31)), target=1)
     assert weak.objects.boxes.tolist() == [RIGHT]
-    for box, boxes in ((shifted(LEFT, 1), [LEFT, RIGHT]), ([70.0, 0, 80, 9], [[70.0, 0, 80, 9], RIGHT])):
+    for box in (shifted(LEFT, 1), [70.0, 0, 80, 9]):
         decided = replace(weak, decision=Decision("found", 0.8, 0, torch.tensor(box)))
-        assert decided.objects.boxes.tolist() == boxes
+        assert decided.objects.boxes.tolist() == [box, RIGHT]
         assert decided.confirmed.tolist() == [True, False]
         assert decided.objects.scores.tolist() == pytest.approx([0.8, 0.31])
     absent = replace(weak, decision=Decision("absent", 0.1, None, None))
