@@ -64,18 +64,12 @@ def _objects_lines(record: Record) -> list[str]:
     rows = record.object_rows()
     lines = [
         f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
-        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{_counted_by(row, record.least)}"
-        for row in rows[:_OBJECTS_LISTED]
+        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}"
+        f"{', confirmed' * row['confirmed']}{', listed by its score in the whole picture' * by_score}"
+        for row, by_score in zip(rows[:_OBJECTS_LISTED], record.listed_by_score.tolist(), strict=False)
     ]
     more = len(rows) - _OBJECTS_LISTED
     return [*lines, f"  and {more} more (--out FILE.json writes all)"] if more > 0 else lines
-
-
-def _counted_by(row: Mapping[str, Any], least: float) -> str:
-    """Why an object is listed, where its probability does not say it."""
-    if row["confirmed"]:
-        return ", confirmed"
-    return ", listed by its score in the whole picture" if row["score"] < least else ""
 
 
 def _regions_lines(scanpath: Scanpath) -> list[str]:

@@ -172,6 +172,11 @@ class Outcome(ABC):
         return self._outcome[1]
 
     @property
+    def listed_by_score(self) -> Tensor:
+        """Which objects, less probable than `least`, count by their score in the whole picture, `(M,)` boolean."""
+        return ~self.confirmed & (self.objects.scores < self.least)
+
+    @property
     def confirmable(self) -> bool:
         """Whether objects can be confirmed: by a decision or by closer looks."""
         return self.decision is not None or len(self.closer) > 0

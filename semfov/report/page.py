@@ -335,9 +335,11 @@ def _objects(data: Data, place: str) -> str:
     )
     label = "Objects with boxes (x1, y1, x2, y2) in picture pixels and the sharpest look"
     table = f"<thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    lower = ", ".join(str(order) for order, each in enumerate(data["listed_by_score"], 1) if each)
+    why = f"<p>Less probable, listed by the score in the whole picture: {lower}.</p>" if lower else ""
     return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{label}">'
-        f'<table class="objects" aria-label="{label}">{table}</table></div>' + _left_out(count - len(rows), "object")
+        f'<div class="wide" tabindex="0" role="region" aria-label="{label}"><table class="objects" '
+        f'aria-label="{label}">{table}</table></div>{why}{_left_out(count - len(rows), "object")}'
     )
 
 

@@ -89,6 +89,7 @@ def zoom_data(
         ],
         "objects": objects[:_DRAWN],
         "count": len(objects),
+        "listed_by_score": path.listed_by_score.tolist()[:_DRAWN],
         "confirmable": path.confirmable,
         "turns": path.how == "head",
     }

@@ -76,12 +76,13 @@ def _draw_objects(
     many = len(rows) > _NAMED
     single = many and record.target is not None
     # The most confident objects are drawn last, over the others.
+    lower = record.listed_by_score.tolist()
     for row in reversed(rows):
         colour, line = (FOUND, 2.0) if row["confirmed"] else (TARGET, 0.8 if many else 1.2)
         text = f"{row['score']:.2f}" if single else f"{row['class']} {row['score']:.2f}"
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
-            drawn += draw_boxes(axes, Tensor([box]), colour, width=line)
+            drawn += draw_boxes(axes, Tensor([box]), colour, "--" if lower[row["object"]] else "-", line)
             tags.append(Tag(box, text, colour))
     if tagged:
         drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
@@ -167,6 +168,8 @@ def plot_scanpath(
     if objects and others:
         rest = "not confirmed: " if count or scanpath.decision is not None else ""
         entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
+    if objects and (lower := int(scanpath.listed_by_score.sum())):
+        entries.append((TARGET, "--", f"by score alone ({lower})"))
     if objects and scanpath.refuted:
         entries.append((FOUND, ":", "not confirmed by a closer look"))
     _draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
