@@ -50,9 +50,16 @@ def _decision_text(record: Record, decision: Decision) -> str:
     """Say whether the target was found, and where."""
     what = "probability that the picture holds it:" if record.decided_by == "probability" else record.decided_by
     name, probability = record.target_name, f"{what} {decision.probability:.2f}"
-    if decision.outcome != "found":
-        where = {"absent": "is not there", "undecided": "undecided"}[decision.outcome]
-        return f"{name} {where}, {probability}"
+    if decision.outcome == "absent":
+        return f"{name} is not there, {probability}"
+    if decision.outcome == "undecided":
+        seen = record.candidates.of([record.target or 0])
+        measured = [(look.place, look.box) for look in record.closer] or list(zip(seen.scores, seen.boxes, strict=True))
+        if not measured:
+            return f"{name} undecided, {probability}"
+        best, box = max(measured, key=lambda each: float(each[0]))
+        of = "probability" if record.closer else record.measure
+        return f"{name} undecided, {probability}; best place: box {box_text(box.tolist())}, {of} {best:.2f}"
     point, box = record.found_at, decision.box
     edges = f", box {box_text(box.tolist())}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
@@ -69,7 +76,9 @@ def _objects_lines(record: Record) -> list[str]:
         for row, by_score in zip(rows[:_OBJECTS_LISTED], record.listed_by_score.tolist(), strict=False)
     ]
     more = len(rows) - _OBJECTS_LISTED
-    return [*lines, f"  and {more} more (--out FILE.json writes all)"] if more > 0 else lines
+    lines += [f"  and {more} more (--out FILE.json writes all)"] if more > 0 else []
+    several = record.target is None and not record.targets and len(rows) > 1
+    return [*lines, f"  in all: {record.classes_in_words()}"] if several else lines
 
 
 def _regions_lines(scanpath: Scanpath) -> list[str]:

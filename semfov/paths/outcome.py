@@ -258,6 +258,19 @@ class Outcome(ABC):
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
         return f"{', '.join(names) or every} from {self.threshold_in_words}"
 
+    def classes_in_words(self) -> str:
+        """Count the objects by class, the most frequent first, and say how many of them this detector can show.
+
+        Returns:
+            A phrase such as `3 × person (about 4 ± 1 that this detector can show), 2 × cup`; empty without objects.
+        """
+        labels = Counter(self.objects.labels.tolist()).most_common()
+        return ", ".join(f"{count} × {self.classes[label]}{self._number_in_words([label])}" for label, count in labels)
+
+    def _number_in_words(self, labels: Sequence[int]) -> str:
+        """The expected number of objects of some classes, in brackets; empty where it is not known or says no more."""
+        return ""
+
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended.
 

@@ -206,20 +206,23 @@ class ZoomPath(Record):
         text = super().objects_in_words()
         if self.unseen is None or not self._sought:
             return text
-        claimed = [label for label in self._sought if self._reacts_to([label])]
-        if not claimed:
+        if not any(self._reacts_to([label]) for label in self._sought):
             why = "beside many faint candidates" if len(self.objects) else "the detector hardly reacts"
             return f"{text} ({why}, so no number in all is given)"
-        if len(self.objects) == 1:
-            return text
+        return text + self._number_in_words(self._sought)
+
+    def _number_in_words(self, labels: Sequence[int]) -> str:
+        claimed, chances = [label for label in labels if self._reacts_to([label])], self.objects.of(labels).scores
+        if self.unseen is None or not claimed or len(chances) == 1:
+            return ""
         chances, numbers = self.objects.of(claimed).scores, self._numbers()
         (mean, variance), of = number_of(chances, (0.0, 0.0), self.spread), "of them right"
         means, variances = zip(*(numbers[label] for label in claimed), strict=True)
         if round(sum(means)) >= len(chances):
             mean, variance, of = sum(means), sum(variances), "that this detector can show"
-        left = [self.classes[label] for label in self._sought if label not in claimed]
+        left = [self.classes[label] for label in labels if label not in claimed]
         without = f", without {' and '.join(left)}" if left else ""
-        return f"{text} (about {mean:.0f} ± {variance**0.5:.0f} {of}{without})"
+        return f" (about {mean:.0f} ± {variance**0.5:.0f} {of}{without})"
 
     def _looks(self) -> Iterator[RecordedLook]:
         clock = self.seconds or (None,) * len(self.glances)

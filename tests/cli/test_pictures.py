@@ -576,7 +576,10 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     _, printed = run(*search, "--closer", 0)
     assert "closer look" not in printed.out
     _, printed = run("search", large, "--target", "red", "--confirm", 1, "--give-up", 0, "--passes", 3, "--closer", 0)
-    assert "red undecided" in printed.out
+    # The red square is at 1000, 700 to 1040, 740.
+    place = re.search(r"red undecided, .*; best place: box (\d+),(\d+)–(\d+),(\d+), score 0\.\d\d$", printed.out, re.M)
+    assert place
+    assert [int(edge) for edge in place.groups()] == pytest.approx([1000, 700, 1040, 740], abs=8)
     assert "All 3 passes were used. 3 passes" in printed.out
     _, printed = run("explore", large, "--worth", 1000)
     assert "1 pass in" in printed.out

@@ -166,6 +166,12 @@ def test_a_number_is_claimed_class_by_class():
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
     said = "2 × cup, 0 × cat from probability or score 0.5 (about 2 ± 1 that this detector can show, without cat)"
     assert path.objects_in_words() == said
+    every = replace(path, targets=())
+    # Of all classes only those are counted of which something is listed.
+    assert every.classes_in_words() == "2 × cup (about 2 ± 1 that this detector can show)"
+    faint = replace(every, least=0.1).classes_in_words()
+    assert faint == "3 × cat, 2 × cup (about 2 ± 1 that this detector can show)"
+    assert replace(every, unseen=None).classes_in_words() == "2 × cup"
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])
     values = path.to_dict()
