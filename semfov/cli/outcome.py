@@ -111,6 +111,8 @@ def _looks_text(record: Record) -> str:
     ]
     head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
+    if any(look.value is not None for look in record):
+        lines.append(f"  value: {record.value_in_words}")
     for number, close_up in enumerate(record.closer, 1):
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
         lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")

@@ -131,6 +131,11 @@ class Record(Conversion):
             (x, y), pixels = look.fixation, read_region(source, (x1, y1, x2, y2), self.size, across)
             yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
 
+    @property
+    def value_in_words(self) -> str:
+        """What the value of a look is, for which it was chosen."""
+        return "the value of the acquisition function at its cell"
+
     def sensor_in_words(self) -> str | None:
         """Describe through what was looked.
 

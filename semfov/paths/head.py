@@ -259,6 +259,11 @@ class HeadPath(Record):
             x, y = self.views.view_grid.centres[self.actions[look.number] % self.views.cells].tolist()
             yield LookView(pixels, world.size, self.detections[look.number].boxes[0], (x, y))
 
+    @property
+    def value_in_words(self) -> str:
+        """The unit of the values of looks."""
+        return "the expected gain per second"
+
     def sensor_in_words(self) -> str:
         """Describe the views of the head."""
         wide, high = self.views.world.size

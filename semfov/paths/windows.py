@@ -232,6 +232,16 @@ class ZoomPath(Record):
             point, region = window.centre(self.lattice), window.region(self.lattice)
             yield RecordedLook(number, point, region, glance.detections, seconds, chosen, more)
 
+    @property
+    def value_in_words(self) -> str:
+        """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
+        searched = self.decision is not None
+        if (self.decided_by if searched else self.measure) == "score" or (self.lattice.levels == 1 and not searched):
+            return "the sum of the scores that the first look has in it"
+        if searched:
+            return "the probability that it shows the target, of a wide window at least a share of those in it"
+        return "the expected number of new objects in it, with a share of those that closer looks would then show"
+
     def sensor_in_words(self) -> str:
         """Describe the windows of the lattice."""
         wide, high = self.lattice.canvas

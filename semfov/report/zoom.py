@@ -26,19 +26,6 @@ _DRAWN = 500
 _MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
 
-_NUMBER = (
-    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
-    "looks would then show. "
-)
-"""What values of windows mean where objects are counted (`semfov.zoom.policy.best_find`)."""
-
-_PROBABILITY = (
-    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
-    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
-    "is the probability, before it, that the target is at the place. "
-)
-"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
-
 
 def zoom_data(
     path: Record,
@@ -81,7 +68,7 @@ def zoom_data(
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
-        "values": "" if path.how != "windows" else _NUMBER if path.decision is None else _PROBABILITY,
+        "values": f"The value of a look is {path.value_in_words}.",
         "truth": [] if boxes is None else boxes.tolist(),
         "image": jpeg_uri(image, width, quality),
         "looks": [

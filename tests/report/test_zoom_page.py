@@ -83,8 +83,10 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
 
 @pytest.mark.parametrize("sought", [True, False], ids=["search", "find"])
 def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_path, large_picture, sought):
-    path = zoom_path if sought else replace(zoom_path, decision=None)
+    path = replace(zoom_path, unseen=(0.0, 0.0), **({} if sought else {"decision": None}))
     page = page_html("field", [zoom_data(path, large_picture, name="field")])
+    assert ("value of a look is the probability that it shows the target" in page) == sought
+    assert ("value of a look is the expected number of new objects" in page) != sought
     assert ("confirmed by the decision or a closer look" in page) == sought
     assert ('<button type="button" class="sort">confirmed</button>' in page) == sought
     ((look, *sure),) = re.findall(r'<tr data-object="1" data-look="(\d)">.*?(?:>(yes|no)</td>.*?)?</tr>', page)
