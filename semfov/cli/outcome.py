@@ -57,9 +57,9 @@ def _decision_text(record: Record, decision: Decision) -> str:
         measured = [(look.place, look.box) for look in record.closer] or list(zip(seen.scores, seen.boxes, strict=True))
         if not measured:
             return f"{name} undecided, {probability}"
-        best, box = max(measured, key=lambda each: float(each[0]))
+        best, at = max(measured, key=lambda each: float(each[0]))
         of = "probability" if record.closer else record.measure
-        return f"{name} undecided, {probability}; best place: box {box_text(box.tolist())}, {of} {best:.2f}"
+        return f"{name} undecided, {probability}; best place: box {box_text(at.tolist())}, {of} {best:.2f}"
     point, box = record.found_at, decision.box
     edges = f", box {box_text(box.tolist())}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
