@@ -114,7 +114,7 @@ class Eye(StatedModule):
         Raises:
             InputError: the shape of `fixations` is wrong.
         """
-        return self.sensor.look(view.state, view.placement.points_to_canvas(_points(fixations, view)))
+        return self.sensor.look(view.state, _on_canvas(fixations, view))
 
     def pictures(self, view: View, fixations: PointLike) -> Tensor:
         """Compute what is seen from fixations as pictures of the canvas, for figures and environments.
@@ -129,9 +129,9 @@ class Eye(StatedModule):
         Raises:
             InputError: the shape of `fixations` is wrong.
         """
-        return self.sensor.picture(view.state, view.placement.points_to_canvas(_points(fixations, view)))
+        return self.sensor.picture(view.state, _on_canvas(fixations, view))
 
-    def detect(self, view: View, fixations: Tensor, canvases: Tensor) -> Detections:
+    def detect(self, view: View, fixations: PointLike, canvases: Tensor) -> Detections:
         """Detect objects in foveated canvases.
 
         Args:
@@ -143,7 +143,7 @@ class Eye(StatedModule):
             The detections, a batch of F, boxes in pixels of the image. Those of several crops are merged by
             `semfov.detection.crops.merge_crops`.
         """
-        gaze = view.placement.points_to_canvas(fixations)
+        gaze = _on_canvas(fixations, view)
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
         if self.sensor.crops == 1:
             return self.detector.detect(canvases, view.placement, back=back)
@@ -169,8 +169,7 @@ class Eye(StatedModule):
         Raises:
             InputError: the shape of `fixations` is wrong.
         """
-        points = _points(fixations, view)
-        return self.detect(view, points, self.foveated(view, points))
+        return self.detect(view, fixations, self.foveated(view, fixations))
 
     def features(self, view: View, fixations: PointLike, layers: Sequence[str] | None = None) -> FeatureMaps:
         """Look from fixations, and keep feature maps of the passes.
@@ -208,11 +207,11 @@ class Eye(StatedModule):
             InputError: a shape is wrong.
         """
         check_shape(image, "image", 1, 3, None, None)
-        window = window_around(box.to(image), (image.shape[-1], image.shape[-2]))
+        window = window_around(box.to(image.dtype), (image.shape[-1], image.shape[-2]))
         sides = window[2:] - window[:2]
         scale = (sides.new_tensor(self.detector.input_size) / sides).amin()
         width, height = (max(1, round(side)) for side in (sides * scale).tolist())
-        detections = self.detector(glimpse(image, window[None], (width, height)).clamp_(0, 1))
+        detections = self.detector(glimpse(image, window[None], (width, height)).clamp_(0, 1)).to(box.device)
         unit = (sides / sides.new_tensor([width, height])).repeat(2)
         return replace(detections, boxes=detections.boxes * unit + window[:2].repeat(2))
 
@@ -238,9 +237,11 @@ class Eye(StatedModule):
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
-def _points(fixations: PointLike, view: View) -> Tensor:
-    """Fixations as `(F, 2)`; a single point becomes a batch of one."""
-    points = as_positions(as_points(fixations, "fixations"), view.canvas)
+def _on_canvas(fixations: PointLike, view: View) -> Tensor:
+    """Fixations as `(F, 2)` in pixels of the canvas, where the canvas is; a single point becomes a batch of one."""
+    points = as_points(fixations, "fixations")
+    points = points.to(torch.promote_types(view.canvas.dtype, torch.float32))
     points = points[None] if points.ndim == 1 else points
     check_shape(points, "fixations", None, 2)
-    return points
+    # Mapped where they are: the numbers of the placement are copied there, and a GPU would be waited for.
+    return view.placement.points_to_canvas(points).to(view.canvas.device)

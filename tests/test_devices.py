@@ -24,6 +24,9 @@ from docs.api import entries
 from semfov.agents.episode import on_cpu
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
+from semfov.detection.detections import Detections
+from semfov.detection.scores import Candidates
+from semfov.detection.selection import Selection, select
 from semfov.episode import StoredLooks
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
@@ -210,6 +213,12 @@ def explored(count: int) -> object:
     return value(belief, torch.zeros(count, 4, dtype=torch.bool, device=GPU))
 
 
+def selected(count: int) -> Detections:
+    low = 8 * on_gpu(count, 20, 2)
+    candidates = Candidates(torch.cat([low, low + 4], -1), on_gpu(count, 20, 3))
+    return select(candidates, None, Selection(threshold=0.5), "residual")
+
+
 def test_an_episode_believes_on_the_cpu_what_an_eye_on_the_gpu_sees():
     agent, image = small.agent(small.Coloured()), small.rand(3, 120, 160)
     here = agent.search(image, "green", how="fovea", shifts=3)
@@ -237,7 +246,7 @@ def test_a_copy_on_the_cpu_is_as_its_module_is_now():
         torch.testing.assert_close(here(torch.ones(1, 2)), module(torch.ones(1, 2, device=GPU)).cpu())
 
 
-@pytest.mark.parametrize("work", [foveated, fused, explored])
+@pytest.mark.parametrize("work", [foveated, fused, explored, selected])
 def test_more_episodes_do_not_wait_for_the_gpu_more_often(work):
     """Nor do more fixations: they are computed together, and few values are read."""
     often = []

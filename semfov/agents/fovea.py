@@ -289,7 +289,7 @@ class FoveaEpisode(Episode[Scanpath]):
 
     def _close_up(self, box: Tensor) -> Detections:
         self.passes += 1
-        self._closely = self.eye.close_up(self._image, box).to(box.device)
+        self._closely = self.eye.close_up(self._image, box)
         return self._closely
 
     def _looked(

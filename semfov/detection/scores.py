@@ -47,6 +47,10 @@ class Candidates:
         coarse = self.boxes.dtype in HALVES or self.classes.dtype in HALVES
         return self._mapped(Tensor.float) if coarse else self
 
+    def to(self, device: torch.device) -> "Candidates":
+        """Move the boxes and scores to a device."""
+        return self if self.boxes.device == device else self._mapped(lambda tensor: tensor.to(device))
+
     def take(self, image: int, index: Tensor) -> "Candidates":
         """Take some boxes of one image.
 

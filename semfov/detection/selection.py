@@ -45,10 +45,17 @@ class Selection:
 def select(
     candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
-    """Select the best boxes of each image, map them to the image, and compute their score vectors."""
-    count = candidates.boxes.shape[0]
+    """Select the best boxes of each image, map them to the image, and compute their score vectors.
+
+    Boxes on a GPU are selected on the CPU: every step needs the number of boxes that the step before has left, and on
+    a GPU each of them would wait.
+    """
+    device, count = candidates.boxes.device, candidates.boxes.shape[0]
+    if values_known(candidates.boxes):
+        candidates = candidates.to(torch.device("cpu"))
     detections = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
-    return detections[0] if count == 1 else Detections.stack(detections)
+    chosen = detections[0] if count == 1 else Detections.stack(detections)
+    return chosen if chosen.boxes.device == device else chosen.to(device)
 
 
 def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:

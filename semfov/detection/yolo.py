@@ -22,6 +22,7 @@ from semfov.detection.selection import Selection
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, InputError, check, values_known
 from semfov.io.files import sha256, write_bytes
+from semfov.sensor.lines import constant
 
 Runtime = Literal["auto", "torch", "onnxruntime"]
 
@@ -309,6 +310,25 @@ def _whole(paths: Iterable[Path]) -> Path | None:
     return None
 
 
+@constant
+def _cells(
+    size: tuple[int, int],
+    canvas: tuple[int, int],
+    anchors: tuple[tuple[float, float], ...],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Column and row of every cell `(h, w, 1, 2)`, its size in canvas pixels `(2,)`, and half the anchors `(A, 2)`."""
+    axes = [torch.arange(length, device=device, dtype=dtype) for length in size]
+    corner = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1)[:, :, None]
+    step = [pixels / length for pixels, length in zip(canvas, size, strict=True)]
+    return (
+        corner,
+        torch.tensor(step, dtype=dtype, device=device),
+        torch.tensor(anchors, dtype=dtype, device=device) / 2,
+    )
+
+
 def decode_yolo(
     raw: Tensor, anchors: Sequence[tuple[float, float]], canvas: tuple[int, int], scale: float = 1.0
 ) -> Candidates:
@@ -325,12 +345,10 @@ def decode_yolo(
     batch, channels, rows, columns = raw.shape
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
     cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
-    column = torch.arange(columns, device=raw.device, dtype=raw.dtype)
-    row = torch.arange(rows, device=raw.device, dtype=raw.dtype)
-    corner = torch.stack(torch.meshgrid(column, row, indexing="xy"), -1)[:, :, None]
-    step = raw.new_tensor([canvas[0] / columns, canvas[1] / rows])
+    sizes = tuple((width, height) for width, height in anchors)
+    corner, step, halves = _cells((columns, rows), canvas, sizes, raw.dtype, raw.device)
     centre = (cells[..., 0:2].sigmoid() * scale - (scale - 1) / 2 + corner) * step
-    half = cells[..., 2:4].exp() * (raw.new_tensor(anchors) / 2)
+    half = cells[..., 2:4].exp() * halves
     boxes = torch.cat([centre - half, centre + half], -1)
     scores = cells[..., 4:].sigmoid()
     return Candidates(boxes.reshape(batch, -1, 4), scores[..., 1:].flatten(1, 3), scores[..., 0].flatten(1))

@@ -103,10 +103,9 @@ class LiveLooks(Looks):
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""
         watch = Stopwatch()
-        there = fixation.to(self.view.canvas.device)
-        canvases = self.eye.foveated(self.view, there)
+        canvases = self.eye.foveated(self.view, fixation)
         watch.lap("foveate")
-        detections = self.eye.detect(self.view, there, canvases).to(self.like.device)
+        detections = self.eye.detect(self.view, fixation, canvases).to(self.like.device)
         watch.lap("detect")
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")

@@ -245,7 +245,8 @@ def _newton(rows: Tensor) -> Tensor:
         step = _response(alpha, _residual(alpha, rows)) / alpha
         length = step.abs().amax(-1)
         going = length > _tolerance(alpha.sum(-1))
-        far = length > _SAFE
+        # Indices: a GPU is waited for whenever a mask is used.
+        far, going = (length > _SAFE).nonzero()[:, 0], going.nonzero()[:, 0]
         step[far] = _climbing(alpha[far], step[far], rows[far])
         alpha = alpha * step.exp()
         result[active] = alpha

@@ -149,7 +149,7 @@ class WindowEye(nn.Module):
         canvas = canvas.to(next(self.detector.parameters(), canvas).device)
         with beside(meanwhile, idle=canvas.device.type != "cpu"):
             proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
-            candidates = proposals.precise()
+            candidates = proposals.precise().to(here)
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
         border = _WIDE_BORDER if view.lattice.levels == 1 else BORDER
