@@ -52,6 +52,10 @@ def check_fixations(options: CheckOptions) -> int:
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
     given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
     given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
+    if options.columns is not None:
+        given["columns"] = dict(each.partition("=")[::2] for each in options.columns.split(","))
+        for ours, theirs in given["columns"].items():
+            check(bool(theirs), "columns", f"the file's name of {ours}, as in x=FPOGX,y=FPOGY", "none")
     place = None if options.picture is None else Path(options.picture)
     folder = place is not None and place.is_dir()
     if folder:
@@ -63,7 +67,7 @@ def check_fixations(options: CheckOptions) -> int:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of what the lines below say
-                reader = reader_of(Path(name))
+                reader = reader_of(Path(name), given.get("columns"))
                 records = _records(reader, Path(name), given, sizes)
             if sizes is not None and not folder:  # one picture is compared with what was looked at in it
                 records = [each for each in records if each.picture in sizes] or records

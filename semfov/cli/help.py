@@ -282,6 +282,8 @@ def completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
     return start + script.format(cases=cases, commands=" ".join(named), lines=lines)
 
 
+_RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"
+
 _COMMANDS = {
     "agent.classes lists": "`semfov detectors NAME` lists",
     "ActivePerception.from_pretrained('mymodels')": "--models mymodels",
@@ -289,8 +291,8 @@ _COMMANDS = {
     "ActivePerception.raw": "--agent raw",
     " or semfov.fit_detector": "",
     "find_all": "`semfov find`",
-    "name them by columns={…}": "give them these names in its first line",
-    "use read_table with columns={…}": "name its columns picture, subject, x, y, width and height in its first line",
+    "name them by columns={…}": _RENAME,
+    "use read_table with columns={…}": f"name its columns picture, subject, x, y, width and height: {_RENAME}",
 }
 """What the command calls that messages name as Python does."""
 
@@ -305,7 +307,7 @@ def in_command_words(message: str, options: Iterable[str]) -> str:
     >>> in_command_words("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"])
     '--recursive, or --detector.classes cat,dog'
     >>> in_command_words("name them by columns={…} or give size=", ["size"])
-    'give them these names in its first line or give --size'
+    'give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too) or give --size'
     """
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)

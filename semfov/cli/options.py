@@ -278,6 +278,7 @@ class CheckOptions(Settings):
         picture: name of the picture, where the file has none; or a picture or folder of pictures that the file names,
             whose sizes are compared with the frames, and are the frames where the file has none.
         subject: name of the person, where the file has none.
+        columns: names of a table's columns by ours, where they differ, `x=FPOGX,y=FPOGY`.
         quiet: print errors alone; the exit code tells whether anything is suspicious.
     """
 
@@ -285,6 +286,7 @@ class CheckOptions(Settings):
     size: str | None = None
     picture: str | None = None
     subject: str | None = None
+    columns: str | None = None
     quiet: bool = False
 
 

@@ -88,6 +88,15 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
     shown = capsys.readouterr().out
     assert "320 fixations, 40 scanpaths, 1 person, 40 pictures, frames of 800 × 600; they take" in shown
     assert "nothing is suspicious; frames were not compared with pictures (--picture FOLDER)\n" in shown
+    # The same table with other names of columns, which the command is told.
+    text = (tmp_path / "good.csv").read_text()
+    (tmp_path / "other.csv").write_text(text.replace("picture,", "seen by,", 1).replace(",x,", ",FPOGX,", 1))
+    assert main(["check", str(tmp_path / "other.csv")]) == 1
+    assert "(`semfov check` takes --columns x=THEIRS,y=THEIRS, too)" in capsys.readouterr().err
+    assert main(["check", str(tmp_path / "other.csv"), "--columns", "picture=seen by,x=FPOGX"]) == 0
+    assert capsys.readouterr().out == shown.replace("good.csv", "other.csv")
+    assert main(["check", str(tmp_path / "other.csv"), "--columns", "picture=seen by,x="]) == 1
+    assert "columns: expected the file's name of x, as in x=FPOGX" in capsys.readouterr().err
     write_table(tmp_path / "bad.csv", KINDS["origin"][0])
     assert main(["check", str(tmp_path / "good.csv"), str(tmp_path / "bad.csv"), str(tmp_path / "none.csv")]) == 1
     shown = capsys.readouterr().out
