@@ -163,9 +163,9 @@ semfov live: one look at each frame of a video, a camera or a network stream
   semfov live rtsp://192.168.1.20/stream --target person
   semfov live holiday.mp4                             explore, without a target
 
-usage: semfov live [VIDEO | URL | --camera N] [--target CLASS | --find CLASSES] [options]
+usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find CLASSES] [options]
 
-  VIDEO, URL           a video file, or an address such as rtsp://… that OpenCV can open
+  VIDEO, FOLDER, URL   a video file, a folder of frames, or an address such as rtsp://… that OpenCV can open
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
   --find CLASSES       classes of which all objects are to be found, with commas between them

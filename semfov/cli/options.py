@@ -179,7 +179,7 @@ class LiveOptions(AgentOptions):
     """Look at a video, a camera or a network stream.
 
     Args:
-        source: video file, or address of a stream.
+        source: video file, folder of frames in the order of their names, or address of a stream.
         camera: number of a camera.
         target: class to search for (none: explore).
         find: class of which all objects are to be found, or several with commas, in place of a target.

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
@@ -120,12 +121,18 @@ class Stream(NamedTuple):
 
 
 def open_stream(source: str | Path | int, most: int | None = None, white: White | None = None) -> Stream:
-    """Open a video by its file, a camera by its number, or a stream by its address; `white` as for `read_image`."""
+    """Open a video by its file, a folder of frames, a camera by its number, or a stream by its address.
+
+    The frames of a folder are in the order of their names; `white` as for `read_image`.
+    """
     check_white(white)
     address = isinstance(source, str) and "://" in source
     if not address and not isinstance(source, int):
         source = Path(source)
     name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
+    if isinstance(source, Path) and source.is_dir():
+        files = picture_files(source)[:most]
+        return Stream(name, None, (Picture(file.name, read_image(file, white=white)) for file in files))
     try:
         import cv2
     except ImportError:
@@ -134,11 +141,6 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         ) from None
     if isinstance(source, Path):
         _check_there(source, "source")
-        if source.is_dir():
-            raise DataError(
-                f"source: expected a video, got the folder {source}; ffmpeg makes a video of its frames, "
-                f"and semfov find takes folders of pictures"
-            )
         check_regular(source)
         with suppress(OSError), source.open("rb") as file:
             if file.read(len(_PLAYLIST)) == _PLAYLIST:
