@@ -32,7 +32,6 @@ from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
 from semfov.eye import Eye
-from semfov.fit.observation import FitObservationConfig
 from semfov.io.files import plain_name, write_text
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation import FovealObservationModel
@@ -44,7 +43,7 @@ from semfov.runs.scene_run import finish
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table
-from train.fit_fom import fit_fom
+from train.fit_fom import FitFomConfig, fit_fom
 from train.outputs import model_path
 
 
@@ -162,7 +161,7 @@ def policies(config: _SensorsConfig) -> tuple[str, ...]:
 
 def _observation(config: _SensorsConfig, name: str) -> Path:
     """File of the observation model of a sensor, which is fitted unless it is there."""
-    fitting = FitObservationConfig(
+    fitting = FitFomConfig(
         data=config.fit,
         fixations=config.fixations,
         name="observation",

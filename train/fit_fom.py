@@ -16,24 +16,27 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 import json
 import platform
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from semfov.fit.observation import FitObservationConfig, count_misses, fit_model, fit_published, statistics_of
+from semfov.fit.observation import count_misses, fit_published, level_edges, statistics_of
 from semfov.fit.outputs import split
+from semfov.fit.settings import FitConfig
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import Calibration, calibration
-from semfov.observation import MissCounts
+from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.runs.command import command
 from semfov.runs.samples import Samples
+from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz import plot_reliability
@@ -45,8 +48,63 @@ from train.samples import Sampler, collect_samples
 _Models = dict[str, FovealObservationModel]
 
 
+@dataclass(frozen=True)
+class FitFomConfig(FitConfig):
+    """Fit p(scores | class, distance to the fovea) on photographs with boxes.
+
+    Args:
+        data: photographs to fit on (by default all of them, however many objects they have).
+        method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
+            and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
+            `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
+            calibration is about.
+        mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
+            input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
+            `width` and `sensor` are ignored.
+        fixations: random fixations in each photograph, or windows of a mosaic at each magnification.
+        levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
+        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
+            with the fovea. A sensor with steps of acuity has its own levels, one for each step.
+        minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
+            (0: no level does).
+        shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
+            levels with few detections.
+        enough: a class with at least so many detections at a level is fitted there by maximum likelihood alone, as
+            published, without shrinkage (None: shrinkage everywhere).
+        holdout: one in every n photographs is held out for the evaluation.
+        iou: least overlap (IoU) at which a detection counts as showing an object.
+        most: number of detections that are in memory at most, about; they are drawn evenly from all. The discriminative
+            fit and the report are from these, the published fits are from all.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
+        out: folder for the model, the report and the figures.
+        cache: folder for the labelled detections (None: `out`).
+    """
+
+    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    mosaics: Whole = 0
+    fixations: Count = 8
+    levels: Annotated[int, Range(1, 1000)] = 8
+    width: Positive = 50.0
+    minimum: Whole = 100
+    shrinkage: Weight = 10.0
+    enough: Whole | None = None
+    holdout: Annotated[int, Range(2, 10**9)] = 10
+    iou: Share = 0.5
+    most: Count = 1_000_000
+    shard: Count = 32
+    out: Path = Path("runs/fit_fom")
+
+    @property
+    def edges(self) -> list[float]:
+        """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
+        if self.mosaics:
+            return [n - 0.5 for n in range(1, self.levels)]
+        return level_edges(self.sensor, self.levels, self.width)
+
+
 def _report_markdown(
-    config: FitObservationConfig,
+    config: FitFomConfig,
     model: FovealObservationModel,
     figures: dict[str, Calibration],
     likelihood: dict[str, float],
@@ -117,7 +175,7 @@ def _figures_by_level(
 
 
 def _write_report(
-    config: FitObservationConfig,
+    config: FitFomConfig,
     model: FovealObservationModel,
     models: _Models,
     judged: Samples,
@@ -160,15 +218,22 @@ def _write_report(
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
 
 
-def fit_fom(config: FitObservationConfig) -> None:
+def fit_fom(config: FitFomConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
     sampler = collect_samples(config, folder, "looking", kind)
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
-    statistics = statistics_of(config, sampler.eye.detector.classes, training)
-    model = fit_model(config, sampler.eye, sampler.scenes, statistics, samples[~held_out])
+    edges, classes = config.edges, sampler.eye.detector.classes
+    statistics = statistics_of(edges, classes, training)
+    noted = {name: getattr(config, name) for name in ("minimum", "shrinkage", "enough", "fixations", "seed")}
+    published = partial(fit_published, sampler.eye, sampler.scenes, statistics, edges, **noted)
+    if config.method == "discriminative":
+        fitted, start = samples[~held_out], published(expected="empirical")
+        model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
+    else:
+        model = published(method=config.method)
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     counts = (
         count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
@@ -179,14 +244,12 @@ def fit_fom(config: FitObservationConfig) -> None:
         model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
-    edges, classes = config.edges, sampler.eye.detector.classes
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
-    published = partial(fit_published, config, sampler.eye, sampler.scenes, statistics)
     for method in methods:
-        models[f"Dirichlet, {method}"] = published(method)
-    models["Dirichlet with class prior"] = published("newton", prior=True)
-    models["the same, tempered 0.1"] = published("newton", prior=True, tempering=0.1)
+        models[f"Dirichlet, {method}"] = published(method=method)
+    models["Dirichlet with class prior"] = published(prior=True)
+    models["the same, tempered 0.1"] = published(prior=True, tempering=0.1)
     if config.method == "discriminative":
         models["discriminative"] = model
     written = _write_report(config, model, models, samples[held_out])
@@ -195,7 +258,7 @@ def fit_fom(config: FitObservationConfig) -> None:
         print(f"  {file}")
 
 
-main = command(fit_fom, FitObservationConfig, __doc__)
+main = command(fit_fom, FitFomConfig, __doc__)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -14,19 +14,63 @@ Use the best exponent with `--belief.tempering τ`, or as the `tempering` of one
 
 import json
 import sys
-from typing import cast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, cast
 
+from semfov.belief.grid import Footprint
 from semfov.belief.observers import Semantic
 from semfov.errors import check
 from semfov.eye import Eye
-from semfov.fit.tempering import FitTemperingConfig, hit_rates, mean_hits
+from semfov.fit.settings import FitConfig
+from semfov.fit.tempering import hit_rates, mean_hits
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.samples import Samples
+from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from train.outputs import write_outputs
 from train.samples import Sampler, collect_samples
+
+
+@dataclass(frozen=True)
+class FitTemperingConfig(FitConfig):
+    """Find the exponent of the likelihoods.
+
+    Args:
+        calibrated: compute likelihoods from the scores with the observation model shipped for the detector. If false,
+            the raw scores are the likelihoods.
+        footprint: which cells a detection updates.
+        exponents: values of the exponent τ to compare.
+        photographs: use only the first so many photographs (None: all).
+        fixations: random fixations in each photograph.
+        iou: must be the same as in `train.fit_fom` to share looks with it.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        min_objects: photographs with fewer objects are left out.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        holdout: one in every n photographs is held out for the evaluation.
+        out: folder for the report.
+        cache: folder for the labelled detections (None: `out`).
+    """
+
+    unused = ("name",)
+    calibrated: bool = False
+    footprint: Footprint = "box_centre"
+    exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+    photographs: Count | None = None
+    fixations: Count = 8
+    iou: Share = 0.5
+    shard: Count = 32
+    columns: Side = 10
+    rows: Side = 10
+    min_objects: Whole = 4
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] = 4
+    out: Path = Path("runs/fit_tempering")
 
 
 def fit_tempering(config: FitTemperingConfig) -> None:
@@ -49,7 +93,9 @@ def _measure(
 ) -> dict[str, float]:
     """Measure one exponent: the share of next fixations that hit the target, as means over photographs."""
     observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
-    return mean_hits(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
+    title, least, most = f"tempering {tempering:g}", config.min_objects, config.photographs
+    rates = hit_rates(config, sampler.scenes, samples, observer, title, least=least, most=most)
+    return mean_hits(config.holdout, rates)
 
 
 def _tempering_report(hits: dict[float, dict[str, float]]) -> str:

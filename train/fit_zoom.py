@@ -13,31 +13,32 @@ continue.
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import get_args
 
 import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
-from semfov.fit.windows import MosaicFit
+from semfov.fit.windows_certainty import explorations_of_kinds, spread_again
 from semfov.fit.windows_evidence import (
+    SurveyExample,
     Windows,
     ZoomExample,
     fit_presence,
     judge_windows,
-    measures_table,
     pair_windows,
     presence_loss,
 )
-from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, RefitPart
 from semfov.io.files import inside
 from semfov.runs.command import command
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.runs.workers import prepare_worker
+from semfov.zoom.evidence import GlimpseEvidence, Survey
 from train.outputs import write_outputs
 from train.zoom_choice import choose_foresight, choose_patience
+from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, PicturesFit, RefitPart
 
 _PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
 """Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
@@ -51,9 +52,8 @@ _JUDGED = ("judged", "judged far", "judged crowded")
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    fit = MosaicFit(config)
-    lines: list[str] = []
-    figures = "{}"
+    fit = PicturesFit(config)
+    lines, figures = list[str](), "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
     refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
     looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
@@ -70,13 +70,19 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(fit.eye.settings())
         if "presence" in refit:
-            lines += _fit_further(fit, model, examples)
+            lines += _fit_further(config, model, examples)
     if "survey" in refit:
-        measured = fit.survey(model, examples)
+        fit.survey(model, examples)
+        model.metadata["survey"]["judged_far"] = config.judged_far
+        held = {"": examples["judged"], ", crowded": examples["judged crowded"]}
+        measured = {
+            name: value for each in held for name, value in judge_survey(model.survey, held[each], each).items()
+        }
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
         tried = choose_foresight(model, fit, _JUDGED)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        lines += [*measures_table(measured), "", chosen, "", *table(tried), ""]
+        rows = ([name, f"{value:.4f}"] for name, value in measured.items())
+        lines += [*table([["measure", "value"], *rows]), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
         lines += fit.decisions(model)
         # A verification belongs to the probability that it was fitted with.
@@ -89,7 +95,9 @@ def fit_zoom(config: FitZoomConfig) -> None:
         lines += fit.certainty(model)
     elif "spread" in refit:
         check(model.certainty is not None, "evidence", "a model whose certainty was fitted", config.evidence)
-        lines += fit.spread(model)
+        prepare_worker()
+        lines += spread_again(model, explorations_of_kinds(model, fit.explored()[0], config.passes), config.passes)
+        fit.note(model, "spread")
     if "photograph" in refit and config.photographs:
         scenes = make_scenes(config.data, fit.eye.detector.classes)
         lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
@@ -98,13 +106,28 @@ def fit_zoom(config: FitZoomConfig) -> None:
     write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
 
 
-def _fit_further(fit: MosaicFit, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+@torch.no_grad()
+def judge_survey(survey: Survey, examples: Sequence[ZoomExample], where: str = "") -> dict[str, float]:
+    """Mean loss on mosaics that were held out, by the overview and by closer looks."""
+    name = "objects of any class, mean negative log likelihood"
+    first, later = [], []
+    for example in map(SurveyExample.of, examples):
+        overview, *closer = example.losses(survey, example.closer)
+        first.append(overview)
+        later += closer
+    figures = {f"{name}, overview{where}": float(torch.stack(first).mean())}
+    if later:
+        figures[f"{name}, closer looks{where}"] = float(torch.stack(later).mean())
+    return figures
+
+
+def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
     """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
-    config = fit.config
     torch.manual_seed(config.seed)
     judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
     before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
-    fit_presence(model.requires_grad_(True), pair_windows(fit.training(examples)), config.steps, rate=_FURTHER)
+    looks = [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
+    fit_presence(model.requires_grad_(True), pair_windows(looks), config.steps, rate=_FURTHER)
     model.requires_grad_(False)
     model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]

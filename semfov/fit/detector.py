@@ -360,7 +360,8 @@ class _FolderFit:
         results = self.inputs.results
         before: list[Any] = [fitted.part.sha256 for fitted in results.values()]
         before += [plain(asdict(each.part)) for each in results.values() if each.part.settings]
-        own = plain(asdict(self.fits[name].settings))
+        own = self.fits[name].settings
+        own = plain(own if isinstance(own, dict) else asdict(own))
         settings = [name, {each: own[each] for each in own.keys() - {*WHERE}}, self.inputs.config.judged, before]
         key = digest_of([self.inputs.run.key, settings])
         result = self._read_result(name, key)

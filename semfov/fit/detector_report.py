@@ -45,11 +45,6 @@ def mean_percent(values: FloatArray) -> str:
     return percent(float(values.mean()), float(standard_error(values)))
 
 
-def percent_of(value: float) -> str:
-    """Format a share in percent."""
-    return f"{100 * value:.1f}"
-
-
 def section(text: str, rows: list[list[str]]) -> str:
     """Return a paragraph of Markdown, followed by a table if there are rows."""
     return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])

@@ -24,7 +24,7 @@ from semfov.decision import OUTCOMES, confirms, decide, place_known
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
 from semfov.fit.descent import descend
-from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, percent_of, section
+from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
@@ -461,7 +461,10 @@ class EvidenceFit(PartFit):
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
         outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
-        outcomes += [[name, *map(percent_of, shares), f"{looks:.1f}"] for name, (*shares, looks, _) in decided.items()]
+        outcomes += [
+            [name, *(f"{100 * share:.1f}" for share in shares), f"{looks:.1f}"]
+            for name, (*shares, looks, _) in decided.items()
+        ]
         report = "\n".join(
             [
                 section(

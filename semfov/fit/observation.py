@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,15 +15,13 @@ from semfov.data.scene import Scenes
 from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, in_words, section
 from semfov.fit.outputs import split
-from semfov.fit.part import IOU, PartFit, PartInputs, PartResult
-from semfov.fit.settings import FitConfig
+from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
+from semfov.runs.config import SensorConfig
 from semfov.runs.samples import Samples, all_cells
-from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 from semfov.zoom.eye import WindowEye
@@ -35,116 +31,40 @@ _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 `(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
-@dataclass(frozen=True)
-class FitObservationConfig(FitConfig):
-    """Fit p(scores | class, distance to the fovea) on photographs with boxes.
+def level_edges(sensor: SensorConfig, levels: int = 8, width: float = 50.0) -> list[float]:
+    """Borders between levels of distance, in units of the image's longer side: the steps of a sensor that has some.
 
-    Args:
-        data: photographs to fit on (by default all of them, however many objects they have).
-        method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
-            and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
-            `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
-            calibration is about.
-        mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
-            input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
-            `width` and `sensor` are ignored.
-        fixations: random fixations in each photograph, or windows of a mosaic at each magnification.
-        levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
-        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
-            with the fovea. A sensor with steps of acuity has its own levels, one for each step.
-        minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
-            (0: no level does).
-        shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
-            levels with few detections.
-        enough: a class with at least so many detections at a level is fitted there by maximum likelihood alone, as
-            published, without shrinkage (None: shrinkage everywhere).
-        holdout: one in every n photographs is held out for the evaluation.
-        iou: least overlap (IoU) at which a detection counts as showing an object.
-        most: number of detections that are in memory at most, about; they are drawn evenly from all. The discriminative
-            fit and the report are from these, the published fits are from all.
-        seed: seed of the fixations.
-        shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
-        out: folder for the model, the report and the figures.
-        cache: folder for the labelled detections (None: `out`).
+    A level is `width` pixels wide in an image whose longer side is 640, for a fovea of 100 pixels.
     """
-
-    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
-    mosaics: Whole = 0
-    fixations: Count = 8
-    levels: Annotated[int, Range(1, 1000)] = 8
-    width: Positive = 50.0
-    minimum: Whole = 100
-    shrinkage: Weight = 10.0
-    enough: Whole | None = None
-    holdout: Annotated[int, Range(2, 10**9)] = 10
-    iou: Share = IOU
-    most: Count = 1_000_000
-    shard: Count = 32
-    out: Path = Path("runs/fit_fom")
-
-    @property
-    def edges(self) -> list[float]:
-        """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
-        if self.mosaics:
-            return [n - 0.5 for n in range(1, self.levels)]
-        own = self.sensor.kind.borders(self.sensor.whole())
-        if own is not None:
-            # Farther away than the longer side there is hardly anything.
-            return [edge / self.sensor.reference for edge in own if edge < self.sensor.reference]
-        step = self.width / 100.0 * self.sensor.fovea
-        return [step * n for n in range(1, self.levels)]
-
-
-def fit_model(
-    config: FitObservationConfig,
-    eye: Eye | WindowEye,
-    scenes: Scenes,
-    statistics: DirichletStatistics,
-    samples: Samples,
-) -> FovealObservationModel:
-    """Fit the model with the method in the settings."""
-    if config.method != "discriminative":
-        return fit_published(config, eye, scenes, statistics, config.method)
-    start = fit_published(config, eye, scenes, statistics, "newton", expected="empirical")
-    return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
+    own = sensor.kind.borders(sensor.whole())
+    if own is not None:
+        # Farther away than the longer side there is hardly anything.
+        return [edge / sensor.reference for edge in own if edge < sensor.reference]
+    return [width / 100.0 * sensor.fovea * n for n in range(1, levels)]
 
 
 def fit_published(
-    config: FitObservationConfig,
     eye: Eye | WindowEye,
     scenes: Scenes,
     statistics: DirichletStatistics,
-    method: Method,
+    edges: Sequence[float],
     **options: Any,
 ) -> FovealObservationModel:
-    """Fit Dirichlet distributions to the scores of each class and level.
+    """Fit Dirichlet distributions to the scores of each class and level (`FovealObservationModel.fit`).
 
     A pair of class and level with enough detections is fitted by maximum likelihood, as published. Others are shrunk.
     """
-    model = FovealObservationModel.identity(eye.detector.classes, config.edges)
+    model = FovealObservationModel.identity(eye.detector.classes, edges)
+    samples, data = int(statistics.count.sum()), scenes.fingerprint
     with warnings.catch_warnings():
         # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
-        return model.fit(
-            statistics,
-            method=method,
-            minimum=config.minimum,
-            shrinkage=config.shrinkage,
-            enough=config.enough,
-            **options,
-            **eye.settings(),
-            samples=int(statistics.count.sum()),
-            data=scenes.fingerprint,
-            fixations=config.fixations,
-            seed=config.seed,
-        ).eval()
+        return model.fit(statistics, **options, **eye.settings(), samples=samples, data=data).eval()
 
 
-def statistics_of(
-    config: FitObservationConfig, classes: Sequence[str], shards: Iterable[Samples]
-) -> DirichletStatistics:
+def statistics_of(edges: Sequence[float], classes: Sequence[str], shards: Iterable[Samples]) -> DirichletStatistics:
     """Sum the sufficient statistics of detections by class and level, shard by shard."""
-    model = FovealObservationModel.identity(classes, config.edges)
+    model = FovealObservationModel.identity(classes, edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
     for samples in shards:
@@ -174,26 +94,28 @@ class ObservationFit(PartFit):
     """Fit the observation model with its miss rates."""
 
     name: ClassVar[str] = "observation"
-    settings: FitObservationConfig
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
-        self.settings = inputs.settings(FitObservationConfig)
+        self.settings = {name: getattr(self.config, name) for name in ("fixations", "holdout", "seed")}
         self.tasks = {"fitting": 1 + 0.1 * len(self.run.scenes)}
 
     def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
-        config, run, samples = self.settings, self.run, self.inputs.samples
-        held_out = split(samples.scene, config.holdout)
+        config, run, samples = self.config, self.run, self.inputs.samples
+        holdout, edges = self.settings["holdout"], level_edges(config.sensor)
+        held_out = split(samples.scene, holdout)
         judged = samples[held_out]
         fitted = samples[~held_out]
-        statistics = statistics_of(config, run.eye.detector.classes, [fitted])
-        model = fit_model(config, run.eye, run.scenes, statistics, fitted)
-        fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
-        cells = partial(all_cells, cells=self.config.cells)
+        statistics = statistics_of(edges, run.eye.detector.classes, [fitted])
+        noted = {"expected": "empirical", "fixations": config.fixations, "seed": config.seed}
+        start = fit_published(run.eye, run.scenes, statistics, edges, **noted)
+        model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
+        fitted_on = {index for index in range(len(run.scenes)) if index % holdout}
+        cells = partial(all_cells, cells=config.cells)
         misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
-        raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
+        raw = FovealObservationModel.identity(run.scenes.classes, edges).eval()
         with torch.inference_mode():
             posteriors = {
                 name: m.calibrate(judged.scores, judged.distance) for name, m in (("raw", raw), ("fitted", model))

@@ -30,8 +30,6 @@ _FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
-IOU = 0.5
-"""Least overlap at which a detection counts as showing an object."""
 MAP_SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
 _LONGEST = 15
@@ -95,7 +93,7 @@ class PartInputs:
             generator = generator_for("cells", self.config.seed, run.scenes.ids[index])
             cells = torch.randperm(len(grid), generator=generator)[: self.config.fixations]
             detections, annotation = run.detections(index)[cells], run.scenes.annotation(index)
-            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, IOU))
+            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, iou=0.5))
         return Samples.join(samples)
 
 
@@ -104,7 +102,7 @@ class PartFit(ABC):
 
     name: ClassVar[str]
     settings: Any
-    """The settings of the part, a dataclass. The part is fitted again if they change."""
+    """The settings of the part, by name or as a dataclass. The part is fitted again if they change."""
     tasks: dict[str, float]
     """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
 

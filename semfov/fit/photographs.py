@@ -22,7 +22,7 @@ from semfov.fit.verification import (
     verify,
 )
 from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread, left_out, logistic_regression
-from semfov.fit.windows_settings import FitZoomConfig
+from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.zoom_store import StoredGlances
@@ -95,7 +95,11 @@ class _WholeSearch(TargetSearch[WindowLook]):
 
 
 def fit_photographs(
-    model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: FitZoomConfig, prior: Verification | None = None
+    model: GlimpseEvidence,
+    pictures: Scenes,
+    eye: WindowEye,
+    config: FitMosaicsConfig,
+    prior: Verification | None = None,
 ) -> str:
     """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
 
@@ -172,7 +176,7 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], h
 
 
 def _fit_closer(
-    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitZoomConfig, prior: Verification | None
+    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitMosaicsConfig, prior: Verification | None
 ) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
     closer = examine(searches, _FOLDS)

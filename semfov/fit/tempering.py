@@ -2,71 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, ClassVar
+from functools import partial
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Footprint, Grid
+from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.fit.detector_report import Difference, in_words, percent_of, section
-from semfov.fit.part import FOOTPRINT, IOU, PartFit, PartInputs, PartResult
-from semfov.fit.settings import FitConfig
+from semfov.fit.detector_report import Difference, in_words, section
+from semfov.fit.part import FOOTPRINT, PartFit, PartInputs, PartResult
 from semfov.io.manifest import Part
 from semfov.runs.progress import track
 from semfov.runs.samples import Samples
-from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
+
+_EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+"""Values of the exponent to compare."""
+_SETTINGS = ("columns", "rows", "fixations", "max_target_area", "holdout", "seed")
+"""Settings of the fit that the exponent depends on."""
 
 
-@dataclass(frozen=True)
-class FitTemperingConfig(FitConfig):
-    """Find the exponent of the likelihoods.
-
-    Args:
-        calibrated: compute likelihoods from the scores with the observation model shipped for the detector. If false,
-            the raw scores are the likelihoods.
-        footprint: which cells a detection updates.
-        exponents: values of the exponent τ to compare.
-        photographs: use only the first so many photographs (None: all).
-        fixations: random fixations in each photograph.
-        iou: must be the same as in `train.fit_fom` to share looks with it.
-        seed: seed of the fixations.
-        shard: number of photographs in a unit of work.
-        columns: columns of the grid.
-        rows: rows of the grid.
-        min_objects: photographs with fewer objects are left out.
-        max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: one in every n photographs is held out for the evaluation.
-        out: folder for the report.
-        cache: folder for the labelled detections (None: `out`).
-    """
-
-    unused = ("name",)
-    calibrated: bool = False
-    footprint: Footprint = FOOTPRINT
-    exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
-    photographs: Count | None = None
-    fixations: Count = 8
-    iou: Share = IOU
-    shard: Count = 32
-    columns: Side = 10
-    rows: Side = 10
-    min_objects: Whole = 4
-    max_target_area: Positive = 0.2
-    holdout: Annotated[int, Range(2, 10**9)] = 4
-    out: Path = Path("runs/fit_tempering")
-
-
-def mean_hits(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
+def mean_hits(holdout: int, rates: dict[int, float]) -> dict[str, float]:
     """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones."""
     means: dict[str, list[float]] = {"fitted": [], "held_out": []}
     for index, share in rates.items():
-        means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
+        means["held_out" if index % holdout == 0 else "fitted"].append(share)
     if not all(means.values()):
         raise DataError(
             f"data: expected searches in photographs of both groups, got {len(means['fitted'])} photographs to choose "
@@ -76,15 +39,25 @@ def mean_hits(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, 
 
 
 def hit_rates(
-    config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
+    config: Any,
+    scenes: Scenes,
+    samples: Samples,
+    observer: Semantic,
+    title: str,
+    *,
+    least: int,
+    most: int | None = None,
 ) -> dict[int, float]:
-    """Compute the share of next fixations that hit the target in each photograph."""
+    """Compute the share of next fixations that hit the target in each of `most` photographs with `least` objects.
+
+    The settings are those of the looks: `fixations`, `columns`, `rows` and `max_target_area`.
+    """
     rates = {}
-    number = min(config.photographs or len(scenes), len(scenes))
+    number = min(most or len(scenes), len(scenes))
     for index in track(range(number), title, "scene"):
         annotation = scenes.annotation(index)
         targets = legal_targets(annotation, config.max_target_area)
-        if len(annotation.labels) < config.min_objects or not targets:
+        if len(annotation.labels) < least or not targets:
             continue
         looks = slice(index * config.fixations, (index + 1) * config.fixations)
         grid = Grid(config.columns, config.rows, annotation.size)
@@ -129,49 +102,46 @@ class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
 
     name: ClassVar[str] = "tempering"
-    settings: FitTemperingConfig
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
-        self.settings = inputs.settings(FitTemperingConfig, min_objects=1)
-        tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in self.settings.exponents]
+        self.settings = {name: getattr(self.config, name) for name in _SETTINGS}
+        tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in _EXPONENTS]
         self.tasks = dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
 
     def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""
-        config, run, inputs = self.settings, self.run, self.inputs
+        inputs, holdout = self.inputs, self.settings["holdout"]
+        measured = partial(hit_rates, self.config, self.run.scenes, inputs.samples, least=1)
         ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
-        baseline = Semantic(inputs.components)
-        raw = hit_rates(config, run.scenes, inputs.samples, baseline, "raw")
+        raw = measured(Semantic(inputs.components), "raw")
         rates = {
-            (scores, exponent): hit_rates(
-                config, run.scenes, inputs.samples, inputs.fusing(scores, exponent), f"{scores} {exponent:g}"
-            )
+            (scores, exponent): measured(inputs.fusing(scores, exponent), f"{scores} {exponent:g}")
             for scores in ways
-            for exponent in config.exponents
+            for exponent in _EXPONENTS
         }
-        means = {way: mean_hits(config, each) for way, each in rates.items()}
+        means = {way: mean_hits(holdout, each) for way, each in rates.items()}
         scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
-        held_out = [index for index in raw if index % config.holdout == 0]
+        held_out = [index for index in raw if index % holdout == 0]
         chosen = rates[best]
         gain = Difference.of(
             torch.tensor([chosen[index] for index in held_out]).numpy(),
             torch.tensor([raw[index] for index in held_out]).numpy(),
         )
-        before = mean_hits(config, raw)["held_out"]
+        before = mean_hits(holdout, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
             f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
         rows = [
             ["scores", "exponent", "next fixations that hit, %"],
-            ["raw, every cell of a box", "1", percent_of(before)],
+            ["raw, every cell of a box", "1", f"{100 * before:.1f}"],
         ]
-        rows += [[way[0], f"{way[1]:g}", percent_of(mean["held_out"])] for way, mean in means.items()]
+        rows += [[way[0], f"{way[1]:g}", f"{100 * mean['held_out']:.1f}"] for way, mean in means.items()]
         report = section(
             f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
             f"photographs; the table shows results on {len(held_out)} held-out photographs.",
             rows,
         )
-        settings = {"scores": scores, "exponent": exponent, "footprint": config.footprint}
+        settings = {"scores": scores, "exponent": exponent, "footprint": FOOTPRINT}
         return PartResult(Part(None, None, gain.better, why, settings), report)

@@ -17,7 +17,6 @@ from torch.nn import functional as F
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
-from semfov.data.scattered import Scattered
 from semfov.data.scene import Annotation, ChosenScenes, Scenes
 from semfov.decision import OUTCOMES, SAME, settle
 from semfov.errors import check
@@ -33,7 +32,7 @@ from semfov.fit.verification import (
     verification_report,
     verify,
 )
-from semfov.fit.windows_certainty import certainty_again, spread_again
+from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_evidence import (
     SurveyExample,
     ZoomExample,
@@ -41,11 +40,10 @@ from semfov.fit.windows_evidence import (
     fit_presence,
     fit_rates,
     fit_survey,
-    judge_survey,
     pair_windows,
     windows_of,
 )
-from semfov.fit.windows_settings import PICTURE_KINDS, FitZoomConfig, PictureKind
+from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.metrics.calibration import BinarySums
@@ -90,7 +88,7 @@ class _Searches(NamedTuple):
 
 @torch.inference_mode()
 def _searches_of(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
 ) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
     """Search every picture for some present classes and for as many absent ones, without decisions."""
     for index, looks in enumerate(track(opened, title, "picture")):
@@ -112,7 +110,7 @@ def _with_facts(turns: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[Windo
 
 @torch.inference_mode()
 def _picture_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
 ) -> _Searches:
     """Run all searches of `_searches_of`, and collect them."""
     rows: list[list[Tensor]] = []
@@ -210,7 +208,7 @@ class _MosaicSearch(TargetSearch[WindowLook]):
 
 @torch.inference_mode()
 def _mosaic_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitZoomConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
 ) -> Iterator[_MosaicSearch]:
     """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
@@ -231,7 +229,7 @@ def _mosaic_searches(
 def _fit_closer(
     model: GlimpseEvidence,
     pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
-    config: FitZoomConfig,
+    config: FitMosaicsConfig,
     prior: Verification | None = None,
 ) -> str:
     """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model."""
@@ -264,7 +262,7 @@ def _fit_closer(
     return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), judged, how)[0]
 
 
-def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
+def crowded(scenes: Scenes, share: float) -> ChosenScenes:
     """The given share of a set's scenes, those with the most objects; among equals the first scenes count."""
     check(0 < share <= 1, "share", "above 0 and at most 1", share)
     check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
@@ -275,38 +273,15 @@ def _crowded(scenes: Scenes, share: float) -> ChosenScenes:
     return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
 
 
-_OTHER = ("kinds", "each", "judged_each", "tile", "seed")
-"""Settings of the pictures that are no mosaics."""
-
-_DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", *_OTHER)
-"""Settings that the thresholds and the probability of presence depend on."""
-
-_VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", *_OTHER)
-"""Settings that the verification depends on."""
-
-_COUNTING = ("searched", "far", "judged", "passes", *_OTHER)
-"""Settings that the certainty and the spread depend on."""
-
-_SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
-"""Settings that the survey depends on."""
-
-
-def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
-    """Compose pictures of a kind."""
-    seed += 10 + PICTURE_KINDS.index(kind)
-    half, ground = (tile // 2, tile * 3 // 8), (8 * tile, 9 * tile // 2)
-    match kind:
-        case "few":
-            return Mosaics(scenes, 3, 3, tile=(tile, tile * 3 // 4), count=count, seed=seed)
-        case "many":
-            return Mosaics(scenes, 12, 12, tile=half, count=count, seed=seed)
-        case "one class":
-            return Mosaics(scenes, 8, 6, tile=half, alike=True, count=count, seed=seed)
-        case "photographs":
-            sides = tile // 5, tile
-            return Scattered(scenes, whole=True, size=ground, sides=sides, most=8, count=count, seed=seed)
-        case "objects":
-            return Scattered(scenes, size=ground, sides=(tile // 15, tile // 3), count=count, seed=seed)
+_SEARCHING = ("searched", "judged", "sought", "passes", "false_alarms", "surest")
+_DEPENDS_ON = {
+    "survey": ("mosaics", "far", "crowded", "judged", "survey_steps"),
+    "decision": (*_SEARCHING, "judging", "lost"),
+    "verification": (*_SEARCHING, "place"),
+    "certainty": ("searched", "far", "judged", "passes"),
+    "spread": ("searched", "far", "judged", "passes"),
+}
+"""Settings that the parts of a model depend on, beside the pictures."""
 
 
 def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
@@ -321,33 +296,34 @@ def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
 
 
 class MosaicFit:
-    """A fit of evidence part by part, with the mosaics and other pictures, and the store of the looks at them."""
+    """A fit of evidence part by part, with the mosaics, and the store of the looks at them."""
 
-    def __init__(self, config: FitZoomConfig, eye: WindowEye | None = None) -> None:
+    kinds: tuple[str, ...] = ()
+    """Kinds of pictures to fit on beside the mosaics."""
+    composed: tuple[str, ...] = ("tile", "seed")
+    """Settings that all pictures depend on."""
+
+    def __init__(self, config: FitMosaicsConfig, eye: WindowEye | None = None) -> None:
         if eye is None:
             eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
         self.config, self.eye = config, eye
-        training, held_out = split_photographs(config.data, eye.detector.classes, config.holdout)
-        tile, half = (config.tile, config.tile * 3 // 4), (config.tile // 2, config.tile * 3 // 4 // 2)
-        most, most_held = _crowded(training, 1 / 3), _crowded(held_out, 1 / 3)
-        seed = config.seed
+        self.training, self.held_out = split_photographs(config.data, eye.detector.classes, config.holdout)
+        half = config.tile // 2, config.tile * 3 // 4 // 2
         self.mosaics = {
-            "near": Mosaics(training, 4, 4, tile=tile, count=config.mosaics, seed=seed),
-            "far": Mosaics(training, 8, 6, tile=tile, count=config.far, seed=seed + 1),
-            "small": Mosaics(training, 12, 12, tile=half, count=config.far, seed=seed + 7),
-            "judged": Mosaics(held_out, 4, 4, tile=tile, count=config.judged, seed=seed + 2),
-            "judged far": Mosaics(held_out, 8, 6, tile=tile, count=config.judged_far, seed=seed + 3),
-            "searched": Mosaics(training, 4, 4, tile=tile, count=config.searched, seed=seed + 4),
-            "crowded": Mosaics(most, 4, 4, tile=tile, count=config.crowded, seed=seed + 5),
-            "judged crowded": Mosaics(most_held, 4, 4, tile=tile, count=config.judged, seed=seed + 6),
+            "near": self.mosaic(self.training, 4, 4, config.mosaics, 0),
+            "far": self.mosaic(self.training, 8, 6, config.far, 1),
+            "small": Mosaics(self.training, 12, 12, tile=half, count=config.far, seed=config.seed + 7),
+            "judged": self.mosaic(self.held_out, 4, 4, config.judged, 2),
+            "searched": self.mosaic(self.training, 4, 4, config.searched, 4),
+            "crowded": self.mosaic(crowded(self.training, 1 / 3), 4, 4, config.crowded, 5),
         }
         self.pictures: dict[str, Scenes] = {**self.mosaics}
-        for kind in PICTURE_KINDS:
-            self.pictures[kind] = _compose_pictures(kind, training, config.each, seed, config.tile)
-            self.pictures[f"judged {kind}"] = _compose_pictures(
-                kind, held_out, config.judged_each, seed + 20, config.tile
-            )
         self.store = GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+
+    def mosaic(self, scenes: Scenes, columns: int, rows: int, count: int, number: int) -> Mosaics:
+        """Mosaics of photographs, with the seed of this number."""
+        tile = self.config.tile, self.config.tile * 3 // 4
+        return Mosaics(scenes, columns, rows, tile=tile, count=count, seed=self.config.seed + number)
 
     def opened(self, kind: str) -> list[StoredGlances]:
         """The stored looks at each picture of a kind."""
@@ -359,7 +335,7 @@ class MosaicFit:
         todo = [(kind, n) for kind in dict.fromkeys(kinds) for n in range(len(self.pictures[kind]))]
         config, store = self.config, self.store
         done = run_tasks(
-            _look, todo, where=config.where, make=MosaicFit, settings=(config,),
+            _look, todo, where=config.where, make=type(self), settings=(config,),
             title="looking", unit="picture",
         )  # fmt: skip
         with closing(done):
@@ -378,10 +354,6 @@ class MosaicFit:
             for kind in kinds
         }
 
-    def training(self, examples: Mapping[str, list[ZoomExample]]) -> list[ZoomExample]:
-        """Looks at the mosaics and the other pictures on which predictions of closer looks are fitted."""
-        return [each for kind in ("near", "far", *self.config.kinds) for each in examples[kind]]
-
     def closer(self, examples: Mapping[str, list[ZoomExample]]) -> GlimpseEvidence:
         """Fit the prediction of closer looks, class by class."""
         config = self.config
@@ -389,27 +361,21 @@ class MosaicFit:
         random.seed(config.seed)
         metadata = {**self.eye.settings(), **training_of(config, self.mosaics["near"], "judged")}
         model = GlimpseEvidence(len(self.eye.detector.classes), metadata=metadata)
-        looks = self.training(examples)
+        looks = [each for kind in ("near", "far", *self.kinds) for each in examples[kind]]
         fit_presence(model, pair_windows(looks), config.steps)
         fit_rates(model, looks, config.steps)
         return model.eval().requires_grad_(False)
 
-    def survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> dict[str, float]:
-        """Fit a new survey; returns its measures on the held-out mosaics that were looked at."""
+    def survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> None:
+        """Fit a new survey."""
         config = self.config
         torch.manual_seed(config.seed)
         random.seed(config.seed)
         survey = Survey(model.classes, foresight=model.survey.foresight)
-        kinds = {
-            kind: [SurveyExample.of(example) for example in examples[kind]]
-            for kind in ("near", "far", "crowded", "judged", "judged crowded")
-            if kind in examples
-        }
-        fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
+        looked = [SurveyExample.of(example) for kind in ("near", "far", "crowded") for example in examples[kind]]
+        fit_survey(survey, looked, config.survey_steps)
         model.survey = survey.eval().requires_grad_(False)
-        self._told(model, "survey", _SURVEYING)
-        crowded = judge_survey(survey, kinds["judged crowded"]) if "judged crowded" in kinds else {}
-        return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
+        self.note(model, "survey")
 
     def decisions(self, model: GlimpseEvidence) -> list[str]:
         """Fit the decisions of searches: the probability of presence, and the thresholds."""
@@ -428,7 +394,7 @@ class MosaicFit:
         _fit_judge(model, searches["searched"], config.judging)
         rows = _judge_searches(model, searches["judged"], config)
         assert model.thresholds is not None
-        self._told(model, "decision", _DECIDING)
+        self.note(model, "decision")
         fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
         return [
             f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them "
@@ -449,25 +415,17 @@ class MosaicFit:
         }
         text = _fit_closer(model, searched, self.config, prior)
         if model.verification is not None:
-            self._told(model, "verification", _VERIFYING)
+            self.note(model, "verification")
         return ["Closer looks:", "", text]
 
     def certainty(self, model: GlimpseEvidence) -> list[str]:
         """Fit the probability that an object is there, and the spread of expected numbers."""
         prepare_worker()
-        training, held_out = self._explored()
-        lines = certainty_again(model, training, held_out, passes=self.config.passes)
-        self._told(model, "certainty", _COUNTING)
+        lines = certainty_again(model, *self.explored(), passes=self.config.passes)
+        self.note(model, "certainty")
         return lines
 
-    def spread(self, model: GlimpseEvidence) -> list[str]:
-        """Fit the spread of expected numbers alone."""
-        prepare_worker()
-        lines = spread_again(model, self._explored()[0], passes=self.config.passes)
-        self._told(model, "spread", _COUNTING)
-        return lines
-
-    def _explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
+    def explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
         """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""
         fitted, judged = self._searched().values()
         some = self.config.some_explored
@@ -478,9 +436,9 @@ class MosaicFit:
 
     def _searched(self) -> dict[str, tuple[str, ...]]:
         """Kinds of pictures to fit decisions on, and to choose thresholds on."""
-        kinds = self.config.kinds
-        return {"searched": ("searched", *kinds), "judged": ("judged", *(f"judged {kind}" for kind in kinds))}
+        judged = (f"judged {kind}" for kind in self.kinds)
+        return {"searched": ("searched", *self.kinds), "judged": ("judged", *judged)}
 
-    def _told(self, model: GlimpseEvidence, part: str, settings: Sequence[str]) -> None:
+    def note(self, model: GlimpseEvidence, part: str) -> None:
         """Note in the model the settings that a part depends on."""
-        model.metadata[part] = {name: getattr(self.config, name) for name in settings}
+        model.metadata[part] = {name: getattr(self.config, name) for name in (*_DEPENDS_ON[part], *self.composed)}

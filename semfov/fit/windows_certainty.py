@@ -267,14 +267,7 @@ def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list
     ]
 
 
-def spread_again(
-    model: GlimpseEvidence, fitted: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], *, passes: int
-) -> list[str]:
-    """Fit the spread of the expected numbers of a model, by kinds of pictures that are left out."""
-    return _spread(model, _explored(model, fitted, passes), passes)
-
-
-def _explored(
+def explorations_of_kinds(
     model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
 ) -> dict[str, list[Exploration]]:
     """The explorations of pictures by their kind."""
@@ -284,7 +277,7 @@ def _explored(
     }
 
 
-def _spread(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:
+def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:
     """Fit the spread on explorations; the report in Markdown."""
     assert model.certainty is not None
     numbers = left_out(explored, partial(_fitted, passes=passes))
@@ -303,11 +296,11 @@ def certainty_again(
     passes: int,
 ) -> list[str]:
     """Fit the certainty of a model on some kinds of pictures, and evaluate it on others."""
-    kinds = _explored(model, fitted, passes)
+    kinds = explorations_of_kinds(model, fitted, passes)
     training = [each for group in kinds.values() for each in group]
-    held_out = [each for group in _explored(model, judged, passes).values() for each in group]
+    held_out = [each for group in explorations_of_kinds(model, judged, passes).values() for each in group]
     model.certainty = _fitted(training, passes)
-    told = _spread(model, kinds, passes)
+    told = spread_again(model, kinds, passes)
     facts, right = _judged(held_out, passes)
     chances = model.certainty.probability(facts)
     sure, error = chances >= 0.5, BinarySums.of(chances, right).ece

@@ -3,7 +3,7 @@
 import json
 import random
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -294,20 +294,6 @@ class SurveyExample(NamedTuple):
         return losses
 
 
-@torch.no_grad()
-def judge_survey(survey: Survey, examples: Sequence[SurveyExample]) -> dict[str, float]:
-    """Mean loss on mosaics that were held out, by the overview and by closer looks."""
-    first, later = [], []
-    for example in examples:
-        overview, *closer = example.losses(survey, example.closer)
-        first.append(overview)
-        later += closer
-    figures = {"objects of any class, mean negative log likelihood, overview": float(torch.stack(first).mean())}
-    if later:
-        figures["objects of any class, mean negative log likelihood, closer looks"] = float(torch.stack(later).mean())
-    return figures
-
-
 _LATER = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
 
@@ -349,10 +335,6 @@ def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[
     losses = torch.stack([_rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
     lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
-    lines += [*measures_table(figures), ""]
+    rows = [["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())]
+    lines += [*table(rows), ""]
     return "\n".join(lines), json.dumps(figures, indent=1)
-
-
-def measures_table(figures: Mapping[str, float]) -> list[str]:
-    """Write measures as a table in Markdown."""
-    return table([["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())])

@@ -19,7 +19,7 @@ from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_evidence import (
     judge_windows,
 )
-from semfov.fit.windows_settings import FitZoomConfig
+from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.manifest import Part
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
@@ -73,7 +73,7 @@ class WindowsFit(PartFit):
                 f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
-        self.settings: FitZoomConfig | _LeftOut
+        self.settings: FitMosaicsConfig | _LeftOut
         if why is not None:
             self.settings, self.tasks = _LeftOut(why), {}
             return
@@ -92,7 +92,7 @@ class WindowsFit(PartFit):
             **{f"exploring, {kind}": 2 * count for kind, count in (sets | config.some_explored).items()},
         }
 
-    def mosaics(self, photographs: int) -> FitZoomConfig:
+    def mosaics(self, photographs: int) -> FitMosaicsConfig:
         """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
         own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
         training = min(photographs - held_out, _FOR_MOSAICS)
@@ -103,14 +103,12 @@ class WindowsFit(PartFit):
             _OF_INPUT * self.run.eye.detector.input_size[0],
         )
         return self.inputs.settings(
-            FitZoomConfig,
+            FitMosaicsConfig,
             sensor=SensorConfig(),
             mosaics=max(1, training // 5),
             far=max(1, training // 60),
             crowded=max(1, training // 10),
             judged=max(8, min(held_out // 3, 30)),
-            judged_far=1,
-            kinds=(),
             searched=max(8, training // 12),
             sought=3,
             passes=16,
@@ -128,7 +126,7 @@ class WindowsFit(PartFit):
         with one_thread():
             return self._fit(config)
 
-    def _fit(self, config: FitZoomConfig) -> PartResult:
+    def _fit(self, config: FitMosaicsConfig) -> PartResult:
         fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
         model, figures = _fit_mosaics(fit)
         judged, opened = fit.mosaics["judged"], fit.opened("judged")

@@ -2,24 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 from semfov.fit.settings import FitConfig
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Range, Share, Whole
 from semfov.runs.window_looking import TileSize
 
-RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]
-
-PictureKind = Literal["few", "many", "one class", "photographs", "objects"]
-"""Mosaics of 3 × 3 photographs; of 12 × 12 of half the size; of 8 × 6 that share a class; photographs, and single
-objects of few classes, scattered over one ground."""
-
-PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)
-
 
 @dataclass(frozen=True)
-class FitZoomConfig(FitConfig):
+class FitMosaicsConfig(FitConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
@@ -33,11 +25,6 @@ class FitZoomConfig(FitConfig):
             number of objects of any class.
         judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
             search and thresholds; and of the third of them that hold most objects.
-        judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
-        kinds: kinds of pictures to fit on beside these mosaics (`PictureKind`): `few`, `many`,
-            `one class`, `photographs` and `objects`.
-        each: number of training pictures of each of these kinds.
-        judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
         tile: width in pixels of the slot of a photograph; its height is three quarters of that.
         searched: number of training mosaics of 4 × 4 photographs for fitting the decisions of searches.
         sought: number of present classes, and of absent classes, to search for in each of these mosaics.
@@ -49,13 +36,6 @@ class FitZoomConfig(FitConfig):
         photographs: number of photographs that are looked at by themselves, those with most pixels first, to fit the
             evidence for photographs; 0 leaves it out.
         worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
-        evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
-            further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
-            closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
-            closer looks find, `certainty`, the probability that an object is there, with the spread of expected
-            numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification has to
-            follow new decisions; without it they are made without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
@@ -73,10 +53,6 @@ class FitZoomConfig(FitConfig):
     far: Count = 40
     crowded: Count = 240
     judged: Count = 80
-    judged_far: Count = 4
-    kinds: tuple[PictureKind, ...] = PICTURE_KINDS
-    each: Count = 20
-    judged_each: Count = 6
     tile: TileSize = 480
     searched: Count = 50
     sought: Count = 4
@@ -87,8 +63,6 @@ class FitZoomConfig(FitConfig):
     place: Share = 0.2
     photographs: Whole = 320
     worth: Share = 0.2
-    evidence: Path | None = None
-    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300

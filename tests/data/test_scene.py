@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data import Annotation, EmbeddedScenes, Scene, box_coverage, legal_targets
-from semfov.fit.windows import _crowded
+from semfov.fit.windows import crowded
 from tests.refusals import refused
 
 
@@ -47,7 +47,7 @@ def test_size_is_width_and_height():
 
 def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
     scenes = EmbeddedScenes(("person", "cat", "dog"), count=9, seed=3)
-    most = _crowded(scenes, 0.4)
+    most = crowded(scenes, 0.4)
     counts = {name: len(scenes.annotation(index).boxes) for index, name in enumerate(scenes.ids)}
     assert len(most) == len(most.ids) == 4  # 3.6 rounded up
     assert len(set(counts.values())) > 1
@@ -58,7 +58,7 @@ def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
 
 def test_a_scene_is_that_of_the_set():
     scenes = EmbeddedScenes(("person", "cat", "dog"), count=6, seed=3)
-    most = _crowded(scenes, 0.5)
+    most = crowded(scenes, 0.5)
     for index, name in enumerate(most.ids):
         place = scenes.ids.index(name)
         assert torch.equal(most[index].image, scenes[place].image)
@@ -66,11 +66,11 @@ def test_a_scene_is_that_of_the_set():
         assert most.targets(index) == scenes.targets(place)
         assert most.digest(index) == scenes.digest(place)
     assert most.classes == scenes.classes
-    assert len({most.fingerprint, scenes.fingerprint, _crowded(scenes, 0.3).fingerprint}) == 3
+    assert len({most.fingerprint, scenes.fingerprint, crowded(scenes, 0.3).fingerprint}) == 3
 
 
 def test_coverages_and_shares_out_of_range_are_refused():
     refused("coverage", box_coverage, torch.zeros(1, 4), (4, 4), "mean")
     refused("boxes", box_coverage, torch.zeros(4, 3), (4, 4))
     for share in [0.0, -0.1, 1.5, float("nan")]:
-        refused("share: expected above 0", _crowded, EmbeddedScenes(("person",), count=2), share)
+        refused("share: expected above 0", crowded, EmbeddedScenes(("person",), count=2), share)

@@ -159,7 +159,7 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 
 FITS = {
-    "observation": "fit_model",
+    "observation": "fit_published",
     "tempering": "hit_rates",
     "evidence": "fit_evidence",
     "verification": "fit_in_folds",

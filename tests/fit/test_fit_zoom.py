@@ -14,20 +14,19 @@ from semfov.belief.verification import Verification
 from semfov.data import Annotation, EmbeddedScenes, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
-from semfov.fit.observation import FitObservationConfig
 from semfov.fit.verification import _unverified, verify
 from semfov.fit.windows import _fit_closer, _mosaic_searches
 from semfov.fit.windows_evidence import example_of
-from semfov.fit.windows_settings import FitZoomConfig
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from tests.small import Coloured, Tiles
-from train.fit_fom import fit_fom
+from train.fit_fom import FitFomConfig, fit_fom
 from train.fit_zoom import fit_zoom
 from train.mosaic_samples import MosaicSampler
+from train.zoom_pictures import FitZoomConfig
 
 
 @pytest.mark.slow
@@ -112,7 +111,7 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     monkeypatch.setattr("train.mosaic_samples.TILE", (96, 72))
-    config = FitObservationConfig(
+    config = FitFomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
         out=tmp_path / "out", workers=1,

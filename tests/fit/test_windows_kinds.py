@@ -3,11 +3,10 @@
 import pytest
 import torch
 
-from semfov.fit.windows import _compose_pictures
 from semfov.fit.windows_evidence import windows_of
-from semfov.fit.windows_settings import PICTURE_KINDS
 from semfov.zoom.lattice import Lattice
 from tests.small import RedBoxes
+from train.zoom_pictures import PICTURE_KINDS, _compose_pictures
 
 SCENES = RedBoxes()
 SIZES = {

@@ -10,7 +10,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
-from semfov.fit.windows_settings import FitZoomConfig
+from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig
@@ -57,7 +57,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
         fitted = folder.fit("windows")
     assert {*used} == {*tasks}
     config = folder.fits["windows"].settings
-    assert isinstance(config, FitZoomConfig)
+    assert isinstance(config, FitMosaicsConfig)
     # Slots of 4 to 3 that hold square photographs of 64 pixels would be 85 wide, more than the detector needs.
     assert config.tile == 74
     model = GlimpseEvidence.from_pretrained(home / "models" / fitted.part.file)

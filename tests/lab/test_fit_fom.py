@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from eval.calibration import main as calibrate
-from semfov.fit.observation import FitObservationConfig
 from semfov.observation import FovealObservationModel, match
 from semfov.runs.config import DataConfig
 from semfov.runs.seeds import generator_for
-from train.fit_fom import fit_fom, main
+from train.fit_fom import FitFomConfig, fit_fom, main
 from train.samples import Sampler
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
@@ -52,7 +51,7 @@ def test_estimators_agree(fitted):
 
 def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, tmp_path):
     data = DataConfig(limit=6, min_instances=0, max_target_area=None)
-    fit_fom(FitObservationConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
+    fit_fom(FitFomConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
     figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
     # No comparison with raw scores: a hundred detections of four scenes are too few for it.
     assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
@@ -70,7 +69,7 @@ def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted,
 
 
 def test_detections_are_drawn_evenly(fitted):
-    config = FitObservationConfig(data=DataConfig(limit=6, min_instances=0, max_target_area=None), fixations=2, shard=2)
+    config = FitFomConfig(data=DataConfig(limit=6, min_instances=0, max_target_area=None), fixations=2, shard=2)
     sampler = Sampler(config, fitted / "samples")
     every = sampler.all()
     assert torch.equal(sampler.drawn(len(every)).scores, every.scores)
@@ -98,7 +97,7 @@ def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
 
 
 def test_samples_match_looks_at_random_fixations(tmp_path):
-    sampler = Sampler(FitObservationConfig(data=DataConfig(limit=2), fixations=2), tmp_path)
+    sampler = Sampler(FitFomConfig(data=DataConfig(limit=2), fixations=2), tmp_path)
     samples = sampler.sample(0)
     scene = sampler.scenes[1]
     mine = samples[samples.scene == 1]

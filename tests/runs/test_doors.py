@@ -7,7 +7,7 @@ import torch
 import yaml
 
 from semfov import Selection
-from semfov.fit.tempering import FitTemperingConfig
+from semfov.fit.settings import FitDetectorConfig
 from semfov.runs import config as settings
 from semfov.runs.command import run_command
 from semfov.runs.settings import Range, check_settings
@@ -41,13 +41,13 @@ def test_invalid_selections_and_strides_are_refused():
 
 
 def test_unused_settings_are_no_options_and_are_not_written(capsys):
-    config = FitTemperingConfig(holdout=3)
+    config = FitDetectorConfig(holdout=3)
     assert "name" in config.unused
     written = yaml.safe_load(config.yaml())
     assert written.keys() == {field.name for field in dataclasses.fields(config)} - {"name"}
-    assert (written["holdout"], written["out"], written["data"]["min_instances"]) == (3, "runs/fit_tempering", 0)
+    assert (written["holdout"], written["out"], written["data"]["min_instances"]) == (3, "mymodels", 0)
     with pytest.raises(SystemExit):
-        run_command(print, FitTemperingConfig, "", ["--name", "mine"])
+        run_command(print, FitDetectorConfig, "", ["--name", "mine"])
     assert "unknown option --name" in capsys.readouterr().err
 
 

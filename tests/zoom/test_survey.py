@@ -5,12 +5,13 @@ import torch
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey, judge_survey
+from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import Survey
 from semfov.zoom.glances import half_steps, on_lattice
 from semfov.zoom.hints import Gist
+from train.fit_zoom import judge_survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
 CLASSES = 3
@@ -132,7 +133,7 @@ def test_fitting_improves_predictions_on_held_out_mosaics():
         x1, y1, x2, y2 = (max(n, 0) for n in window.cells)
         return int((look.scores[y1:y2, x1:x2, 1] > 0).sum()) // 4
 
-    examples, held = ([SurveyExample.of(example(rule)) for _ in range(count)] for count in (4, 1))
+    examples, held = [SurveyExample.of(example(rule)) for _ in range(4)], [example(rule)]
     survey = Survey(CLASSES)
     overview, *_ = before = judge_survey(survey, held)
     fit_survey(survey, examples, 40, batch=2)

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.observation import FitObservationConfig, count_misses
+from semfov.fit.observation import count_misses
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.setup import split_photographs
 from semfov.zoom.lattice import Lattice
+from train.fit_fom import FitFomConfig
 from train.mosaic_samples import MosaicSampler, _choose_windows
 
 pytestmark = pytest.mark.lab
@@ -38,7 +39,7 @@ def sampler(detector, monkeypatch, tmp_path):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: detector)
     monkeypatch.setattr("train.mosaic_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
-    config = FitObservationConfig(data=data, fixations=2, shard=1, mosaics=2, holdout=2)
+    config = FitFomConfig(data=data, fixations=2, shard=1, mosaics=2, holdout=2)
     return MosaicSampler(config, tmp_path)
 
 
