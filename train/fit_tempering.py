@@ -22,12 +22,12 @@ from semfov.belief.grid import Footprint
 from semfov.belief.observers import Semantic
 from semfov.errors import check
 from semfov.eye import Eye
-from semfov.fit.settings import FitConfig
+from semfov.fit.settings import FitOnCellsConfig
 from semfov.fit.tempering import hit_rates, mean_hits
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.samples import Samples
-from semfov.runs.settings import Count, Positive, Range, Share, Side, Whole
+from semfov.runs.settings import Count, Positive, Range, Share, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from train.outputs import write_outputs
@@ -35,7 +35,7 @@ from train.samples import Sampler, collect_samples
 
 
 @dataclass(frozen=True)
-class FitTemperingConfig(FitConfig):
+class FitTemperingConfig(FitOnCellsConfig):
     """Find the exponent of the likelihoods.
 
     Args:
@@ -48,8 +48,6 @@ class FitTemperingConfig(FitConfig):
         iou: must be the same as in `train.fit_fom` to share looks with it.
         seed: seed of the fixations.
         shard: number of photographs in a unit of work.
-        columns: columns of the grid.
-        rows: rows of the grid.
         min_objects: photographs with fewer objects are left out.
         max_target_area: classes that cover a larger share of the image are not searched for.
         holdout: one in every n photographs is held out for the evaluation.
@@ -65,8 +63,6 @@ class FitTemperingConfig(FitConfig):
     fixations: Count = 8
     iou: Share = 0.5
     shard: Count = 32
-    columns: Side = 10
-    rows: Side = 10
     min_objects: Whole = 4
     max_target_area: Positive = 0.2
     holdout: Annotated[int, Range(2, 10**9)] = 4

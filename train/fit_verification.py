@@ -14,18 +14,39 @@ looks are stored, photograph by photograph, in the folder `cache`: the same comm
 
 import json
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
 from semfov.fit.outputs import training_of
 from semfov.fit.searches import open_photographs
-from semfov.fit.verification import FitVerificationConfig, fit_in_folds, verification_report
+from semfov.fit.verification import VerificationConfig, fit_in_folds, verification_report
 from semfov.runs.command import command
+from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
+from semfov.runs.settings import Count
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
 from train.outputs import model_path, write_outputs
+
+
+@dataclass(frozen=True)
+class FitVerificationConfig(VerificationConfig):
+    """Fit the verification of targets.
+
+    Args:
+        target_model: learned target evidence, by name or file (None: the one for the detector and the sensor).
+        fitted: number of photographs that this evidence was fitted to (`--data.limit` of `train.fit_search` with
+            `--data.min_instances 2`); those from which it learned are left out here (None: none is left out).
+        cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
+    """
+
+    unused = ("workers", "scheduler")
+    data: DataConfig = field(default_factory=DataConfig)
+    target_model: str | None = None
+    fitted: Count | None = None
+    out: Path = Path("runs/fit_verification")
 
 
 def fit_verification(config: FitVerificationConfig) -> None:

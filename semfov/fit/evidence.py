@@ -335,7 +335,7 @@ def _search_curves(
     curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
     for index in track(scenes, "searching", "scene"):
         targets = legal_targets(run.scenes.annotation(index), max_area)
-        episodes = episodes_of(run.scenes, index, *run.config.cells, protocol, targets)
+        episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
         if not episodes:
             continue
         grid = run.grid(index)

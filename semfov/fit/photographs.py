@@ -73,20 +73,14 @@ class _WholeSearch(TargetSearch[WindowLook]):
             present=len(objects) > 0,
             spare=spare,
         )
-        self.glances, self.whole, self.objects, self.model = glances, whole, objects, model
-
-    def __len__(self) -> int:
-        return 1
-
-    @property
-    def best(self) -> float:
+        self.steps, self.objects, self.model = (whole,), objects, model
+        self.best = float(whole.show[target - 1])
         """Highest score of the target."""
-        return float(self.whole.show[self.target - 1])
 
     def look(self, index: int, number: int) -> WindowLook:
-        """The look at the whole."""
+        """The look at the whole, with the probability after it."""
         presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return WindowLook(candidates(self.whole), number, float(presence), self.best, 0.0)
+        return WindowLook(candidates(self.steps[0]), number, float(presence), self.best, 0.0)
 
     def right(self, box: Tensor) -> bool:
         """Whether the centre of a box `(4,)` lies in an annotated box of the class."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Observer, Target
+from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
 from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
@@ -31,13 +31,14 @@ from semfov.runs.store import DetectionStore, RememberedLooks
 
 
 class TargetSearch(ABC, Generic[LookType]):
-    """Base of the searches for a class in a picture, with all their looks but the closer ones.
+    """Base of the searches for a class in a picture, with all their looks but the closer ones, `steps`.
 
     Decisions do not move the gaze, so all of them can be made along the same looks.
     """
 
     after: ClassVar[tuple[int, ...]]
     most: ClassVar[int] = MOST_CLOSER
+    steps: Any
 
     def __init__(
         self,
@@ -53,13 +54,10 @@ class TargetSearch(ABC, Generic[LookType]):
         self.picture, self.target, self.candidates, self.close_up = picture, target, candidates, close_up
         self.present, self.spare, self.passes = present, spare, passes
 
-    @abstractmethod
-    def __len__(self) -> int:
-        """Number of looks."""
-
-    @abstractmethod
     def look(self, index: int, number: int) -> LookType:
         """Return the look of this index; `number` looks of both kinds were made up to it."""
+        look: LookType = self.steps[index]
+        return look
 
     @abstractmethod
     def right(self, box: Tensor) -> bool:
@@ -126,7 +124,7 @@ def open_photographs(
     spare: int = 0,
     everywhere: Callable[[int], Detections] | None = None,
 ) -> list[SearchedPhotograph]:
-    """Draw classes to search for in photographs, by a `FitVerificationConfig`."""
+    """Draw classes to search for in photographs, by a `VerificationConfig`."""
     photographs, seed, area = list[SearchedPhotograph](), config.seed, config.max_target_area
     protocol = ProtocolConfig(seed=seed)
     for index in chosen:
@@ -145,18 +143,6 @@ def open_photographs(
     return photographs
 
 
-def _search_photograph(
-    photograph: SearchedPhotograph,
-    target: DrawnSearch,
-    observer: Observer,
-    looks: int,
-) -> Iterator[Step]:
-    """Search a photograph for a class, where it is most probable, in at most `looks` looks."""
-    source = CellLooks(photograph.look, photograph.grid, photograph.grid.centres, target.target)
-    choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
-    return rollout(source, observer, TargetPosterior(target.target), target.start, choice, most=looks)
-
-
 class _PhotographSearch(TargetSearch[Step]):
     """A search of a photograph, where the class is most probable."""
 
@@ -169,24 +155,20 @@ class _PhotographSearch(TargetSearch[Step]):
         super().__init__(
             photograph.number, target.target, places, photograph.close_up, present=target.present, spare=target.spare
         )
-        self.photograph, self.goal = photograph, target.goal
-        self._search = lambda: _search_photograph(photograph, target, Target(evidence), looks)
+        self.photograph, self.sought, self.evidence, self.most_looks = photograph, target, evidence, looks
 
     @cached_property
     def steps(self) -> list[Step]:
-        """The steps."""
-        return list(self._search())
-
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def look(self, index: int, number: int) -> Step:
-        """Return a step."""
-        return self.steps[index]
+        """Looks where the class is most probable, at most as many as given."""
+        photograph, sought = self.photograph, self.sought
+        source = CellLooks(photograph.look, photograph.grid, photograph.grid.centres, sought.target)
+        choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
+        observer, policy = Target(self.evidence), TargetPosterior(sought.target)
+        return list(rollout(source, observer, policy, sought.start, choice, most=self.most_looks))
 
     def right(self, box: Tensor) -> bool:
         """Whether an object of the class overlaps the cell of a box `(4,)`."""
-        return bool(self.goal[cell_of(box, self.photograph.grid)])
+        return bool(self.sought.goal[cell_of(box, self.photograph.grid)])
 
     def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
         """The outcome by the belief alone; the place is right if an object overlaps the cell of strongest evidence."""
@@ -195,7 +177,7 @@ class _PhotographSearch(TargetSearch[Step]):
             return outcome, None
         looks = [step.detections for step in self.steps[: index + 1]]
         decision = conclude(1, self.steps[index].belief, looks, self.photograph.grid, self.target)
-        return outcome, bool(self.goal[decision.cell])
+        return outcome, bool(self.sought.goal[decision.cell])
 
 
 def photograph_searches(

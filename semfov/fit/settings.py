@@ -28,13 +28,29 @@ class FitConfig(EyeConfig):
 
 
 @dataclass(frozen=True)
-class FitOnLooksConfig(FitConfig):
+class FitOnCellsConfig(FitConfig):
+    """Base of the settings of fits on looks from the cells of a grid.
+
+    Args:
+        columns: columns of the grid.
+        rows: rows of the grid.
+    """
+
+    columns: Side = 10
+    rows: Side = 10
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        return self.columns, self.rows
+
+
+@dataclass(frozen=True)
+class FitOnLooksConfig(FitOnCellsConfig):
     """Base of the settings of fits on looks from every cell of photographs.
 
     Args:
         data: photographs to learn from.
-        columns: columns of the grid.
-        rows: rows of the grid.
         holdout: one in every n photographs is held out for the evaluation.
         looks: number of looks in a training episode.
         astray: share of the fixations in training that are drawn at random, so that the model learns from all cells.
@@ -46,8 +62,6 @@ class FitOnLooksConfig(FitConfig):
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
-    columns: Side = 10
-    rows: Side = 10
     holdout: Annotated[int, Range(2, 10**9)] = 5
     looks: Annotated[int, Range(2, 10_000)] = 16
     astray: Share = 0.3
@@ -56,26 +70,19 @@ class FitOnLooksConfig(FitConfig):
     rate: Positive = 5e-3
     out: Path = Path("runs/fit")
 
-    @property
-    def cells(self) -> tuple[int, int]:
-        """Columns and rows of the grid."""
-        return self.columns, self.rows
-
 
 _MANY = 100
 """With at least this many photographs, one in five is held out and training takes all its steps."""
 
 
 @dataclass(frozen=True)
-class FitDetectorConfig(FitConfig):
+class FitDetectorConfig(FitOnCellsConfig):
     """Fit all models that the agent needs to your own detector.
 
     Args:
         model: the detector: a name or a file, as for `semfov.load_detector`.
         data: photographs with boxes to learn from. All of them are used unless `data.limit` or `data.ids` selects some.
         detector: options of the detector; `model` gives its name.
-        columns: columns of the grid.
-        rows: rows of the grid.
         max_target_area: classes that cover a larger share of the image are not searched for.
         holdout: one in every n photographs is held out for the evaluation and for choosing thresholds (None: one in 5,
             or one in 3 if there are fewer than 100 photographs).
@@ -95,8 +102,6 @@ class FitDetectorConfig(FitConfig):
     unused = ("name",)
     model: Path | None = None
     detector: DetectorConfig = field(default_factory=DetectorConfig)
-    columns: Side = 10
-    rows: Side = 10
     max_target_area: Positive = 0.2
     holdout: Annotated[int, Range(2, 10**9)] | None = None
     judged: Count = 100
@@ -108,11 +113,6 @@ class FitDetectorConfig(FitConfig):
     gaze: GazeModelFit = field(default_factory=GazeModelFit)
     thin: Whole = 20
     out: Path = Path("mymodels")
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """Columns and rows of the grid."""
-        return self.columns, self.rows
 
     def named(self) -> "FitDetectorConfig":
         """These settings with `model` as the detector's name, and with targets of all sizes in the photographs."""

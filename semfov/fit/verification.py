@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -22,12 +21,11 @@ from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import training_of
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
-from semfov.fit.settings import FitConfig
+from semfov.fit.settings import FitOnCellsConfig
 from semfov.io.manifest import Part
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, area_under_roc
-from semfov.runs.config import DataConfig
-from semfov.runs.settings import Count, Positive, Range, Share, Side
+from semfov.runs.settings import Count, Positive, Range, Share
 from semfov.runs.tables import mean_or_dash, share, table
 
 _LEVELS = tuple(number / 100 for number in range(50, 100))
@@ -53,17 +51,12 @@ _ABSENT = 200
 
 
 @dataclass(frozen=True)
-class FitVerificationConfig(FitConfig):
+class VerificationConfig(FitOnCellsConfig):
     """Fit the verification of targets.
 
     Args:
         data: photographs to learn from.
         detector: the detector that processes the foveated views and the closer looks.
-        target_model: learned target evidence, by name or file (None: the one for the detector and the sensor).
-        fitted: number of photographs that this evidence was fitted to (`--data.limit` of `train.fit_search` with
-            `--data.min_instances 2`); those from which it learned are left out here (None: none is left out).
-        columns: columns of the grid.
-        rows: rows of the grid.
         classes: maximum number of present classes to search for in each photograph.
         absent: maximum number of absent classes to search for (None: as many as present ones).
         max_target_area: classes that cover a larger share of the image are not searched for.
@@ -73,15 +66,8 @@ class FitVerificationConfig(FitConfig):
         false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
         folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
         seed: seed of the choice of classes and of the first fixations.
-        cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
-    unused = ("workers", "scheduler")
-    data: DataConfig = field(default_factory=DataConfig)
-    target_model: str | None = None
-    fitted: Count | None = None
-    columns: Side = 10
-    rows: Side = 10
     classes: Count = 2
     absent: Count | None = None
     max_target_area: Positive = 0.2
@@ -90,7 +76,6 @@ class FitVerificationConfig(FitConfig):
     give_up: Share = 0.2
     false_alarms: Share = 0.01
     folds: Annotated[int, Range(2, 1000)] = 5
-    out: Path = Path("runs/fit_verification")
 
 
 class _VerifiedSearch(NamedTuple):
@@ -140,7 +125,7 @@ class VerificationResult(NamedTuple):
 def fit_in_folds(
     photographs: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
-    config: FitVerificationConfig,
+    config: VerificationConfig,
     prior: Verification | None = None,
     surest: float = _LEVELS[-1],
 ) -> VerificationResult:
@@ -165,7 +150,7 @@ def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> _CloserLoo
     for search in searches:
         if search.spare:
             continue
-        for count in (each for each in search.after if each <= len(search)):
+        for count in (each for each in search.after if each <= len(search.steps)):
             candidates = search.candidates()
             for index in range(count):
                 candidates.see(search.look(index, index + 1))
@@ -193,11 +178,11 @@ def verify(
         model = folds[search.picture % len(folds)]
         places, count, ends = search.candidates(), 0, list[int]()
         verifier = Verifier(model, places, search.close_up, limits, search.most)
-        for index in range(len(search)):
+        for index in range(len(search.steps)):
             count += 1
             room = search.passes - count
             # Where passes are limited, a search ends with them, after the last closer look.
-            last = index + 1 == len(search) if room == math.inf else room <= 1
+            last = index + 1 == len(search.steps) if room == math.inf else room <= 1
             verifier.see(search.look(index, count), last=last)
             for each in verifier.look_closely(room):
                 count += not places.seen(each)
@@ -219,12 +204,12 @@ def verify(
 def _unverified(search: TargetSearch[Any], thresholds: Thresholds | None) -> _SearchEnd:
     """Decide along the looks of a search without closer looks; nothing is found without thresholds."""
     if thresholds is None:
-        return None, len(search)
-    for index in range(len(search)):
+        return None, len(search.steps)
+    for index in range(len(search.steps)):
         outcome, right = search.decided(index, thresholds)
         if outcome:
             return right, index + 1
-    return None, len(search)
+    return None, len(search.steps)
 
 
 def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, surest: float = _LEVELS[-1]) -> float:
@@ -278,11 +263,6 @@ def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None)
         model.linear.weight.copy_(weight / scale)
         model.linear.bias.copy_(bias - (weight / scale) @ mean)
     return model.eval().requires_grad_(False)
-
-
-def _shipped_mean() -> Verification:
-    """Return the mean of two shipped models (`_SHIPPED`), without thresholds: the centre of the prior."""
-    return mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
 
 
 def mean_of(models: Sequence[Verification]) -> Verification:
@@ -375,15 +355,15 @@ def _row(present: Sequence[bool], ended: Sequence[_SearchEnd]) -> list[str]:
 class VerificationFit(PartFit):
     """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
 
-    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`_shipped_mean`).
+    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`_SHIPPED`).
     """
 
     name: ClassVar[str] = "verification"
-    settings: FitVerificationConfig
+    settings: VerificationConfig
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
-        self.settings = inputs.settings(FitVerificationConfig, absent=inputs.absent)
+        self.settings = inputs.settings(VerificationConfig, absent=inputs.absent)
         judged = len(inputs.judged)
         self.tasks = {"looking": judged, "verifying": 0.5 * judged}
 
@@ -411,7 +391,8 @@ class VerificationFit(PartFit):
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
-        fitted = fit_in_folds(photographs, evidence, config, _shipped_mean(), SUREST_OF_FEW)
+        prior = mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
+        fitted = fit_in_folds(photographs, evidence, config, prior, SUREST_OF_FEW)
         assert fitted.model.thresholds is not None
         confirm = fitted.model.thresholds.confirm
         after = _scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
@@ -421,7 +402,7 @@ class VerificationFit(PartFit):
             f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
             f"{in_words(gain, 'points gained', 100)}"
         )
-        fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes, "target_model", "fitted")}
+        fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
         text = (
             "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
             "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "

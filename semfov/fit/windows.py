@@ -80,11 +80,6 @@ class _Searches(NamedTuple):
     left: Tensor
     there: Tensor
 
-    @classmethod
-    def join(cls, searches: Sequence[_Searches]) -> _Searches:
-        """Join several sets of searches."""
-        return cls(*map(torch.cat, zip(*searches, strict=True)))
-
 
 @torch.inference_mode()
 def _searches_of(
@@ -170,7 +165,7 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         passes: int,
         likely: float,
         glances: Sequence[Glance],
-        states: Sequence[WindowLook],
+        steps: Sequence[WindowLook],
         boxes: Sequence[Tensor | None],
     ) -> None:
         places = partial(CandidateBoxes, target, likely)
@@ -182,14 +177,11 @@ class _MosaicSearch(TargetSearch[WindowLook]):
             present=len(objects) > 0,
             passes=passes,
         )
-        self.looks, self.objects, self.glances, self.states, self.boxes = looks, objects, glances, states, boxes
-
-    def __len__(self) -> int:
-        return len(self.states)
+        self.looks, self.objects, self.glances, self.steps, self.boxes = looks, objects, glances, steps, boxes
 
     def look(self, index: int, number: int) -> WindowLook:
         """Return a look with the number of looks up to it."""
-        return self.states[index]._replace(number=number)
+        return self.steps[index]._replace(number=number)
 
     def right(self, box: Tensor) -> bool:
         """Whether a box `(4,)` is that of an annotated object of the class."""
@@ -197,7 +189,7 @@ class _MosaicSearch(TargetSearch[WindowLook]):
 
     def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
         """The outcome by the evidence alone; the place is that of the box with the highest score."""
-        state, box = self.states[index], self.boxes[index]
+        state, box = self.steps[index], self.boxes[index]
         presence, looked, left = (torch.tensor([each]) for each in (state.presence, box is not None, state.left))
         outcome = int(settle(presence, looked, left, thresholds))
         if OUTCOMES[outcome] != "found":
@@ -382,15 +374,13 @@ class MosaicFit:
         config = self.config
         prepare_worker()
         torch.manual_seed(config.seed)
-        searches = {
-            use: _Searches.join(
-                [
-                    _picture_searches(model, self.pictures[kind], self.opened(kind), config, f"searching, {kind}")
-                    for kind in kinds
-                ]
+        searches = {}
+        for use, kinds in self._searched().items():
+            some = (
+                _picture_searches(model, self.pictures[kind], self.opened(kind), config, f"searching, {kind}")
+                for kind in kinds
             )
-            for use, kinds in self._searched().items()
-        }
+            searches[use] = _Searches(*map(torch.cat, zip(*some, strict=True)))
         _fit_judge(model, searches["searched"], config.judging)
         rows = _judge_searches(model, searches["judged"], config)
         assert model.thresholds is not None

@@ -251,7 +251,7 @@ WHERE = ("out", "cache", "workers", "scheduler")
 
 @dataclass(frozen=True)
 class EyeConfig(WorkConfig):
-    """Looks at scenes from the cells of a grid; `cells` are its columns and rows.
+    """Looks at scenes through a fovea.
 
     Args:
         data: the scenes.
@@ -260,11 +260,6 @@ class EyeConfig(WorkConfig):
 
     data: DataConfig = field(default_factory=DataConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """Columns and rows of the grid."""
-        raise NotImplementedError(f"{type(self).__name__} has no cells")
 
 
 @dataclass(frozen=True)

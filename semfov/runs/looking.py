@@ -14,7 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import EyeConfig, LookingConfig
+from semfov.runs.config import LookingConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
@@ -22,19 +22,23 @@ from semfov.runs.store import cell_store, look_everywhere
 
 
 class Looking(SceneRun):
-    """Scenes, and an eye that looks at each of them from every cell; its detections are stored."""
+    """Scenes, and an eye that looks at each of them from every cell; its detections are stored.
 
-    config: EyeConfig
+    The settings are those of an `EyeConfig` with `cells`, the columns and rows of the grid.
+    """
 
-    def __init__(self, config: EyeConfig) -> None:
+    cells: tuple[int, int]
+
+    def __init__(self, config: Any) -> None:
         self.config = config
+        columns, rows = self.cells = config.cells
         self.check_sources()
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):
             raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
         components = len(self.scenes.classes) + 1
-        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), *config.cells, components)
+        self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), columns, rows, components)
         self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
@@ -47,7 +51,7 @@ class Looking(SceneRun):
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye and the cells."""
-        return {"eye": self.eye.settings(), "cells": [*self.config.cells]}
+        return {"eye": self.eye.settings(), "cells": [*self.cells]}
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a scene depend on."""
@@ -57,7 +61,7 @@ class Looking(SceneRun):
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""
-        return Grid(*self.config.cells, self.scenes.annotation(index).size)
+        return Grid(*self.cells, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:
         """Detections from every cell of a scene, read from the store, or computed and stored."""

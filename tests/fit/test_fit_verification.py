@@ -13,19 +13,19 @@ from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, Foveation, 
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.fit.searches import _search_photograph, open_photographs, photograph_searches
+from semfov.fit.searches import _PhotographSearch, open_photographs, photograph_searches
 from semfov.fit.verification import (
     _LEVELS,
     _SHIPPED,
     _STRENGTH,
-    FitVerificationConfig,
+    VerificationConfig,
     _CloserLooks,
-    _shipped_mean,
     _VerifiedSearch,
     choose_confirm,
     examine,
     fit,
     fit_in_folds,
+    mean_of,
     verify,
 )
 from semfov.gaze.policies import Policy
@@ -49,7 +49,7 @@ def examined(count=200, seed=0):
 def test_the_fit_minimises_the_penalised_cross_entropy(count):
     """With a prior, the penalty is the distance to it."""
     known = examined(count)
-    chosen, prior = known.fold != 1, _shipped_mean() if count == 60 else None
+    chosen, prior = known.fold != 1, shipped_mean() if count == 60 else None
     model = fit(known, chosen, prior)
     phi = known.features[chosen].double().numpy()
     mean, scale = phi.mean(0), phi.std(0, ddof=1)
@@ -80,7 +80,7 @@ def test_the_fit_ignores_the_closer_looks_that_are_held_out():
 
 
 def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without():
-    prior, distances = _shipped_mean(), []
+    prior, distances = shipped_mean(), []
     for count in (8, 80, 800, 8000):
         known = examined(count)
         near, far = fit(known, known.fold >= 0, prior), fit(known, known.fold >= 0)
@@ -94,12 +94,17 @@ def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without(
 def test_a_single_closer_look_is_not_enough():
     known = examined(4)
     with pytest.raises(DataError, match=r"expected closer looks in all folds but one, got 1; give more photographs"):
-        fit(known, known.fold == 0, _shipped_mean())
+        fit(known, known.fold == 0, shipped_mean())
+
+
+def shipped_mean():
+    """The centre of the prior."""
+    return mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
 
 
 def test_the_prior_is_the_mean_of_the_shipped_models():
     files = [read(Verification.shipped / f"{name}.safetensors", "verification")[0] for name in _SHIPPED]
-    for name, tensor in _shipped_mean().named_parameters():
+    for name, tensor in shipped_mean().named_parameters():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
 
@@ -151,7 +156,7 @@ def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
     assert chosen == (fits[0] if fits else _LEVELS[-1])
 
 
-SOUGHT = FitVerificationConfig(columns=4, rows=3, max_target_area=1.0)
+SOUGHT = VerificationConfig(columns=4, rows=3, max_target_area=1.0)
 
 
 def opened(detector, store=None):
@@ -182,10 +187,8 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
     for _ in range(2):
         for one, other in zip(live, found, strict=True):
             for sought in one.targets:
-                pairs = zip(
-                    *(_search_photograph(each, sought, Target(evidence), 5) for each in (one, other)), strict=True
-                )
-                for first, second in pairs:
+                pairs = (_PhotographSearch(each, sought, evidence, 5).steps for each in (one, other))
+                for first, second in zip(*pairs, strict=True):
                     torch.testing.assert_close(first.belief.probability(1), second.belief.probability(1))
             other.close()
     assert calls == 2 * [0, 1, 2]  # read once before each `close`
@@ -195,14 +198,14 @@ def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
     live, evidence = seen
     sought = SimpleNamespace(**{**vars(SOUGHT), "classes": 1, "absent": 0})
     few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], sought, spare=n) for n in (0, 1))
-    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     for one, other in zip(few, many, strict=True):
         assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]
         assert all(not each.present for each in other.targets if each.spare)
     assert any(each.spare for photograph in many for each in photograph.targets)
     first, second = examined_in(few, evidence, config), examined_in(many, evidence, config)
     assert torch.equal(first.features, second.features)
-    searches = list(verified_in(many, 2 * [_shipped_mean()], evidence, config))
+    searches = list(verified_in(many, 2 * [shipped_mean()], evidence, config))
     assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.targets]
 
 
@@ -211,8 +214,8 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     """The agent looks by itself and with other code, with closer looks and without."""
     found, evidence = seen
     evidence.thresholds = Thresholds(0.55, 0.3, 0.3)
-    model = _shipped_mean()
-    config = FitVerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
+    model = shipped_mean()
+    config = VerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
     model.thresholds = Thresholds(confirm, config.give_up, config.place)
     searching, exploring = (Target(evidence), Policy("non-predictive")), (Semantic(4), Policy("random"))
     agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
@@ -250,7 +253,7 @@ def test_classes_are_present_and_absent_as_the_goal_says(seen):
 
 def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
     found, evidence = seen
-    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     known = examined_in(found, evidence, config)
     assert known.features.shape == (len(known.right), 7)
     assert set(known.fold.tolist()) == {0, 1}
@@ -283,7 +286,7 @@ class Limited(Blobs):
 
 def all_of(detector, store):
     """Examine and verify the embedded scenes."""
-    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     found, evidence = opened(detector, store)
     known = examined_in(found, evidence, config)
     return known, list(verified_in(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
