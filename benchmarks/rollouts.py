@@ -6,7 +6,8 @@ import torch
 
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
-from semfov.runs.search_protocol import Trial, looks_of, run_episodes
+from semfov.episode import StoredLooks
+from semfov.runs.search_protocol import Trial, run_episodes
 from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30
@@ -32,7 +33,7 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     strategy = Strategy(observers.Semantic(CLASSES + 1), policies.Policy("non-predictive"))
 
     def run(count: int, batch: int) -> object:
-        looks = looks_of(todo[:count], detections, grid)
+        looks = StoredLooks(detections, grid, torch.tensor([episode.cue for episode in todo[:count]]))
         return run_episodes(todo[:count], strategy, looks, noise[:count], shifts=SHIFTS, batch=batch)
 
     return detections, run

@@ -17,13 +17,14 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
+from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.looks import one_thread
+from semfov.runs.looks import LOOK_SOURCES, one_thread
 from semfov.runs.samples import Samples, all_cells
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
-from semfov.runs.store import SceneStore, looks_digest
+from semfov.runs.store import SceneStore
 from semfov.runs.workers import run_tasks
 from semfov.zoom.eye import WindowEye
 
@@ -73,7 +74,7 @@ class Sampler:
             "scenes": self.scenes.fingerprint,
             **{name: getattr(config, name) for name in ("fixations", "iou", "seed", "shard")},
         }
-        self.store = SceneStore(folder, what, looks_digest(*self.sources), schema)
+        self.store = SceneStore(folder, what, modules_digest(*LOOK_SOURCES, *self.sources), schema)
 
     def make(self) -> tuple[Eye | WindowEye, Scenes]:
         """Make the eye and open the scenes."""

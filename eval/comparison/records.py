@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator
+from typing import Any
 
+from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.scene_run import SceneRun
+from semfov.runs.settings import Settings
 
 
 class StoredRecords:
@@ -40,3 +43,9 @@ class StoredRecords:
 def gather(run: SceneRun) -> StoredRecords:
     """Records of all scenes in their order, read as they are asked for, and the seconds that each stage took."""
     return StoredRecords(run.results, len(run.scenes))
+
+
+def own_settings(config: Settings, *others: str) -> dict[str, Any]:
+    """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
+    left_out = (*WHERE, "store", "data", "detector", *others)
+    return {name: value for name, value in config.plain().items() if name not in left_out}

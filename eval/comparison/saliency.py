@@ -14,9 +14,10 @@ from semfov.detection.detector import Detector
 from semfov.detection.placement import resize
 from semfov.gaze.saliency import VOCUS2, FixationDensity, IttiKoch, cell_saliency
 from semfov.gaze.saliency.cells import Reduction
+from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
-from semfov.runs.looks import one_thread
-from semfov.runs.store import SceneStore, looks_digest
+from semfov.runs.looks import LOOK_SOURCES, one_thread
+from semfov.runs.store import SceneStore
 from semfov.sensor.base import Sensor
 
 _SaliencyMap = Callable[[Tensor], Tensor]
@@ -58,7 +59,7 @@ class SaliencyStore(SceneStore):
             what["detector"] = detector
         cells = grid[0] * grid[1]
         schema = Schema({"saliency": Field(("F", cells), low=0)})
-        super().__init__(folder, what, looks_digest(*_SOURCES), schema)
+        super().__init__(folder, what, modules_digest(*LOOK_SOURCES, *_SOURCES), schema)
         self.fixations = cells if view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:

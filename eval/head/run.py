@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from eval.comparison.records import own_settings
 from eval.head.scan import Scan
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.belief import Belief
@@ -129,7 +130,7 @@ class HeadRun(SceneRun):
     def depends_on(self) -> dict[str, Any]:
         """List the eye, its models and the settings."""
         models = [self.target_evidence, self.map_evidence]
-        return {"eye": self.eye.settings(), "models": models, "settings": self.own_settings()}
+        return {"eye": self.eye.settings(), "models": models, "settings": own_settings(self.config)}
 
     def world(self, index: int) -> World:
         """The scene as a world in which the head looks around."""

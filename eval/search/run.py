@@ -9,11 +9,11 @@ import torch
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.settings import ComparedConfig
-from semfov.episode import Stopwatch
+from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, looks_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
 
@@ -61,7 +61,7 @@ class SearchRun(ComparedLooking):
         watch.lap("look")
         if not episodes:
             return records, watch.seconds
-        looks = looks_of(episodes, detections, grid)
+        looks = StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
         noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
         for name in self.policies:
             candidate = self.candidate(name, index)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
+from eval.comparison.records import own_settings
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
 from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
@@ -104,7 +105,7 @@ class ZoomRun(WindowLooking, SceneRun):
     def depends_on(self) -> dict[str, Any]:
         """List the eye, its models and the settings."""
         models = [self.evidence, self.observation]
-        settings = self.own_settings("model", "observation")
+        settings = own_settings(self.config, "model", "observation")
         return {"eye": self.eye.settings(), "models": models, "settings": settings}
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:

@@ -364,7 +364,8 @@ class _FolderFit:
         own = plain(own if isinstance(own, dict) else asdict(own))
         settings = [name, {each: own[each] for each in own.keys() - {*WHERE}}, self.inputs.config.judged, before]
         key = digest_of([self.inputs.run.key, settings])
-        result = self._read_result(name, key)
+        file = self.inputs.config.out / "progress" / f"{name}.json"
+        result = self._read_result(file, key)
         if result is None:
             try:
                 result = self.fits[name].fit()
@@ -372,17 +373,14 @@ class _FolderFit:
                 result = PartResult(
                     Part(None, None, False, f"could not be fitted: {error}"), f"Could not be fitted: {error}"
                 )
-            write_text(self._record(name), json.dumps({"key": key, **result._asdict(), "part": asdict(result.part)}))
+            write_text(file, json.dumps({"key": key, **result._asdict(), "part": asdict(result.part)}))
         results[name] = result
         return result
 
-    def _record(self, name: str) -> Path:
-        return self.inputs.config.out / "progress" / f"{name}.json"
-
-    def _read_result(self, name: str, key: str) -> PartResult | None:
+    def _read_result(self, file: Path, key: str) -> PartResult | None:
         out = self.inputs.config.out
         try:
-            record = json.loads(self._record(name).read_text(encoding="utf-8"))
+            record = json.loads(file.read_text(encoding="utf-8"))
             part = Part(**record["part"])
             whole = record["key"] == key
             whole = whole and (part.file is None or sha256(out / part.file) == part.sha256)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
+from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import Policy
@@ -40,7 +40,6 @@ from semfov.runs.search_protocol import (
     choose_classes,
     choose_searches,
     episodes_of,
-    looks_of,
     run_episodes,
     search_steps,
     tie_noise,
@@ -162,20 +161,14 @@ def _train_evidence(
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
-        for step in _searches(model, chosen, grid, config.looks, astray, generator):
+        learned, policy = Target(model, together=True), TargetPosterior(1)
+        for step in example_episodes(chosen, learned, policy, grid, config.looks, astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + evidence_objective(config, step, chosen.goal)
         return loss
 
     descend(model.parameters(), loss_of, config.steps, config.rate)
     return model.eval()
-
-
-def _searches(
-    model: TargetEvidence, examples: _TargetExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
-) -> Iterator[Step]:
-    """Search every example; see `example_episodes`."""
-    return example_episodes(examples, Target(model, together=True), TargetPosterior(1), grid, looks, astray, generator)
 
 
 def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
@@ -219,7 +212,8 @@ def _judge_evidence(
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*_JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []
-    for step in _searches(model, examples, grid, looks, 0.0, generator):
+    learned, policy = Target(model, together=True), TargetPosterior(1)
+    for step in example_episodes(examples, learned, policy, grid, looks, 0.0, generator):
         assert isinstance(step.belief, TargetBelief)
         present.append(step.belief.present)
         anywhere.append(step.belief.anywhere)
@@ -339,7 +333,7 @@ def _search_curves(
         if not episodes:
             continue
         grid = run.grid(index)
-        looks = looks_of(episodes, run.detections(index), grid)
+        looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
         noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
         for name, way in ways.items():
             with torch.inference_mode():
@@ -432,12 +426,14 @@ class EvidenceFit(PartFit):
         config, run, inputs = self.settings, self.run, self.inputs
         fit = fit_evidence(config, run)
         fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
-        learned = strategy(Target(fit.model), Policy("non-predictive"))
+        learned = Strategy(Target(fit.model), Policy("non-predictive"))
         ways = {
             "fitted": learned,
-            "raw": strategy(Semantic(inputs.components), Policy("non-predictive")),
-            "fused": strategy(inputs.semantic, Policy("non-predictive")),
+            "raw": Strategy(Semantic(inputs.components), Policy("non-predictive")),
+            "fused": Strategy(inputs.semantic, Policy("non-predictive")),
         }
+        for way in ways.values():
+            way.eval().requires_grad_(False)
         protocol, judged = inputs.protocol, inputs.judged
         curves = _search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):

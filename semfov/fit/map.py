@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -23,7 +23,7 @@ from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult, strategy
+from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
@@ -150,21 +150,13 @@ def _train_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
-        for step in _explorations(model, chosen, grid, max(counted), config.astray, generator):
+        learned, policy = LearnedMap(model, together=True), CloserLook(grid)
+        for step in example_episodes(chosen, learned, policy, grid, max(counted), config.astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + map_objective(step, chosen)
         return loss
 
     descend(model.parameters(), loss_of, config.steps, config.rate)
-
-
-def _explorations(
-    model: MapEvidence, examples: _MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
-) -> Iterator[Step]:
-    """Explore every example; see `example_episodes`."""
-    return example_episodes(
-        examples, LearnedMap(model, together=True), CloserLook(grid), grid, looks, astray, generator
-    )
 
 
 def map_objective(step: Step, examples: _MapExamples) -> Tensor:
@@ -191,8 +183,9 @@ def _train_gain(config: FitMapConfig, model: MapEvidence, examples: _MapExamples
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         before: Step | None = None
         loss = chosen.score.new_zeros(())
+        learned, policy = LearnedMap(model, together=True), CloserLook(grid)
         with torch.no_grad():
-            steps = list(_explorations(model, chosen, grid, config.looks, config.astray, generator))
+            steps = [*example_episodes(chosen, learned, policy, grid, config.looks, config.astray, generator)]
         for step in steps:
             if before is not None:
                 belief = before.belief
@@ -224,7 +217,8 @@ def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
     answers = examples.answers
     some = ~answers[..., 0]
     before: tuple[Tensor, Tensor] | None = None
-    for step in _explorations(model, examples, grid, max(_JUDGED), 0.0, generator):
+    learned, policy = LearnedMap(model, together=True), CloserLook(grid)
+    for step in example_episodes(examples, learned, policy, grid, max(_JUDGED), 0.0, generator):
         belief = step.belief
         assert isinstance(belief, MapBelief)
         p, now = belief.probabilities, _right(step, answers)
@@ -350,10 +344,12 @@ class MapFit(PartFit):
         fit = fit_map_evidence(self.settings, run)
         fovea = self.config.sensor.fovea
         ways = {
-            "fitted": strategy(LearnedMap(fit.model), Policy("closer-look", fovea=fovea)),
-            "raw": strategy(Semantic(inputs.components), Policy("random")),
-            "fused": strategy(inputs.semantic, Policy("closer-look", fovea=fovea)),
+            "fitted": Strategy(LearnedMap(fit.model), Policy("closer-look", fovea=fovea)),
+            "raw": Strategy(Semantic(inputs.components), Policy("random")),
+            "fused": Strategy(inputs.semantic, Policy("closer-look", fovea=fovea)),
         }
+        for way in ways.values():
+            way.eval().requires_grad_(False)
         protocol = inputs.protocol
         curves = _explore_curves(run, inputs.judged, ways, protocol)
         at = min(MAP_SHIFTS, protocol.shifts)

@@ -11,9 +11,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import torch
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import Observer, Semantic
+from semfov.belief.observers import Semantic
 from semfov.fit.settings import FitConfig, FitDetectorConfig
-from semfov.gaze.policies import Policy
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
 from semfov.model_folder import KINDS, FolderModel
@@ -22,7 +21,6 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
-from semfov.strategy import Strategy
 
 _Config = TypeVar("_Config", bound=FitConfig)
 
@@ -118,8 +116,3 @@ class PartFit(ABC):
         file = f"{self.name}.safetensors"
         model.save(self.config.out / file)
         return Part(file, sha256(self.config.out / file), used, why)
-
-
-def strategy(observer: Observer, policy: Policy) -> Strategy:
-    """Make a strategy in evaluation mode, whose parameters need no gradients."""
-    return Strategy(observer, policy).eval().requires_grad_(False)

@@ -23,11 +23,13 @@ from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+from semfov.io.code import modules_digest
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema
+from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.scene_run import digest_of, store_folder
 from semfov.runs.settings import Count, Range, Settings
-from semfov.runs.store import SceneStore, looks_digest
+from semfov.runs.store import SceneStore
 
 LONGEST = 20
 """Number of fixations of a scanpath that are used, the first ones."""
@@ -164,7 +166,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
         for n, name in enumerate(source.layers)
     }
     schema = Schema(fields | {"placed": Field((8,), torch.float64)})
-    code = looks_digest("semfov.gaze.saliency", "semfov.detection", __name__)
+    code = modules_digest(*LOOK_SOURCES, "semfov.gaze.saliency", "semfov.detection", __name__)
     store = SceneStore(store_folder(data.cache) / "viewing", source.what, code, schema)
     groups = []
     for number, root in enumerate(data.pictures):

@@ -82,11 +82,6 @@ class Exploration(NamedTuple):
         """Number of looks."""
         return len(self.promised)
 
-    @property
-    def shows(self) -> bool:
-        """Whether all looks show at least half of the annotated objects: elsewhere most are too small for any look."""
-        return 2 * int((self.objects[self.looks][1] > 0).sum()) >= self.held
-
     def sums(self, certainty: Certainty, number: int) -> tuple[float, float]:
         """The sums of the probabilities of the objects after the first look, and after a number of them."""
         first, after = (float(certainty.probability(self.objects[n][0]).double().sum()) for n in (1, number))
@@ -233,11 +228,13 @@ def left_out(
         if not others:
             continue
         certainty = fit(others)
+        # Where all looks show less than half of the annotated objects, most are too small for any look.
+        shown = [each for each in some if 2 * int((each.objects[each.looks][1] > 0).sum()) >= each.held]
         for after in checked:
             claims = [
                 (*claim, each.held)
-                for each in some
-                if each.target is not None and each.shows
+                for each in shown
+                if each.target is not None
                 for claim in [each.number(certainty, min(after, each.looks))]
                 if claim is not None
             ]

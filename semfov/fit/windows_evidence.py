@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Annotation, Scenes
+from semfov.data.scene import Scenes
 from semfov.detection.objects import LEAST
 from semfov.fit.descent import descend
 from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, Survey, pool
-from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.glances import Glances, Window, around, half_steps
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 
@@ -57,15 +57,6 @@ def _closer_windows(
             yield closer, steps, (x1, y1, x2, y2)
 
 
-def _found_by(glance: Glance, annotation: Annotation, score: float = DETECTION_SCORE, iou: float = 0.5) -> Tensor:
-    """Find the objects that a look shows with a detection of their class; → `(M,)`."""
-    detections = glance.detections
-    sure = detections.confidence[0] >= score
-    boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
-    hits = (box_iou(boxes, annotation.boxes) >= iou) & (labels[:, None] == annotation.labels)
-    return hits.any(0) if len(boxes) else torch.zeros(len(annotation.boxes), dtype=torch.bool)
-
-
 def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
     """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
     tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
@@ -74,12 +65,17 @@ def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
 
 
 def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:
-    """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`."""
-    annotation = pictures.annotation(index)
-    looks = [
-        _WindowResult(glance.window, glance.gist, glance.show, _found_by(glance, annotation))
-        for glance in glances.see(windows_of(pictures, index, glances.lattice))
-    ]
+    """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`.
+
+    A look finds the objects that it shows with a detection of their class.
+    """
+    annotation, looks = pictures.annotation(index), []
+    for glance in glances.see(windows_of(pictures, index, glances.lattice)):
+        detections = glance.detections
+        sure = detections.confidence[0] >= DETECTION_SCORE
+        boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
+        hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
+        looks.append(_WindowResult(glance.window, glance.gist, glance.show, hits.any(0)))
     return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, ClassVar
@@ -30,7 +30,7 @@ from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance, Glances
+from semfov.zoom.glances import Glance
 from semfov.zoom.slices import ranked, usual_slices
 
 _ENOUGH = 16
@@ -45,9 +45,6 @@ _ALONE = 120
 """Largest number of photographs that are searched by themselves."""
 _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
-
-_Way = Callable[[Glances], Iterator[WindowStep[Any]]]
-"""A way of looking for all objects of a picture."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +121,11 @@ class WindowsFit(PartFit):
         if isinstance(config, _LeftOut):
             return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
         with one_thread():
-            return self._fit(config)
-
-    def _fit(self, config: FitMosaicsConfig) -> PartResult:
-        fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
-        model, figures = _fit_mosaics(fit)
-        judged, opened = fit.mosaics["judged"], fit.opened("judged")
-        curves = {
-            "fitted": _photograph_recalls(judged, opened, lambda glances: find_everything(glances, model)),
-            "raw": _photograph_recalls(judged, opened, _in_raw_order),
-        }
+            fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
+            model, figures = _fit_mosaics(fit)
+            judged, opened = fit.mosaics["judged"], fit.opened("judged")
+            ways = {"fitted": model, "raw": None}
+            curves = {name: _photograph_recalls(judged, opened, way) for name, way in ways.items()}
         gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
         at = _RECALL_PASSES[-1] - 1
         why = (
@@ -172,14 +164,13 @@ def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
     return model, "\n".join(lines)
 
 
-def _in_raw_order(glances: Glances) -> Iterator[WindowStep[Any]]:
-    """Look at slices in the order of the overview's scores, as an agent without evidence does."""
-    return look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
-
-
 @torch.inference_mode()
-def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: _Way) -> FloatArray:
-    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`."""
+def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], model: GlimpseEvidence | None) -> FloatArray:
+    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`.
+
+    Without a model the looks are at slices in the order of the overview's scores, as an agent without evidence makes
+    them.
+    """
     hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
@@ -188,7 +179,9 @@ def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], way: 
         )
         np.add.at(there, photograph, 1)
         history: list[Glance] = []
-        turns = way(glances)
+        turns: Iterator[WindowStep[Any]] = look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
+        if model is not None:
+            turns = find_everything(glances, model)
         for number in range(_RECALL_PASSES[-1]):
             turn = next(turns, None)
             if turn is not None:

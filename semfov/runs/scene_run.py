@@ -14,14 +14,11 @@ from typing import Any
 from semfov.data.scene import Scenes
 from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
-from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.store import versions
 from semfov.runs.workers import run_tasks
 
 _log = logging.getLogger(__name__)
-
-_BESIDES = (*WHERE, "store", "data", "detector")
 
 
 class SceneRun(ABC):
@@ -48,10 +45,6 @@ class SceneRun(ABC):
     @abstractmethod
     def depends_on(self) -> dict[str, Any]:
         """List the fitted models and the settings that the outcomes depend on, beside scenes and code."""
-
-    def own_settings(self, *others: str) -> dict[str, Any]:
-        """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
-        return {name: value for name, value in self.config.plain().items() if name not in (*_BESIDES, *others)}
 
     @property
     def results(self) -> SceneResults:

@@ -141,11 +141,6 @@ def tie_noise(scenes: Scenes, episode: Trial, cells: int, protocol: ProtocolConf
     return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
 
 
-def looks_of(episodes: Sequence[Trial], detections: Detections, grid: Grid) -> StoredLooks:
-    """The looks of episodes of one scene, which all policies share."""
-    return StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
-
-
 def run_episodes(
     episodes: Sequence[Trial],
     strategy: Strategy,

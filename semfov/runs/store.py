@@ -201,8 +201,3 @@ def versions() -> dict[str, object]:
         "kornia": version("kornia"),
         "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
     }
-
-
-def looks_digest(*more: str) -> str:
-    """Digest of the source code that turns an image into detections; a store is not reused after a change of it."""
-    return modules_digest(*LOOK_SOURCES, *more)

@@ -19,12 +19,11 @@ from semfov.fit.evidence import (
     _evidence_report,
     _judge_evidence,
     _make_examples,
-    _searches,
     _train_evidence,
     choose_thresholds,
     evidence_objective,
 )
-from semfov.fit.examples import _ExampleLooks
+from semfov.fit.examples import _ExampleLooks, example_episodes
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.search_protocol import choose_classes
@@ -119,7 +118,8 @@ def test_training_searches_visit_every_cell_once(examples):
     model = TargetEvidence(4, 4, components=len(CLASSES) + 1).requires_grad_(False)
     for astray in (0.0, 0.5, 1.0):
         generator = torch.Generator().manual_seed(0)
-        steps = list(_searches(model, examples, GRID, 30, astray, generator))
+        observer, policy = Target(model, together=True), TargetPosterior(1)
+        steps = [*example_episodes(examples, observer, policy, GRID, 30, astray, generator)]
         assert len(steps) == CELLS
         cells = torch.stack([step.cell for step in steps])
         assert torch.equal(cells.sort(0).values, torch.arange(CELLS)[:, None].expand_as(cells))

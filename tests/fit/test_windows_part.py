@@ -9,7 +9,7 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _in_raw_order, _photograph_recalls
+from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
@@ -19,6 +19,8 @@ from semfov.runs.progress import WholeBar
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom.episode import look_by_look
+from semfov.zoom.slices import ranked, usual_slices
 from tests.colours import COLOURS, write_home
 from tests.small import Tiles
 
@@ -117,7 +119,7 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
     shares = {}
     for index, glances in enumerate(opened):
         tiles = mosaics.tiles(index)
-        looks = [turn.glance for turn in _in_raw_order(glances)]
+        looks = [turn.glance for turn in look_by_look(glances, ranked(usual_slices(glances.lattice)), None)]
         found = torch.stack([found_in(looks[:n], mosaics.annotation(index)) for n in range(1, len(looks) + 1)], -1)
         # When all slices were looked at, recall stays the same.
         assert len(looks) < _RECALL_PASSES[-1]
@@ -127,4 +129,4 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
             shares.setdefault(tile.scene, []).append(part.mean(0))
     expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
     assert expected.amax() > 0
-    torch.testing.assert_close(torch.from_numpy(_photograph_recalls(mosaics, opened, _in_raw_order)), expected)
+    torch.testing.assert_close(torch.from_numpy(_photograph_recalls(mosaics, opened, None)), expected)

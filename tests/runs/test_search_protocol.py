@@ -10,9 +10,10 @@ from eval.chance import random_search
 from semfov import Detections, Grid, fusion, policies
 from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
+from semfov.episode import StoredLooks
 from semfov.metrics.episodes import cumulative_performance
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.search_protocol import episodes_of, looks_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import episodes_of, run_episodes, tie_noise
 from semfov.strategy import Strategy
 from tests.small import FixedLook
 
@@ -58,13 +59,16 @@ GRID = Grid(5, 5, (100, 100))
 NOTHING = Detections.empty(25, 3)
 
 
+def stored(episodes):
+    """Looks that show nothing."""
+    return StoredLooks(NOTHING, GRID, torch.tensor([episode.cue for episode in episodes]))
+
+
 def run(scenes, look, policy, protocol, batch=1024, index=0):
     episodes = episodes_of(scenes, index, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
     candidate = Strategy(FixedLook(look), policy)
-    outcomes = run_episodes(
-        episodes, candidate, looks_of(episodes, NOTHING, GRID), noise, shifts=protocol.shifts, batch=batch
-    )
+    outcomes = run_episodes(episodes, candidate, stored(episodes), noise, shifts=protocol.shifts, batch=batch)
     return episodes, noise, outcomes
 
 
@@ -120,7 +124,7 @@ class Unread(FixedLook):
 def test_a_search_that_does_not_depend_on_the_belief_maintains_none(scenes, look):
     protocol = ProtocolConfig(starts=4, shifts=9)
     episodes, noise, expected = run(scenes, look, policies.Policy("random"), protocol)
-    looks, candidate = looks_of(episodes, NOTHING, GRID), Strategy(Unread(look), policies.Policy("random"))
+    looks, candidate = stored(episodes), Strategy(Unread(look), policies.Policy("random"))
     assert run_episodes(episodes, candidate, looks, noise, shifts=9, batch=8) == expected
     for episode, random, outcome in zip(episodes, noise, expected, strict=True):
         cells = [episode.start]
@@ -190,6 +194,6 @@ def test_a_search_ends_when_no_cell_is_left(scenes, look):
     hidden = [episodes[0]._replace(goal=())]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
     candidate = Strategy(FixedLook(look), policies.Policy("random"))
-    cells, found_at = run_episodes(hidden, candidate, looks_of(hidden, NOTHING, GRID), noise, shifts=40, batch=8)[0]
+    cells, found_at = run_episodes(hidden, candidate, stored(hidden), noise, shifts=40, batch=8)[0]
     assert found_at == -1
     assert sorted(cells) == list(range(25))

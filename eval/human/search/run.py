@@ -16,11 +16,11 @@ from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
-from semfov.episode import Stopwatch
+from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Trial, looks_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, run_episodes, tie_noise
 from semfov.runs.settings import Count, Positive, Range, Settings
 
 
@@ -106,7 +106,7 @@ class PeopleSearchRun(ComparedLooking):
         start = int(grid.cell_of(torch.tensor(self.config.screen.start)))
         (target,) = self.scenes.targets(index)
         episode = Trial(index, target, target, 0, start, goal, True)
-        looks = looks_of([episode], detections, grid)
+        looks = StoredLooks(detections, grid, torch.tensor([target]))
         noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
         records: list[ResultRecord] = []
         for policy in self.policies:
