@@ -292,7 +292,7 @@ def _scene_answers(views: Views, places: Boxes, labels: Tensor, classes: int) ->
     """
     world = views.world
     samples = places.samples()
-    cells = world.cell_of(samples.flatten(0, 1)).view(samples.shape[:2])
+    cells = world.scene.cell_of(world.pixels_of(samples.flatten(0, 1))).view(samples.shape[:2])
     overlap = torch.zeros(len(places), len(world.scene), dtype=torch.bool).scatter(-1, cells, True)
     overlap |= places.contain(world.centres)
     overlap &= views.reachable

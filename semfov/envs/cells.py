@@ -196,30 +196,27 @@ class CellGazes(Gazes):
         self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])
-        fresh = self._attend(Memory.empty(self.looks, self.observer, len(rows)), rows)
-        self.memory = self.memory.put(rows, fresh) if self._begun else fresh
-        self.result[rows] = self._rate(rows)
         self._steps, self._stimulus = [], None
-        self._keep()
+        self._see(rows, rows, Memory.empty(self.looks, self.observer, len(rows)))
 
     @torch.inference_mode()
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
         fresh = ~self.memory.visited[rows, actions]
         self.cell[rows] = actions
         new = rows[fresh]
-        if len(new) == len(self.episodes):
-            self.memory = self._attend(self.memory, new)
-        elif len(new):
-            self.memory = self.memory.put(new, self._attend(self.memory[new], new))
-        self._keep()
-        self.result[rows] = self._rate(rows)
+        self._see(rows, new, self.memory if len(new) == len(self.episodes) else self.memory[new])
         return self.result[rows] == 1 if self.searching else self.memory.visited[rows].all(-1)
 
-    def _attend(self, memory: Memory, rows: Tensor) -> Memory:
-        return attend(self.looks, self.observer, memory, rows, self.cell[rows], self.points(rows))[1]
-
-    def _keep(self) -> None:
-        """Keep the last look of the first episode."""
+    def _see(self, rows: Tensor, new: Tensor, memory: Memory) -> None:
+        """Look in the rows `new`, whose state is `memory`, rate all rows, and keep the last look of the first one."""
+        if len(new):
+            memory = attend(self.looks, self.observer, memory, new, self.cell[new], self.points(new))[1]
+            self.memory = memory if len(new) == len(self.episodes) else self.memory.put(new, memory)
+        right = self._right[rows]
+        if self.searching:
+            self.result[rows] = right[torch.arange(len(rows)), self.cell[rows]].float()
+        else:
+            self.result[rows] = count_right(self._all_or(rows).class_probabilities(), right) / right.any(-1).sum(-1)
         if not self.pictures:
             return
         detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
@@ -239,10 +236,3 @@ class CellGazes(Gazes):
     def _all_or(self, rows: Tensor) -> Belief:
         """The belief of some rows, without a copy where these are all."""
         return self.memory.belief if len(rows) == len(self.episodes) else self.memory.belief[rows]
-
-    def _rate(self, rows: Tensor) -> Tensor:
-        """Result of the task: is the gaze on the goal, or the share of the cells with objects that are right."""
-        right = self._right[rows]
-        if self.searching:
-            return right[torch.arange(len(rows)), self.cell[rows]].float()
-        return count_right(self._all_or(rows).class_probabilities(), right) / right.any(-1).sum(-1)

@@ -81,7 +81,7 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any], EzPickle):
             DataError: no scene has anything to look for.
         """
         super().reset(seed=seed)
-        _check_dictionary(options)
+        check(options is None or isinstance(options, dict), "options", "a dictionary", f"a {type(options).__name__}")
         self.gazes.begin(_ROW, [self.gazes.choose(self.np_random, options or {})])
         self._over = False
         return self._observed()
@@ -102,11 +102,11 @@ class EpisodeEnv(gymnasium.Env[Arrays, Any], EzPickle):
         chosen = self.gazes.action(action)
         if self._over:
             raise InputError("step: expected an episode in progress, got none; call reset first")
-        score = self.gazes.move(_ROW, chosen)
-        terminated, truncated = bool(score.terminated), bool(score.truncated)
+        reward, *ends = self.gazes.move(_ROW, chosen)
+        terminated, truncated = map(bool, ends)
         self._over = terminated or truncated
         observation, info = self._observed()
-        return observation, float(score.reward), terminated, truncated, info
+        return observation, float(reward), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the last look: the scanpath, the foveated view and the belief, or the windows and found objects.
@@ -307,11 +307,6 @@ def _scenery_or_open(
     return open_it(*task, **options) if scenery is None else scenery
 
 
-def _check_dictionary(options: object) -> None:
-    """Raise `InputError` for options of a reset that have no names."""
-    check(options is None or isinstance(options, dict), "options", "a dictionary", f"a {type(options).__name__}")
-
-
 def _first(arrays: Arrays) -> Arrays:
     """The first entry of each array."""
     one = {name: _first(value) if isinstance(value, dict) else value[0] for name, value in arrays.items()}
@@ -419,7 +414,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
             for row, one in enumerate(seeds):
                 if one is not None:
                     self._randoms[row] = seeding.np_random(one)[0]
-        _check_dictionary(options)
+        check(options is None or isinstance(options, dict), "options", "a dictionary", f"a {type(options).__name__}")
         remaining = dict(options or {})
         mask = remaining.pop("reset_mask", None)
         if mask is not None:
@@ -459,8 +454,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         reward, last = torch.zeros(self.num_envs, dtype=torch.float64), {}
         going, resting = (~over).nonzero()[:, 0], over.nonzero()[:, 0]
         if len(going):
-            score = self.gazes.move(going, chosen[going])
-            reward[going], self._ended[:, going] = score.reward, torch.stack([score.terminated, score.truncated])
+            reward[going], *ends = self.gazes.move(going, chosen[going])
+            self._ended[:, going] = torch.stack(ends)
         if mode == AutoresetMode.NEXT_STEP:
             self._restart(resting)
             self._ended[:, resting] = False

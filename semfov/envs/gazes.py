@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,21 +20,11 @@ from semfov.errors import check, check_number, check_whole
 Arrays = dict[str, Any]
 
 
-class Score(NamedTuple):
-    """Reward and end of n episodes after a gaze shift; reward `(n,)`, terminated `(n,)`, truncated `(n,)`."""
-
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-
-
 class Gazes(ABC):
-    """A batch of episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
+    """A batch of B episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
 
-    `result` is that of the task so far, from 0 to 1: in a search 1 once the target is found, in an exploration the
-    fraction that is right or found.
-
-    Shapes: targets `(B,)`, shift `(B,)`, result `(B,)`.
+    `result` `(B,)` is that of the task so far, from 0 to 1: in a search 1 once the target is found, in an exploration
+    the fraction that is right or found.
     """
 
     coordinates: ClassVar[int]
@@ -96,14 +86,14 @@ class Gazes(ABC):
         self._enter(rows, episodes)
         self._begun = True
 
-    def move(self, rows: Tensor, actions: Tensor) -> Score:
-        """Move the gaze of the rows `(n,)`, and look."""
+    def move(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Move the gaze of the rows `(n,)`, and look; reward, terminated and truncated, each `(n,)`."""
         self.shift[rows] += 1
         before = self.result[rows]
         over = self._look(rows, actions)
         gain = self.result[rows] - before
         truncated = ~over & (self.shift[rows] >= self.scenery.shifts)
-        return Score(self.find * gain.double() - self.price, over, truncated)
+        return self.find * gain.double() - self.price, over, truncated
 
     def observe(self, rows: Tensor) -> Arrays:
         """Observations of the rows `(n,)`, each array `(n, ...)`."""

@@ -14,7 +14,7 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interp
 
 from semfov.agents.windows import WindowEpisode
 from semfov.detection.detections import Detections
-from semfov.envs.gazes import Gazes, Score
+from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
@@ -26,11 +26,7 @@ _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 
 
 class _WindowEpisode(NamedTuple):
-    """A search in a large picture, or its exploration.
-
-    >>> _WindowEpisode(scene=3, target=16).target
-    16
-    """
+    """A search in a large picture, or its exploration, for which the target is 0."""
 
     scene: int
     target: int
@@ -65,16 +61,20 @@ class WindowGaze(Gazes):
 
     def action(self, action: Any) -> Tensor:
         """Check an action; returns a batch of one."""
-        fits = self.action_space.contains(action if isinstance(action, np.ndarray) else _array(action))
+        try:
+            place = np.asarray(action, dtype=np.float64)
+        except (ValueError, TypeError):  # it has no numbers
+            place = np.empty(0)
+        fits = self.action_space.contains(action if isinstance(action, np.ndarray) else place)
         check(fits, "action", "(x, y, magnification), each from 0 to 1", repr(action))
-        return torch.from_numpy(np.asarray(action, dtype=np.float64))[None]
+        return torch.from_numpy(place)[None]
 
-    def move(self, rows: Tensor, actions: Tensor) -> Score:
+    def move(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Look at another window; the looks are stored at the end of an episode."""
-        score = super().move(rows, actions)
-        if score.terminated or score.truncated:
+        reward, terminated, truncated = super().move(rows, actions)
+        if terminated or truncated:
             self.glances.save()
-        return score
+        return reward, terminated, truncated
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """The probability that closer looks find an object, and how closely each place was looked at."""
@@ -164,11 +164,3 @@ def _action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)
     return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)
-
-
-def _array(action: Any) -> Any:
-    """An action as an array; as it is where it has no numbers."""
-    try:
-        return np.asarray(action, dtype=np.float64)
-    except (ValueError, TypeError):
-        return np.empty(0)

@@ -178,12 +178,6 @@ SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike
 def is_scene(picture: object) -> bool:
     """Whether this is a scene to look around in, and not a picture: `Panorama`, `Flat` or a camera that turns.
 
-    Args:
-        picture: any object.
-
-    Returns:
-        Whether it has a way to look in a direction.
-
     >>> is_scene(Flat(torch.rand(3, 48, 64))), is_scene(torch.rand(3, 48, 64)), is_scene("street.jpg")
     (True, False, False)
     """

@@ -5,7 +5,6 @@ Panoramas lie around the viewer, and large pictures in front of it.
 
 import math
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -43,7 +42,7 @@ def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(field) for field in fields)
 
 
-class World(ABC):
+class _Scene:
     """Base of the scenes that a head looks around in: their geometry, and the view from each pose.
 
     A pose of the head has three numbers, all in degrees: pan to the right, tilt up, and the field of view across. A
@@ -81,46 +80,6 @@ class World(ABC):
         """The view `(3, h, w)` in a direction, pan to the right and tilt up in degrees, of a field of view across."""
         return self.view(torch.tensor([*direction, field]))[0]
 
-    @abstractmethod
-    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels `(N, 2)` of the view from a pose at points `(N, D)`, and whether they are inside it `(N,)`."""
-
-    @abstractmethod
-    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Points `(N, D)` of the scene that pixels `(N, 2)` of the view from a pose show."""
-
-    def cell_of(self, points: Tensor) -> Tensor:
-        """Cells `(N,)` of the scene that contain points `(N, D)`."""
-        return self.scene.cell_of(self.pixels_of(points))
-
-    @abstractmethod
-    def pixels_of(self, points: Tensor) -> Tensor:
-        """Positions `(N, 2)` of points `(N, D)` in the scene's picture."""
-
-    @abstractmethod
-    def angles_of(self, points: Tensor) -> Tensor:
-        """Directions of points `(N, D)`, as a head would turn to them: pan right and tilt up `(N, 2)`."""
-
-    @abstractmethod
-    def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angles `(...)` in degrees by which the head turns between poses `(..., 3)`."""
-
-    @abstractmethod
-    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angles `(...)` in degrees by which the eye turns between pixels `(..., 2)` of a view."""
-
-    @abstractmethod
-    def poses(self, field: float) -> list[list[Tensor]]:
-        """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene."""
-
-    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
-        """Regions of the scene that boxes `(M, 4)` in the view from a pose cover."""
-        return Boxes(self.boxes(boxes, pose))
-
-    @abstractmethod
-    def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Smallest boxes `(M, 4)` of the scene's picture around those of a view; a seam does not cut them."""
-
     def image(self) -> Tensor | LargePicture | None:
         """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""
         return self._drawn
@@ -133,7 +92,7 @@ def _angle_between(one: Tensor, other: Tensor) -> Tensor:
     return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
 
 
-class Sphere(World):
+class Sphere(_Scene):
     """Directions around a perspective camera (`semfov.sensor.sphere.Camera`), without anything to see.
 
     A pose is pan (yaw), tilt (pitch) and horizontal field of view in degrees. Points are unit directions, so D is 3.
@@ -167,35 +126,38 @@ class Sphere(World):
         self.area = weight / weight.mean()
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels at which directions are seen."""
+        """Pixels `(N, 2)` of the view from a pose at directions `(N, 3)`, and whether they are inside it `(N,)`."""
         return Camera(pose, self.size).points(points)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Directions of pixels."""
+        """Directions `(N, 3)` that pixels `(N, 2)` of the view from a pose show."""
         return Camera(pose, self.size).directions(points)
 
     def pixels_of(self, points: Tensor) -> Tensor:
-        """Pixels of the panorama at directions."""
+        """Pixels `(N, 2)` of the panorama at directions `(N, 3)`."""
         return panorama_points(points, self.picture)
 
     def angles_of(self, points: Tensor) -> Tensor:
-        """Pan from -180 to 180 degrees, and tilt."""
+        """Pan from -180 to 180 degrees, and tilt, as a head would turn to directions `(N, 3)`, `(N, 2)`."""
         x, y, z = points.unbind(-1)
         return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angle between the optical axes of two cameras."""
+        """Angles `(...)` in degrees between the optical axes of two cameras, for poses `(..., 3)`."""
         middle = torch.tensor([[0.0, 0.0]])
         return _angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angle between the directions of two pixels."""
+        """Angles `(...)` in degrees by which the eye turns between pixels `(..., 2)` of a view."""
         camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
         rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
         return _angle_between(*rays)
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Rings of poses around the viewer, or arcs of them between the limits of pan."""
+        """Rings of poses around the viewer, or arcs of them between the limits of pan, half a window apart.
+
+        Every second pose of every second ring tiles the scene.
+        """
         high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
         middle, reach = (self.tilt[0] + self.tilt[1]) / 2, (self.tilt[1] - self.tilt[0]) / 2
         number = math.floor(reach / (high / 2))
@@ -213,11 +175,11 @@ class Sphere(World):
         return rings
 
     def places(self, boxes: Tensor, pose: Tensor) -> Regions:
-        """Regions of the sphere."""
+        """Regions of the sphere that boxes `(M, 4)` in the view from a pose cover."""
         return Regions(boxes, Camera(pose.expand(len(boxes), 3), self.size))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Smallest boxes around the regions in the panorama."""
+        """Smallest boxes `(M, 4)` in the panorama around boxes of a view; a seam does not cut them."""
         return self.places(boxes, pose).panorama_boxes(self.picture)
 
 
@@ -280,7 +242,7 @@ class Panorama(Sphere):
         return sample(self._source, pose, self.size).clamp(0, 1), pose
 
 
-class Flat(World):
+class Flat(_Scene):
     """A large picture in front of the viewer, seen through a window that moves over it.
 
     The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
@@ -403,6 +365,14 @@ class Flat(World):
         across, down = (middles(*pair) for pair in zip(self.picture, (width, height), strict=True))
         return [[torch.tensor([x, -y, field]) for x in across] for y in down]
 
+    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
+        """Regions of the picture that boxes `(M, 4)` in the view from a pose cover."""
+        return Boxes(self.boxes(boxes, pose))
+
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Boxes of the picture."""
+        """Boxes `(M, 4)` of the picture."""
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
+
+
+World = Sphere | Flat
+"""A scene of either kind: both have the same methods."""

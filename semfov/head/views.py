@@ -52,7 +52,7 @@ class Views:
         self.view_grid, self.cells = Grid(CELL_POINTS, CELL_POINTS, (wide, high)), CELL_POINTS**2
         self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
-        self.gaze_cell = world.cell_of(self.gaze)
+        self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         centres = self.view_grid.centres
         # For each field of view, angles between the cells of a view, `(cells, cells)`.
         self._shifts = [world.shift(centres[:, None], centres[None], field) for field in fields]

@@ -114,8 +114,12 @@ class _Look:
             if not differs.any():
                 return
             changed = _extent(differs)
-        if differs.any():
-            self._cover(_extent(differs))
+        if differs.any():  # then the scores count less, by the share that is left
+            if self.visible is self.scores:
+                self.visible = self.scores.copy()
+            x1, y1, x2, y2 = _extent(differs)
+            here = slice(y1, y2), slice(x1, x2)
+            np.multiply(self.scores[here], self.left[here][..., None], out=self.visible[here])
         if not self.tables:
             return
         places = [table.holding(changed) for table in self.tables.values()]
@@ -124,18 +128,13 @@ class _Look:
         part = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
         pools = pool_spans(torch.from_numpy(self.visible[part]), [table.span for table in self.tables.values()])
         for (level, table), (down, across), maps in zip(self.tables.items(), places, pools, strict=True):
-            at = _shifted(down, below.start), _shifted(across, beside.start)
+            at = tuple(
+                slice(here.start - start, here.stop - start)
+                for here, start in ((down, below.start), (across, beside.start))
+            )
             top, summary = (values[at].flatten(0, 1) for values in maps)
             facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
             yield _Pooled(level - self.gist.level, top, summary, facts, stale)
-
-    def _cover(self, changed: _Box) -> None:
-        """Multiply the scores by the share that is left to see, where it has changed."""
-        if self.visible is self.scores:
-            self.visible = self.scores.copy()
-        x1, y1, x2, y2 = changed
-        here = slice(y1, y2), slice(x1, x2)
-        np.multiply(self.scores[here], self.left[here][..., None], out=self.visible[here])
 
     def _left_of(self, left: Cells) -> Cells:
         """Share of each cell of the gist that is left to see, `(rows, columns)`."""
@@ -238,11 +237,6 @@ class _WindowOdds:
             place[:] = odds[: place.shape[0], : place.shape[1]]
 
 
-def _shifted(part: slice, start: int) -> slice:
-    """A part of an array, in an array that begins at `start`."""
-    return slice(part.start - start, part.stop - start)
-
-
 _SLIVER = 0.25
 """Share of a window: where less is not blank, little counts as little, and the edge of a scan takes no look."""
 
@@ -256,13 +250,9 @@ class Rates(Protocol):
     foresight: float
     """Share of what still closer looks would find in a window that counts towards its value."""
 
-    def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
-        """See `GlimpseEvidence.rates`."""
-        ...
+    def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor: ...
 
-    def taper(self, span: int) -> Tensor:
-        """See `GlimpseEvidence.taper`."""
-        ...
+    def taper(self, span: int) -> Tensor: ...
 
 
 class _WindowSums:

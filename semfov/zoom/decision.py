@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence, features
 from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
-from semfov.zoom.lattice import CELLS, Lattice
+from semfov.zoom.lattice import CELLS
 
 
 class _LookFacts(NamedTuple):
@@ -28,19 +28,6 @@ class _LookFacts(NamedTuple):
     named: float
     found: float
     box: Tensor | None
-
-    @classmethod
-    def of(cls, glance: Glance, target: int, lattice: Lattice) -> Self:
-        """The facts of a look."""
-        score = float(glance.show[target - 1])
-        closest = score if glance.window.level == lattice.levels - 1 else 0.0
-        detections = glance.detections
-        scores = detections.scores[0, :, target].detach().float().numpy()
-        if not len(scores):
-            return cls(score, closest, 0.0, 0.0, None)
-        named = scores[detections.labels[0].numpy() == target].max(initial=0)
-        place = int(scores.argmax())
-        return cls(score, closest, float(named), float(scores[place]), detections.boxes[0, place])
 
 
 class SearchFacts:
@@ -67,7 +54,14 @@ class SearchFacts:
 
     def add(self, glance: Glance) -> None:
         """Add the facts of a look."""
-        self.looks.append(_LookFacts.of(glance, self.belief.target, self.belief.lattice))
+        target, detections = self.belief.target, glance.detections
+        score, named, found, box = float(glance.show[target - 1]), 0.0, 0.0, None
+        closest = score if glance.window.level == self.belief.lattice.levels - 1 else 0.0
+        scores = detections.scores[0, :, target].detach().float().numpy()
+        if len(scores):
+            named = float(scores[detections.labels[0].numpy() == target].max(initial=0))
+            found, box = float(scores.max()), detections.boxes[0, int(scores.argmax())]
+        self.looks.append(_LookFacts(score, closest, named, found, box))
         self.best = max(look.score for look in self.looks)
         shown = max(self.looks, key=lambda look: look.found)
         self.box, self.detected = shown.box if shown.found > 0 else None, shown.found >= DETECTION_SCORE

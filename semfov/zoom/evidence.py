@@ -199,24 +199,6 @@ class PhotographEvidence(nn.Module):
         odds: Tensor = self.whole(facts)[..., 0]
         return odds
 
-    def record(self) -> dict[str, Any]:
-        """Thresholds and certainty as JSON."""
-        thresholds, certainty = self.verification.thresholds, self.certainty
-        return {
-            "thresholds": None if thresholds is None else vars(thresholds),
-            "certainty": None if certainty is None else certainty.numbers,
-        }
-
-    @classmethod
-    def of(cls, classes: int, record: Mapping[str, Any]) -> Self:
-        """The module of a record, before its tensors are loaded."""
-        thresholds, certainty = record["thresholds"], record["certainty"]
-        return cls(
-            classes,
-            thresholds=None if thresholds is None else Thresholds(**thresholds),
-            certainty=None if certainty is None else Certainty.of(certainty),
-        )
-
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
@@ -494,7 +476,8 @@ class GlimpseEvidence(Pretrained):
 
     def _record(self) -> dict[str, Any]:
         """Sizes and chosen settings, for the file."""
-        verified = self.verification
+        verified, own = self.verification, self.photograph
+        at = own and own.verification.thresholds
         return {
             "classes": self.classes,
             "width": self.width,
@@ -503,8 +486,9 @@ class GlimpseEvidence(Pretrained):
             "thresholds": self.thresholds and asdict(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
             "verification": verified and {"thresholds": verified.thresholds and asdict(verified.thresholds)},
-            "certainty": None if self.certainty is None else self.certainty.numbers,
-            "photograph": None if self.photograph is None else self.photograph.record(),
+            "certainty": self.certainty and self.certainty.numbers,
+            "photograph": own
+            and {"thresholds": at and asdict(at), "certainty": own.certainty and own.certainty.numbers},
         }
 
     @classmethod
@@ -512,6 +496,7 @@ class GlimpseEvidence(Pretrained):
         """The model from its file."""
         verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
         chosen, sure = record["thresholds"], verified and verified["thresholds"]
+        at, certain = (photograph and photograph[name] for name in ("thresholds", "certainty"))
         model = cls(
             record["classes"],
             record["width"],
@@ -520,7 +505,12 @@ class GlimpseEvidence(Pretrained):
             thresholds=chosen and Thresholds(**chosen),
             verification=verified and Verification(thresholds=sure and Thresholds(**sure)),
             certainty=None if certainty is None else Certainty.of(certainty),
-            photograph=None if photograph is None else PhotographEvidence.of(record["classes"], photograph),
+            photograph=photograph
+            and PhotographEvidence(
+                record["classes"],
+                thresholds=at and Thresholds(**at),
+                certainty=None if certain is None else Certainty.of(certain),
+            ),
             metadata=record["metadata"],
         )
         model.survey.foresight = record["survey"]["foresight"]

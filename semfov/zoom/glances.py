@@ -139,7 +139,10 @@ def _aims(windows: Sequence[Window]) -> tuple[Tensor, list[tuple[float, float, f
 
 def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
-    detections = _only(looks.detections, number)
+    detections = looks.detections
+    if len(detections.mask) > 1:  # a batch of one, without padding
+        count, one = int(detections.mask[number].sum()), slice(number, number + 1)
+        detections = Detections(*(each[one, :count] for each in (detections.boxes, detections.scores, detections.mask)))
     look_gist, faint = None, None
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]
@@ -156,11 +159,3 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
 def points_closer(window: Window, lattice: Lattice) -> bool:
     """Whether a look at a window tells where to look more closely: it is on the lattice, and not of the last level."""
     return window.within is None and window.level < lattice.levels - 1
-
-
-def _only(looks: Detections, number: int) -> Detections:
-    """Detections of one look, a batch of one without padding."""
-    if len(looks.mask) == 1:
-        return looks
-    count, one = int(looks.mask[number].sum()), slice(number, number + 1)
-    return Detections(looks.boxes[one, :count], looks.scores[one, :count], looks.mask[one, :count])

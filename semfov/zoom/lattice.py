@@ -13,17 +13,6 @@ CELLS = 8
 """Cells along a side of the closest window."""
 
 
-def _ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """Magnifications one octave apart, from the one that shows the whole picture up to a finest one."""
-    check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
-    check(finest > 0, "finest", "a positive magnification", finest)
-    whole = min(size[0] / picture[0], size[1] / picture[1])
-    steps = [whole]
-    while steps[-1] * 2 <= finest * (1 + 1e-9):
-        steps.append(steps[-1] * 2)
-    return tuple(steps)
-
-
 @dataclass(frozen=True)
 class Lattice:
     """A grid of cells over a picture, and the windows of every level that lie on it.
@@ -64,7 +53,13 @@ class Lattice:
         >>> lattice.levels, lattice.columns, lattice.rows, len(lattice)
         (3, 32, 24, 579)
         """
-        return cls(size, canvas, _ladder(size, canvas, finest=finest))
+        check(min(size) >= 1, "picture", "a width and a height in pixels", size)
+        check(finest > 0, "finest", "a positive magnification", finest)
+        # Magnifications one octave apart, from the one that shows the whole picture up to the finest one.
+        steps = [min(canvas[0] / size[0], canvas[1] / size[1])]
+        while steps[-1] * 2 <= finest * (1 + 1e-9):
+            steps.append(steps[-1] * 2)
+        return cls(size, canvas, tuple(steps))
 
     def __post_init__(self) -> None:
         check(len(self.magnifications) >= 1, "magnifications", "at least one", self.magnifications)

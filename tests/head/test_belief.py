@@ -117,7 +117,7 @@ def test_search_gain_equals_brute_force(views, eye, models):
     chance, fovea = belief.probability(2)[0], 100 / 640
     for action in (pose * 100 + 55, pose * 100 + 89, 3, 1234):
         place, cell = divmod(action, 100)
-        here = int(views.world.cell_of(views.gaze[action][None]))
+        here = int(views.gaze_cell[action])
         value = 0.0 if belief.examined[0, here] else float(chance[here])
         points, inside = views.world.to_view(views.world.centres, views.poses[place])
         for x in inside.nonzero()[:, 0].tolist():

@@ -53,7 +53,7 @@ def test_boxes_are_converted_to_places_and_back(world):
 
 
 def test_cells_contain_their_centres_and_panoramas_are_twice_as_wide_as_high(world):
-    assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
+    assert torch.equal(world.scene.cell_of(world.pixels_of(world.centres)), torch.arange(len(world.scene)))
     torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
     assert float(world.area.mean()) == pytest.approx(1)
     with pytest.warns(UserWarning, match="twice as wide as high, got 64 × 48 px"):

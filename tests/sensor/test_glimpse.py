@@ -11,7 +11,7 @@ from PIL import Image
 from torch.nn import functional as F
 
 from semfov.sensor.glimpse import glimpse, window_around, windows_at
-from semfov.zoom.lattice import _ladder
+from semfov.zoom.lattice import Lattice
 from tests.refusals import refused
 
 
@@ -95,11 +95,11 @@ def test_gradients_in_image_position_and_magnification():
 def test_windows_and_ladder_of_magnifications():
     box = windows_at(torch.tensor([99.5, 49.5]), torch.tensor(0.5), (416, 208))
     assert box.tolist() == [100 - 416, 50 - 208, 100 + 416, 50 + 208]
-    steps = _ladder((20000, 15000), (416, 416))
+    steps = Lattice.over((20000, 15000), (416, 416)).magnifications
     assert steps[0] == 416 / 20000
     assert all(finer == 2 * coarser for coarser, finer in pairwise(steps))
     assert steps[-1] <= 1 < 2 * steps[-1]
-    assert _ladder((100, 80), (416, 416)) == (4.16,)
+    assert Lattice.over((100, 80), (416, 416)).magnifications == (4.16,)
 
 
 @pytest.mark.parametrize(
