@@ -89,7 +89,12 @@ class ActivePerception(nn.Module):
         self.searching, self.exploring = Strategy(*search), Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
-        self._check_parts()
+        settings = eye.settings()
+        for module in self.modules():
+            if isinstance(module, FovealObservationModel | TargetEvidence | MapEvidence | Verification):
+                check_same_detector(module.metadata.get("detector", {}), settings["detector"], module.title)
+                check_sensor(module.metadata.get("sensor", {}), settings["sensor"], module.title, strict=True)
+                check_grid(module.metadata.get("training", {}), grid, module.title)
 
     @classmethod
     def recommended(
@@ -583,15 +588,6 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)
         return kind
-
-    def _check_parts(self) -> None:
-        """Raise `InputError` where a model was fitted for another detector, sensor or grid."""
-        settings, grid = self.eye.settings(), (self.columns, self.rows)
-        for module in self.modules():
-            if isinstance(module, FovealObservationModel | TargetEvidence | MapEvidence | Verification):
-                check_same_detector(module.metadata.get("detector", {}), settings["detector"], module.title)
-                check_sensor(module.metadata.get("sensor", {}), settings["sensor"], module.title, strict=True)
-                check_grid(module.metadata.get("training", {}), grid, module.title)
 
 
 def _counting(record: Record, least: float | None) -> Record:

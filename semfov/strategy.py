@@ -14,17 +14,6 @@ from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Unifor
 from semfov.gaze.policies import Policy
 
 
-def _weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
-    """Weights by class index for a target that is any of several classes."""
-    check(len(target) > 0, "target", "a class, or several classes with weights", "none")
-    weights: dict[int, float] = {}
-    for name, weight in target.items():
-        index = class_index(name, classes, "target")
-        check(index not in weights, "target", "each class once", f"{classes[index - 1]!r} twice")
-        weights[index] = weight
-    return weights
-
-
 class Strategy(nn.Module):
     """Observer and policy for a task."""
 
@@ -46,7 +35,13 @@ class Strategy(nn.Module):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
         by_target: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
-        weights, policy = _weights_by_class(by_target, classes[1:]), self.policy
+        check(len(by_target) > 0, "target", "a class, or several classes with weights", "none")
+        weights: dict[int, float] = {}
+        for name, weight in by_target.items():
+            index = class_index(name, classes[1:], "target")
+            check(index not in weights, "target", "each class once", f"{classes[index]!r} twice")
+            weights[index] = weight
+        policy = self.policy
         suits = policy.name in (TargetPosterior.name, Uniform.name) or policy.function.by_place
         check(
             suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(by_target)

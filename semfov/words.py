@@ -28,24 +28,6 @@ OTHER_WORDS: dict[str, tuple[str, ...]] = {
     "names": ("classes",),
 }
 
-RECORD_WORDS = {
-    **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
-    "box": "record.decision.box, or its objects, record.objects.boxes",
-    **dict.fromkeys(("confidence", "probability", "score"), "record.decision.probability"),
-    **dict.fromkeys(("outcome", "result"), "record.decision.outcome"),
-    **dict.fromkeys(("count", "counts", "number"), "len(record.objects), or record.expected with what was not seen"),
-    **dict.fromkeys(("dataframe", "df", "to_dataframe", "to_df", "to_pandas"), "record.to_frame()"),
-    **dict.fromkeys(("draw", "show", "visualize"), "record.plot()"),
-    **dict.fromkeys(("names",), "record.classes"),
-    **dict.fromkeys(("detections", "results"), "record.objects, or the detections of a look, record[0].detections"),
-    **dict.fromkeys(("to_html", "save_html"), "record.report(path)"),
-}
-GAZE_WORDS = {
-    **dict.fromkeys(("draw", "show", "visualize"), "gaze.plot()"),
-    **dict.fromkeys(("save", "to_png"), "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)"),
-    **dict.fromkeys(("heatmap", "map", "saliency"), "gaze.density"),
-    **dict.fromkeys(("fixations", "sample", "scanpath"), "gaze.scanpaths(people)"),
-}
 _AGENT = "agent = semfov.ActivePerception.recommended(), which has search, find_all, explore, gaze and live"
 PACKAGE_WORDS = {
     **dict.fromkeys(("Agent", "detect", "explore", "find", "find_all", "load", "predict", "search"), _AGENT),

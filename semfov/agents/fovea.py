@@ -1,8 +1,9 @@
 """Looks of a fovea at a photograph or at the frames of a stream: a gaze that moves over a grid of cells."""
 
+import math
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from semfov.agents.episode import Episode, EpisodeLimits, on_cpu
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
+from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import (
@@ -23,16 +25,14 @@ from semfov.decision import (
     Decision,
     Verifier,
     conclude,
+    confirms,
     decide,
-    goal_cells,
-    outcome_by_gain,
-    outcome_of,
 )
 from semfov.detection.detections import Detections
 from semfov.episode import LiveLooks, Step, Stopwatch, rollout
-from semfov.errors import InputError, check, check_whole
+from semfov.errors import InputError, check, check_finite, check_shape, check_whole
 from semfov.eye import Eye
-from semfov.gaze.acquisition import ExpectedGain
+from semfov.gaze.acquisition import AcquisitionFunction, ExpectedGain
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath
@@ -85,8 +85,8 @@ class FoveaAgent:
             confirm=confirm, give_up=give_up, closer=closer if boxes is None else 0,
         )  # fmt: skip
         grid = episode.open(image)
-        goal = None if boxes is None else goal_cells(boxes, grid, image)
-        episode.ends = outcome_of(weights, grid, goal, episode.thresholds, 0.5 if confirm is None else confirm)
+        goal = None if boxes is None else _goal_cells(boxes, grid, image)
+        episode.ends = _outcome_of(weights, grid, goal, episode.thresholds, 0.5 if confirm is None else confirm)
         episode.to_goal = goal is not None
         return episode.run()
 
@@ -114,7 +114,7 @@ class FoveaAgent:
         )
         grid = episode.open(image)
         if isinstance(observer, LearnedMap) and (policy is None or worth is not None):
-            episode.ends = outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
+            episode.ends = _outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
         return episode.run()
 
     def find_all(
@@ -429,3 +429,53 @@ def cell_at(start: Start, cells: tuple[int, int]) -> int | None:
     check_whole(column, "start", 0, cells[0] - 1)
     check_whole(row, "start", 0, cells[1] - 1)
     return int(row) * cells[0] + int(column)
+
+
+def _outcome_of(
+    weights: Mapping[int, float], grid: Grid, goal: Tensor | None, thresholds: Thresholds | None, confirm: float
+) -> Callable[[Step], Tensor]:
+    """Make the function that decides which searches end with a step; goal `(X·Y,)` → `(A,)`."""
+    first = next(iter(weights))
+
+    def outcome(step: Step) -> Tensor:
+        if goal is not None:
+            return goal[step.cell].long()
+        if thresholds is not None:
+            return decide(step, first, thresholds)
+        hits = [
+            confirms(step.detections, grid, step.cell, index, confirm / weight)
+            for index, weight in weights.items()
+            if weight > 0
+        ]
+        return torch.stack(hits).any(0).long()
+
+    return outcome
+
+
+def _outcome_by_gain(gain: AcquisitionFunction, worth: float) -> Callable[[Step], Tensor]:
+    """Make the function that decides which explorations end with a step; → `(A,)`."""
+
+    def outcome(step: Step) -> Tensor:
+        best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
+        return ((best < worth) & (worth > 0) & ~step.visited.all(-1)).long()
+
+    return outcome
+
+
+def _goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
+    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
+
+    Shapes: boxes `(M, 4)` → `(X·Y,)`.
+    """
+    tensor = torch.as_tensor(boxes).to(like)
+    check_shape(tensor, "boxes", None, 4)
+    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
+    check_finite(tensor, "boxes")
+    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
+    check(
+        full,
+        "boxes",
+        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
+        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
+    )
+    return grid.footprint(tensor).any(-2)

@@ -230,6 +230,8 @@ class HeadAgent(nn.Module):
 class _HeadEpisode(Episode[HeadPath]):
     """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second."""
 
+    decision: Decision | None = None
+
     def __init__(
         self,
         agent: HeadAgent,
@@ -257,7 +259,6 @@ class _HeadEpisode(Episode[HeadPath]):
             target=self.target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
         )  # fmt: skip
         self._made, self._maps = list[HeadStep](), list[Tensor]()
-        self._decision: Decision | None = None
 
     def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
         """Turn the eye, or eye and head, and look."""
@@ -275,8 +276,8 @@ class _HeadEpisode(Episode[HeadPath]):
                 cells = (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
             self._maps.append(cells)
             if self.thresholds is not None and target is not None:
-                self._decision = _decide_look(self.views, step, target, self.thresholds)
-                self.ending = "decision" if self._decision.outcome != "undecided" else None
+                self.decision = _decide_look(self.views, step, target, self.thresholds)
+                self.ending = "decision" if self.decision.outcome != "undecided" else None
             views, pose = self.views, self.views.poses[step.action // self.views.cells]
             x, y = views.world.pixels_of(views.gaze[[step.action]])[0].tolist()
             width, height = views.world.size
@@ -293,14 +294,9 @@ class _HeadEpisode(Episode[HeadPath]):
             usual = "cells"
         self.ending = self.ending or limit or usual
 
-    @property
-    def decision(self) -> Decision | None:
-        """The decision of a search as it stands; None in an exploration."""
-        return self._decision
-
     def record(self) -> HeadPath:
         """The record of the looks so far."""
-        steps, decision, picture = self._made, self._decision, self.views.world.image()
+        steps, decision, picture = self._made, self.decision, self.views.world.image()
         return HeadPath(
             views=self.views,
             target=self.target,

@@ -414,7 +414,14 @@ class WindowEpisode(Episode[ZoomPath]):
             return self._decisions.decision()
         if not self.searches or self.target is None:
             return None
-        return _decide_by_score(self.glances, self.target, self._confirm)
+        best, box = 0.0, None
+        for detections in (glance.detections for glance in self.glances):
+            scores = detections.confidence[0].masked_fill(
+                ~detections.mask[0] | (detections.labels[0] != self.target), 0
+            )
+            if len(scores) and float(scores.max()) > best:
+                best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
+        return Decision("found", best, None, box) if best >= self._confirm else Decision("undecided", best)
 
     @property
     def belief(self) -> ZoomBelief | None:
@@ -496,14 +503,3 @@ class WindowEpisode(Episode[ZoomPath]):
     def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
         return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None
-
-
-def _decide_by_score(looks: Sequence[Glance], target: int, confirm: float) -> Decision:
-    """Decide by the scores of detections alone, for looks without learned evidence; nothing is `absent` by them."""
-    best, box = 0.0, None
-    for detections in (look.detections for look in looks):
-        scores = detections.confidence[0].masked_fill(~detections.mask[0] | (detections.labels[0] != target), 0)
-        if len(scores) and float(scores.max()) > best:
-            best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
-    found = best >= confirm
-    return Decision("found" if found else "undecided", best, None, box if found else None)

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -65,6 +65,17 @@ class Evidence(PretrainedForEye):
         self.read = network(READOUT + more, readout_width)
         self.prior = nn.Parameter(torch.zeros(components))
 
+    def _record(self) -> dict[str, Any]:
+        """The widths of the networks and the number of classes."""
+        return {"widths": self.widths, "components": len(self.prior)}
+
+    @classmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The model with the saved tensors and record."""
+        model = cls(*record["widths"], components=record["components"], metadata=record["metadata"])
+        model.load_state_dict(tensors)
+        return model
+
     def evidence(self, features: Tensor) -> Tensor:
         """Evidence of looks, log odds `(...)`, from their features `(..., 10)` (`look_features`)."""
         value: Tensor = self.look(features)
@@ -107,9 +118,10 @@ def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Siz
     return value.view(shape)
 
 
-def network(inputs: int, width: int) -> nn.Sequential:
-    """A network with two hidden layers of `width` units and one output."""
-    return nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1))
+def network(inputs: int, width: int, outputs: int = 1) -> nn.Sequential:
+    """A network with two hidden layers of `width` units."""
+    hidden = nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
+    return nn.Sequential(*hidden, nn.Linear(width, outputs))
 
 
 def nearness(distance: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -175,14 +175,3 @@ class MapEvidence(Evidence):
         ]
         # Two equal distances may differ by rounding; such a look is not closer.
         return apply_network(self.worth, inputs, nearer.shape) * (nearer > _ROUNDING)
-
-    def _record(self) -> dict[str, Any]:
-        """The widths of the networks and the number of classes."""
-        return {"widths": self.widths, "components": len(self.prior)}
-
-    @classmethod
-    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model with the saved tensors and record."""
-        model = cls(*record["widths"], components=record["components"], metadata=record["metadata"])
-        model.load_state_dict(tensors)
-        return model

@@ -165,15 +165,11 @@ class TargetEvidence(Evidence):
 
     def _record(self) -> dict[str, Any]:
         """The widths of the networks, the number of classes, and the thresholds."""
-        thresholds = None if self.thresholds is None else asdict(self.thresholds)
-        return {"widths": self.widths, "components": len(self.prior), "thresholds": thresholds}
+        return {**super()._record(), "thresholds": self.thresholds and asdict(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model with the saved tensors and record."""
-        thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
-        model = cls(
-            *record["widths"], components=record["components"], thresholds=thresholds, metadata=record["metadata"]
-        )
-        model.load_state_dict(tensors)
+        model = super()._restore(record, tensors)
+        model.thresholds = record["thresholds"] and Thresholds(**record["thresholds"])
         return model

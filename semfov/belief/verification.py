@@ -17,7 +17,7 @@ from semfov.observation.matching import box_iou
 CLOSER_FEATURES = 7
 """Number of features of a closer look (`closer_features`)."""
 
-MATCHED = 0.3
+_MATCHED = 0.3
 """Least overlap (intersection over union) of a detection with a box at which it shows the same object."""
 
 _FLOOR = 1e-3
@@ -112,17 +112,33 @@ def closer_features(
     after = [0.0] * 4
     if len(boxes):
         score = scores[:, target]
-        best, overlap = best_detection(boxes, score, box)
+        best, overlap = _best_detection(boxes, score, box)
         other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
         after = [
             float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
         ]
-        if float(overlap[best]) >= MATCHED:
+        if float(overlap[best]) >= _MATCHED:
             box = boxes[best]
     return box.new_tensor([*before, *after]).logit(_FLOOR), box
 
 
-def best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
+def _best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
     r"""Detection that best shows the target in a box, :math:`m = \arg\max_l s_l o_l`, and all overlaps o `(L,)`."""
     overlap = box_iou(boxes, box[None])[:, 0]
     return int((scores * overlap).argmax()), overlap
+
+
+def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
+    """Move the box `(4,)` of a target to the middle of the detection that best shows it; it keeps its size.
+
+    A closer look measures the size better than a look of the fovea.
+    """
+    real = detections.mask[0]
+    boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]
+    if not len(boxes):
+        return box
+    best, overlap = _best_detection(boxes, scores, box)
+    if float(overlap[best]) < _MATCHED:
+        return box
+    shift = (boxes[best] - box).view(2, 2).mean(0)
+    return box + shift.repeat(2)

@@ -2,8 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
@@ -136,19 +134,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """A look of a search, whose footprints are computed once."""
-
-    detections: Detections
-    grid: Grid
-
-    @cached_property
-    def weights(self) -> Tensor:
-        """The `soft` footprints of the detections, `(L, X·Y)`."""
-        return self.grid.footprint(self.detections.boxes, "soft")[0]
-
-
 class CandidateCells(CandidatePlaces[Step]):
     """Cells that seem to hold the target of one search: those with the largest product of probability and evidence.
 
@@ -170,7 +155,8 @@ class CandidateCells(CandidatePlaces[Step]):
         self._step, self._fixation, self.detections = look, look.shift, look.detections
         self.target = class_meant(look.belief, self._target)
         self.presence = float(look.belief.presence(self._target))
-        self._looks.append((self._frame, _Seen(look.detections, self.grid)))
+        footprint = self.grid.footprint(look.detections.boxes, "soft")[0]
+        self._looks.append((self._frame, (look.detections, footprint)))
         # Largest probability of a cell that was not fixated, given that no fixated cell holds the target.
         self._left = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
 
@@ -181,10 +167,17 @@ class CandidateCells(CandidatePlaces[Step]):
             cells = cells.masked_fill(covered, 0)
         if not (last or bool(place_known(cells, self._step.visited[0], least))):
             return None
-        boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
+        boxes = torch.cat([detections.boxes[0] for _, (detections, _) in self._looks])
         if not len(boxes):
             return None
-        evidence = self._scores(boxes, self.target)[:, None] * torch.cat([look.weights for _, look in self._looks])
+        # Faded scores of the detections of all looks, 0 for objects that were examined.
+        keep = self.forgetting.keep
+        faded = [
+            seen.mask[0] * (seen.scores[0, :, self.target] * keep ** (self._frame - frame))
+            for frame, (seen, _) in self._looks
+        ]
+        scores = torch.cat(faded) * ~self._again(boxes) if self._examined else torch.cat(faded)
+        evidence = scores[:, None] * torch.cat([footprint for _, (_, footprint) in self._looks])
         value = cells * evidence.amax(0)
         cell = int(value.argmax())
         if float(value[cell]) <= 0 or float(cells[cell]) < least:
@@ -195,14 +188,3 @@ class CandidateCells(CandidatePlaces[Step]):
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is in the cell of a closer look."""
         return float(self._step.belief.probability(self._target)[0, look.cell])
-
-    def _scores(self, boxes: Tensor, target: int) -> Tensor:
-        """Faded scores of the detections of all looks, 0 for objects that were examined; boxes `(N, 4)` → `(N,)`."""
-        keep = self.forgetting.keep
-        scores = torch.cat(
-            [
-                look.detections.mask[0] * (look.detections.scores[0, :, target] * keep ** (self._frame - frame))
-                for frame, look in self._looks
-            ]
-        )
-        return scores * ~self._again(boxes) if self._examined else scores

@@ -1,7 +1,6 @@
 """The decision of a search: whether the image holds the target, where, and with what probability, on what evidence."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,8 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check, check_finite, check_shape
-from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.errors import check
 from semfov.io.schema import is_number
 
 Outcome = Literal["found", "absent", "undecided"]
@@ -51,6 +49,11 @@ class CloseUp:
     place: float
     presence: float
     number: int | None = None
+
+    @property
+    def of_look(self) -> int:
+        """Number of the look that it is, or after which it was made."""
+        return (self.fixation if self.number is None else self.number) or 0
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
@@ -103,12 +106,19 @@ def conclude(
     probability = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
         return Decision(OUTCOMES[outcome], probability)
+    # Evidence of each look: score times footprint, of each detection in each cell.
+    evidence = [
+        grid.footprint(look.boxes, "soft")[0] * (look.mask[0] * look.scores[0, :, target])[:, None] for look in looks
+    ]
     if cell is None:
         cells = belief.probability(target)[0]
-        strengths = (_strength(look, grid, target) for look in looks)
-        evidence = torch.stack([cells.new_zeros(len(grid)), *strengths]).amax(0)
-        cell = int((cells * evidence if bool(evidence.any()) else cells).argmax())
-    return Decision("found", probability, cell, _strongest(looks, grid, cell, target)[1])
+        strongest = torch.cat([cells.new_zeros(1, len(grid)), *evidence]).amax(0)
+        cell = int((cells * strongest if bool(strongest.any()) else cells).argmax())
+    best, box = 0.0, None
+    for look, values in zip(looks, evidence, strict=True):
+        if len(values) and float(values[:, cell].max()) > best:
+            best, box = float(values[:, cell].max()), look.boxes[0, int(values[:, cell].argmax())]
+    return Decision("found", probability, cell, box)
 
 
 def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
@@ -126,63 +136,10 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
     return OUTCOMES.index("absent") if presence < _ABSENT else len(OUTCOMES) - 1
 
 
-def outcome_of(
-    weights: Mapping[int, float],
-    grid: Grid,
-    goal: Tensor | None,
-    thresholds: Thresholds | None,
-    confirm: float,
-) -> Callable[[Step], Tensor]:
-    """Make the function that decides which searches end with a step; goal `(X·Y,)` → `(A,)`."""
-    first = next(iter(weights))
-
-    def outcome(step: Step) -> Tensor:
-        if goal is not None:
-            return goal[step.cell].long()
-        if thresholds is not None:
-            return decide(step, first, thresholds)
-        hits = [
-            confirms(step.detections, grid, step.cell, index, confirm / weight)
-            for index, weight in weights.items()
-            if weight > 0
-        ]
-        return torch.stack(hits).any(0).long()
-
-    return outcome
-
-
-def outcome_by_gain(gain: AcquisitionFunction, worth: float) -> Callable[[Step], Tensor]:
-    """Make the function that decides which explorations end with a step; → `(A,)`."""
-
-    def outcome(step: Step) -> Tensor:
-        best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
-        return ((best < worth) & (worth > 0) & ~step.visited.all(-1)).long()
-
-    return outcome
-
-
 def check_thresholds(confirm: float | None, give_up: float | None) -> None:
     """Raise `InputError` unless each threshold is None or a probability."""
     for name, value in (("confirm", confirm), ("give_up", give_up)):
         check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
-
-
-def _strength(detections: Detections, grid: Grid, target: int) -> Tensor:
-    """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
-    scores = detections.mask[0] * detections.scores[0, :, target]
-    by_detection = grid.footprint(detections.boxes, "soft")[0] * scores[:, None]
-    return by_detection.amax(0) if len(by_detection) else by_detection.sum(0)
-
-
-def _strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
-    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint; → `(4,)`."""
-    evidence, box = 0.0, None
-    for look in looks:
-        weight = grid.footprint(look.boxes, "soft")[0, :, cell] * look.mask[0]
-        scores = weight * look.scores[0, :, target]
-        if scores.numel() and float(scores.max()) > evidence:
-            evidence, box = float(scores.max()), look.boxes[0, int(scores.argmax())]
-    return evidence, box
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
@@ -190,25 +147,6 @@ def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, scor
     sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
     there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
     return (there & sure).any(-1)
-
-
-def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
-    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
-
-    Shapes: boxes `(M, 4)` → `(X·Y,)`.
-    """
-    tensor = torch.as_tensor(boxes).to(like)
-    check_shape(tensor, "boxes", None, 4)
-    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
-    check_finite(tensor, "boxes")
-    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
-    check(
-        full,
-        "boxes",
-        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
-        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
-    )
-    return grid.footprint(tensor).any(-2)
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.belief.verification import MATCHED, Verification, best_detection
+from semfov.belief.verification import Verification, follow_target
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
 from semfov.decision.rule import OUTCOMES, CloseUp, Decision, verified
-from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.observation.matching import box_iou
@@ -91,7 +90,7 @@ class Verifier(Generic[LookType]):
         self.places.see(look)
         if self.places.forgetting.rate:
             for number, verdict in enumerate(self.verdicts):
-                box = _follow_target(verdict.look.box, self.places.detections, verdict.look.target)
+                box = follow_target(verdict.look.box, self.places.detections, verdict.look.target)
                 if box is not verdict.look.box:
                     moved = replace(verdict.look, box=box, cell=self.places.cell(box))
                     self.verdicts[number] = verdict._replace(look=moved)
@@ -215,19 +214,3 @@ class Verifier(Generic[LookType]):
             return before
         odds, present = (math.log(p / (1 - p)) for p in (min(max(p, _FLOOR), 1 - _FLOOR) for p in (before, now)))
         return 1 / (1 + math.exp(-(weight * odds + (1 - weight) * present)))
-
-
-def _follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
-    """Move the box `(4,)` of a target to the middle of the detection that best shows it; it keeps its size.
-
-    A closer look measures the size better than a look of the fovea.
-    """
-    real = detections.mask[0]
-    boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]
-    if not len(boxes):
-        return box
-    best, overlap = best_detection(boxes, scores, box)
-    if float(overlap[best]) < MATCHED:
-        return box
-    shift = (boxes[best] - box).view(2, 2).mean(0)
-    return box + shift.repeat(2)

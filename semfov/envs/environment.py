@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from inspect import signature
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 import gymnasium
 import numpy as np
@@ -24,9 +24,6 @@ from semfov.errors import InputError, check, check_options, check_whole, lookup
 from semfov.gaze.acquisition.base import Task
 
 _Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
-
-_PRICES = {"search": 0.05, "exploration": 0.01}
-"""Cost of a look by default, for each task."""
 
 _ROW = torch.tensor([0])
 
@@ -165,17 +162,8 @@ class GazeEnv(EpisodeEnv):
         **options: Any,
     ) -> None:
         self.scenery = _scenery_or_open(scenery, open_scenery, options, self.task)
-        gazes = CellGazes(
-            self.scenery,
-            self.task,
-            price=_PRICES[self.task] if price is None else price,
-            find=find,
-            belief=belief,
-            glimpse=glimpse,
-            pictures=render_mode is not None,
-        )
-        super().__init__(gazes, render_mode)
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
+        super().__init__(CellGazes(self.scenery, self.task, **rewards, pictures=render_mode is not None), render_mode)
         EzPickle.__init__(self, self.scenery, **rewards, render_mode=render_mode)
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -274,19 +262,10 @@ class ZoomEnv(EpisodeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        usual = _PRICES[lookup(task, _PRICES, "task")]
+        lookup(task, get_args(Task), "task")
         self.scenery = _scenery_or_open(scenery, open_zoom_scenery, options)
-        gazes = WindowGaze(
-            self.scenery,
-            task,
-            price=usual if price is None else price,
-            find=find,
-            belief=belief,
-            grid=grid,
-            glimpse=glimpse,
-        )
-        super().__init__(gazes, render_mode)
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse, "grid": grid}
+        super().__init__(WindowGaze(self.scenery, task, **rewards), render_mode)
         EzPickle.__init__(self, task, self.scenery, **rewards, render_mode=render_mode)
 
     def close(self) -> None:
@@ -363,22 +342,13 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         known, name = [mode.value for mode in AutoresetMode], getattr(autoreset_mode, "value", autoreset_mode)
         mode = AutoresetMode(lookup(str(name), known, "autoreset_mode"))
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self.num_envs, self.task = num_envs, lookup(task, _PRICES, "task")
+        self.num_envs, self.task = num_envs, lookup(task, get_args(Task), "task")
         self.scenery = _scenery_or_open(scenery, open_scenery, options, task)
         # A copy is a new environment of the same settings and scenes, which begins with a reset.
         rewards: dict[str, Any] = {"price": price, "find": find, "belief": belief, "glimpse": glimpse}
         modes = {"detections": detections, "together": together, "autoreset_mode": mode}
         EzPickle.__init__(self, task, num_envs, self.scenery, **rewards, **modes)
-        self.gazes = CellGazes(
-            self.scenery,
-            task,
-            num_envs,
-            price=_PRICES[task] if price is None else price,
-            find=find,
-            belief=belief,
-            glimpse=glimpse,
-            together=together,
-        )
+        self.gazes = CellGazes(self.scenery, task, num_envs, **rewards, together=together)
         self.single_observation_space = self.gazes.observation_space
         self.single_action_space = self.gazes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)

@@ -19,6 +19,9 @@ from semfov.errors import check, check_number, check_whole
 
 Arrays = dict[str, Any]
 
+_PRICES = {"search": 0.05, "exploration": 0.01}
+"""Cost of a look by default, for each task."""
+
 
 class Gazes(ABC):
     """A batch of B episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
@@ -42,12 +45,13 @@ class Gazes(ABC):
         task: str,
         count: int = 1,
         *,
-        price: float,
-        find: float,
+        price: float | None = None,
+        find: float = 1.0,
         belief: bool = False,
         glimpse: int | None = None,
         pictures: bool = False,
     ) -> None:
+        price = _PRICES[task] if price is None else price
         check_number(price, "price", 0, 1e9)
         check_number(find, "find", 0, 1e9)
         self.scenery, self.price, self.find, self.pictures = scenery, price, find, pictures

@@ -50,15 +50,7 @@ _VIEWS = 16  # number of pictures that are kept open for glimpses
 
 
 class _Surroundings:
-    """What the environments of all kinds share: scenes, and an eye that looks at them.
-
-    Attributes:
-        pictures: the scenes.
-        eye: sensor and detector.
-        classes: names of the classes, background first.
-        shifts: largest number of looks of an episode after the first one.
-        pixels: number of pixels that the detector takes in for a look.
-    """
+    """What environments of all kinds share: scenes, and an eye that looks at them, `shifts` times after the first."""
 
     opened: partial[Any] | None = None
 
@@ -88,16 +80,8 @@ class Scenery(_Surroundings):
     """Scenes, an eye and a belief, which any number of environments can share; `open_scenery` makes one.
 
     Episodes and looks are those of the protocols of search and exploration. The looks from all cells of a scene are
-    computed when an episode first enters it, and are kept on disk.
-
-    Attributes:
-        protocol: the protocol of the episodes.
-        policy: name of the policy in tables.
-        observer: turns looks into belief.
-        shape: number of rows and columns of the cells.
-        episodes: all episodes of a scene, which `GazeEnv.reset` takes as an option.
-        annotation, grid, answers: of a scene: its objects, its cells, and their correct classes `(X·Y, K+1)`.
-        scenes: indices of the scenes that may have episodes.
+    computed when an episode first enters it, and are kept on disk. Of a scene `episodes` are all its episodes, which
+    `GazeEnv.reset` takes as an option, and `answers` the correct classes of its cells `(X·Y, K+1)`.
     """
 
     def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
@@ -259,13 +243,7 @@ _TRIES = 1000
 
 
 class ZoomScenery(_Surroundings):
-    """Large pictures and an eye that zooms, which any number of environments can share; `open_zoom_scenery` makes one.
-
-    Attributes:
-        evidence: learned evidence by magnification.
-        annotated: whether the objects in the pictures are annotated.
-        episodes: targets of all searches of a picture.
-    """
+    """Large pictures and an eye that zooms, which environments can share; `open_zoom_scenery` makes one."""
 
     def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
         super().__init__(looking.scenes, looking.eye, passes - 1, targets)

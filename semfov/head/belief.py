@@ -32,18 +32,12 @@ class _SceneLook(Look):
 
 @dataclass(frozen=True)
 class SceneBelief(Belief):
-    """Belief about the cells of a scene, in one episode.
+    """Belief about the S cells of a scene, in one episode.
 
-    Attributes:
-        values: `(1, S, C)`. For a belief about a target, C is 2: the probability that a cell holds the target, and the
-            same under the condition that no fixated cell does. For a belief about all classes, the probability of each,
-            background first.
-        closest: `(1, S)`, distance of the closest fixation to each cell, in units of the narrowest view's longer side
-            (`Views.distances`); infinite where a cell was never seen.
-        owner: `(1, S)`, number of the pose from which the closest fixation was; -1 where a cell was never seen.
-        examined: `(1, S)` boolean, cells that were fixated.
-        looks: `(1,)`, number of looks.
-        views: belief about the view from each pose; None where there was no look.
+    Of a target the values `(1, S, 2)` are the probability that a cell holds it, and the same if no fixated cell does;
+    of all classes the probability of each, background first. Of each cell `(1, S)`: the distance of its closest
+    fixation (`Views.distances`), infinite where it was never seen; the number of the pose that this was from, else -1;
+    and whether it was fixated. `views` are the beliefs about the view from each pose, None where there was no look.
     """
 
     values: Tensor

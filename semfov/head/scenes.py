@@ -45,18 +45,9 @@ def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
 class _Scene:
     """Base of the scenes that a head looks around in: their geometry, and the view from each pose.
 
-    A pose of the head has three numbers, all in degrees: pan to the right, tilt up, and the field of view across. A
-    point of the scene has D coordinates. Cameras of your own need less (`semfov.head.PanTiltCamera`).
-
-    Attributes:
-        scene: cells of the whole scene, in pixels of its picture.
-        size: `(w, h)` of a view in pixels.
-        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
-        speeds: of eye and head.
-        centres: `(S, D)`, centres of the cells.
-        area: `(S,)`, relative areas of the cells, 1 on average.
-        closed: whether the left and the right border of the picture meet.
-        still: whether two views from one pose are equal, as those of a picture are.
+    A pose of the head has three numbers, all in degrees: pan to the right, tilt up, and the field of view across.
+    `scene` are the cells of the whole scene, in pixels of its picture, with centres `(S, D)` and areas `(S,)`, 1 on
+    average. Cameras of your own need less (`semfov.head.PanTiltCamera`).
     """
 
     scene: Grid
@@ -65,8 +56,8 @@ class _Scene:
     speeds: Speeds
     centres: Tensor
     area: Tensor
-    closed: bool = False
-    still: bool = True
+    closed: bool = False  # whether the left and the right border of the picture meet
+    still: bool = True  # whether two views from one pose are equal, as those of a picture are
 
     _drawn: Tensor | LargePicture | None = None
 
@@ -242,48 +233,24 @@ class Panorama(Sphere):
         return sample(self._source, pose, self.size).clamp(0, 1), pose
 
 
-class Flat(_Scene):
-    """A large picture in front of the viewer, seen through a window that moves over it.
+class Plane(_Scene):
+    """A plane in front of a window that moves over it, without anything to see.
 
-    The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
-    middle of the window, in degrees to the right of and above the middle of the picture, and the window's width in
-    degrees. Points are pixels, so D is 2.
-
-    Args:
-        picture: picture of any common kind (`semfov.data.large.open_large`); or its `(width, height)` alone, for the
-            geometry of a scene that is not viewed.
-        size: `(w, h)` of a view in pixels.
-        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
-        speeds: of eye and head.
-        degree: number of pixels of the picture per degree. None takes 640 pixels for 60 degrees, and fewer where the
-            widest view would not fit into the picture.
-        cell: height of the scene's cells in degrees.
-        color: order of the channels of an array or a tensor (`semfov.as_image`).
-
-    Raises:
-        InputError: `degree` or `cell` is not positive.
-
-    >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
-    >>> world.look_at((0, 0), 40.0).shape, len(world.scene)
-    (torch.Size([3, 30, 40]), 130)
+    A pose is the middle of the window, in degrees to the right of and above the middle of the picture, and the window's
+    width in degrees. Points are pixels, so D is 2.
     """
 
     def __init__(
         self,
-        picture: LargePicture | ImageLike | tuple[int, int],
-        size: tuple[int, int] = _VIEW,
+        picture: tuple[int, int],
+        size: tuple[int, int],
         *,
         fields: tuple[float, ...] = FIELDS,
         speeds: Speeds | None = None,
         degree: float | None = None,
         cell: float = 6.0,
-        color: Color = "rgb",
     ) -> None:
         self.fields = check_fields(fields)
-        self.opened: LargePicture | None = None
-        if not isinstance(picture, tuple):
-            self.opened = self._drawn = open_large(picture, color=color)
-            picture = self.opened.size
         self.picture = width, height = picture
         if degree is None:
             degree = min(_DEGREE, min(width, height * size[0] / size[1]) / max(fields))
@@ -311,13 +278,6 @@ class Flat(_Scene):
         what = f"a window inside {self.picture[0]} × {self.picture[1]} pixels"
         check(inside, "pose", what, (x1, y1, x1 + wide, y1 + high))
         return within[0], within[1], within[0] + wide, within[1] + high
-
-    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """The content of the window, resampled to the size of a view."""
-        if self.opened is None:
-            return super().view(pose)
-        pixels = self.opened.read(self._box(pose)).float()[None] / 255
-        return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of the view that show points of the picture."""
@@ -374,5 +334,56 @@ class Flat(_Scene):
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
 
 
-World = Sphere | Flat
+class Flat(Plane):
+    """A large picture in front of the viewer, seen through a window that moves over it.
+
+    The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
+    middle of the window, in degrees to the right of and above the middle of the picture, and the window's width in
+    degrees. Points are pixels, so D is 2.
+
+    Args:
+        picture: picture of any common kind (`semfov.data.large.open_large`); or its `(width, height)` alone, for the
+            geometry of a scene that is not viewed.
+        size: `(w, h)` of a view in pixels.
+        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
+        speeds: of eye and head.
+        degree: number of pixels of the picture per degree. None takes 640 pixels for 60 degrees, and fewer where the
+            widest view would not fit into the picture.
+        cell: height of the scene's cells in degrees.
+        color: order of the channels of an array or a tensor (`semfov.as_image`).
+
+    Raises:
+        InputError: `degree` or `cell` is not positive.
+
+    >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
+    >>> world.look_at((0, 0), 40.0).shape, len(world.scene)
+    (torch.Size([3, 30, 40]), 130)
+    """
+
+    def __init__(
+        self,
+        picture: LargePicture | ImageLike | tuple[int, int],
+        size: tuple[int, int] = _VIEW,
+        *,
+        fields: tuple[float, ...] = FIELDS,
+        speeds: Speeds | None = None,
+        degree: float | None = None,
+        cell: float = 6.0,
+        color: Color = "rgb",
+    ) -> None:
+        self.opened: LargePicture | None = None
+        if not isinstance(picture, tuple):
+            self.opened = self._drawn = open_large(picture, color=color)
+            picture = self.opened.size
+        super().__init__(picture, size, fields=fields, speeds=speeds, degree=degree, cell=cell)
+
+    def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """The content of the window, resampled to the size of a view."""
+        if self.opened is None:
+            return super().view(pose)
+        pixels = self.opened.read(self._box(pose)).float()[None] / 255
+        return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
+
+
+World = Sphere | Plane
 """A scene of either kind: both have the same methods."""

@@ -23,16 +23,9 @@ class Views:
     one cell of a grid, `action = pose * 100 + cell`. So the loop that moves an eye over a picture also moves eye and
     head.
 
-    Attributes:
-        poses: `(P, 3)`, poses of the head.
-        tiling: for each field of view, rows of the numbers of poses whose views tile the scene.
-        grid: the strip.
-        view_grid: the cells of one view.
-        cells: number of cells of a view.
-        gaze: `(A, D)`, point of the scene that each action fixates.
-        gaze_cell: `(A,)`, cell of the scene that contains this point.
-        visible: for each pose, `(V,)`, the cells of the scene that its view shows.
-        points: for each pose, `(V, 2)`, the pixels of its view that show the middles of these cells.
+    `grid` is the strip, `view_grid` the cells of one view. Of the poses `(P, 3)` those of `tiling`, rows of numbers for
+    each field of view, tile the scene. Each action fixates a point `gaze` `(A, D)` in a cell `gaze_cell` `(A,)` of the
+    scene. From each pose the cells `visible` `(V,)` are seen, with their middles at the pixels `points` `(V, 2)`.
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:

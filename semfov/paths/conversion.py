@@ -22,9 +22,8 @@ from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
-from semfov.paths.merging import number_of
 from semfov.paths.outcome import Outcome
-from semfov.words import RECORD_WORDS, not_there
+from semfov.words import not_there
 
 if TYPE_CHECKING:
     import pandas
@@ -39,6 +38,20 @@ COLUMNS = ("object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", 
 _PIXELS = "pixels of the picture: x to the right, y down"
 """What the coordinates of a GeoJSON file are whose picture has no georeference."""
 
+_WORDS = {
+    **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
+    "box": "record.decision.box, or its objects, record.objects.boxes",
+    **dict.fromkeys(("confidence", "probability", "score"), "record.decision.probability"),
+    **dict.fromkeys(("outcome", "result"), "record.decision.outcome"),
+    **dict.fromkeys(("count", "counts", "number"), "len(record.objects), or record.expected with what was not seen"),
+    **dict.fromkeys(("dataframe", "df", "to_dataframe", "to_df", "to_pandas"), "record.to_frame()"),
+    **dict.fromkeys(("draw", "show", "visualize"), "record.plot()"),
+    **dict.fromkeys(("names",), "record.classes"),
+    **dict.fromkeys(("detections", "results"), "record.objects, or the detections of a look, record[0].detections"),
+    **dict.fromkeys(("to_html", "save_html"), "record.report(path)"),
+}
+"""What others call the attributes of a record, and ours."""
+
 
 class Conversion(Outcome):
     """Conversion of looks and objects to tables, and of objects to the formats of other libraries and of maps."""
@@ -49,7 +62,7 @@ class Conversion(Outcome):
     if not TYPE_CHECKING:  # to which any name would be one of a record
 
         def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, RECORD_WORDS)
+            return not_there(self, name, _WORDS)
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
@@ -64,7 +77,7 @@ class Conversion(Outcome):
         Returns:
             One dictionary for each look.
         """
-        closer = {number_of(look): look.place for look in self.closer}
+        closer = {look.of_look: look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
         rows: list[dict[str, Any]] = []
         for look in self:

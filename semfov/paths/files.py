@@ -80,11 +80,6 @@ _OTHERS = {
 """Calls that write files with these ends of names."""
 
 
-def pair(of: Json) -> Array:
-    """Requirements of two values of one kind."""
-    return Array(of, 2)
-
-
 class Format:
     """Format of the files of one kind of records: what they have beside the attributes of the base."""
 

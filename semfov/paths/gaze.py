@@ -29,7 +29,7 @@ from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import write_bytes
 from semfov.paths.base import Record
 from semfov.paths.stimulus import reduced_copy
-from semfov.words import GAZE_WORDS, not_there
+from semfov.words import not_there
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +43,14 @@ _LONGEST = 100
 
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
+
+_WORDS = {
+    **dict.fromkeys(("draw", "show", "visualize"), "gaze.plot()"),
+    **dict.fromkeys(("save", "to_png"), "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)"),
+    **dict.fromkeys(("heatmap", "map", "saliency"), "gaze.density"),
+    **dict.fromkeys(("fixations", "sample", "scanpath"), "gaze.scanpaths(people)"),
+}
+"""What others call the attributes of a prediction, and ours."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -75,7 +83,7 @@ class GazePrediction:
     if not TYPE_CHECKING:  # to which any name would be one of a prediction
 
         def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, GAZE_WORDS)
+            return not_there(self, name, _WORDS)
 
     @classmethod
     def of(

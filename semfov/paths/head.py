@@ -23,7 +23,7 @@ from semfov.head.views import Views
 from semfov.io.schema import Array, Field, Number, Object, Text
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
-from semfov.paths.files import POSITIVE, Format, pair
+from semfov.paths.files import POSITIVE, Format
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
@@ -39,13 +39,13 @@ _WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
 }
 _WORLD = {
     "kind": Text(tuple(_WORLDS)),
-    "picture": pair(Number(low=1, whole=True)),
-    "size": pair(Number(low=1, whole=True)),
+    "picture": Array(Number(low=1, whole=True), 2),
+    "size": Array(Number(low=1, whole=True), 2),
     "cell": POSITIVE,
     "reach": Number(0, 90),
     "degree": POSITIVE,
-    "pan": pair(Number()),
-    "tilt": pair(Number(-90, 90)),
+    "pan": Array(Number(), 2),
+    "tilt": Array(Number(-90, 90), 2),
 }
 
 _FORMAT = Format(

@@ -46,7 +46,7 @@ def merge_fixations(
         boxes.append(look.box[None].detach().float().cpu())
         scores.append(torch.tensor([look.place]))
         labels.append(torch.tensor([look.target]))
-        numbers.append(torch.tensor([number_of(look)]))
+        numbers.append(torch.tensor([look.of_look]))
         sharpness.append(torch.tensor([1.0]))
         broken.append(torch.tensor([False]))
     if not boxes:
@@ -64,8 +64,3 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
     at = (point + 0.5).to(boxes)
     beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)
     return torch.linalg.vector_norm(beside, dim=-1)
-
-
-def number_of(look: CloseUp) -> int:
-    """Number of the look that a closer look is, or after which it was made."""
-    return (look.fixation if look.number is None else look.number) or 0

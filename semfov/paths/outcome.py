@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -19,7 +19,7 @@ from semfov.detection.objects import LEAST, Objects
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
-from semfov.paths.merging import distances_to, merge_fixations, number_of
+from semfov.paths.merging import distances_to, merge_fixations
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -226,9 +226,9 @@ class Outcome(ABC):
         box = decision.box if decision is not None and decision.outcome == "found" else None
         # From a probability of one half on a closer look confirms that the target is there.
         others = [look for look in closer if look.place >= 0.5 and (box is None or not look.box.equal(box))]
-        places = [(look.box, look.target, look.place, number_of(look)) for look in others]
+        places = [(look.box, look.target, look.place, look.of_look) for look in others]
         if box is not None and decision is not None and self.target is not None:
-            number = next((number_of(look) for look in closer if look.box.equal(box)), len(self) - 1)
+            number = next((look.of_look for look in closer if look.box.equal(box)), len(self) - 1)
             probability = decision.probability if decision.place is None else decision.place
             places.append((box, self.target, probability, number))
         return places
@@ -236,7 +236,8 @@ class Outcome(ABC):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        objects, sure = _confirm(self.candidates.of(self._sought), self._confirmed_places, self._counts)
+        candidates = self.candidates.of(self._sought)
+        objects, sure = _confirm(candidates, self._confirmed_places, self._counts(candidates))
         if self.decision is not None and self.decision.outcome != "found":
             # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
             objects = objects[~sure | (objects.scores >= self.least)]
@@ -299,13 +300,11 @@ class Outcome(ABC):
 
 
 def _confirm(
-    candidates: Objects,
-    places: Sequence[tuple[Tensor, int, float, int]],
-    counting: Callable[[Objects], Tensor],
+    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], counts: Tensor
 ) -> tuple[Objects, Tensor]:
-    """The candidates that count, and those that were confirmed; and which of all these were, `(M,)`."""
+    """The candidates that count `(N,)`, and those that were confirmed; and which of all these were, `(M,)`."""
     boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
-    sure, counts = torch.zeros(len(candidates), dtype=torch.bool), counting(candidates)
+    sure = torch.zeros(len(candidates), dtype=torch.bool)
     for place, label, chance, look in places:
         box, probability = place[None].to(boxes), scores.new_tensor([chance])
         overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)

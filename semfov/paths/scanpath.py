@@ -22,11 +22,11 @@ from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Anything, Array, Field, Json, Maybe, Number, Object, Text
 from semfov.paths.base import Moment, Record
-from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
 
-_GRID: dict[str, Json] = {"grid": pair(Number(low=1, high=10_000, whole=True)), "size": pair(POSITIVE)}
+_GRID: dict[str, Json] = {"grid": Array(Number(low=1, high=10_000, whole=True), 2), "size": Array(POSITIVE, 2)}
 """JSON values of a grid in a file."""
 
 _SENSOR = {
@@ -45,7 +45,7 @@ _SETTINGS = Object(
     Anything(),
     ("sensor", "detector"),
 )
-_PLACEMENT = {"size": pair(POSITIVE), "scale": pair(POSITIVE), "offset": pair(WHOLE)}
+_PLACEMENT = {"size": Array(POSITIVE, 2), "scale": Array(POSITIVE, 2), "offset": Array(WHOLE, 2)}
 
 _FORMAT = Format(
     "scanpath",

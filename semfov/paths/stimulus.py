@@ -23,15 +23,9 @@ LONGEST = 1280
 class Stimulus:
     """The canvas from which foveated views of a photograph are made, as bytes.
 
-    The canvas is the photograph fitted into the detector's input, or into the canvas of the sensor. A view is computed
-    on request, by applying the sensor of the eye to the canvas. A stimulus from a file has no sensor, so the sensor is
-    made from its settings (`sensor_of`).
-
-    Attributes:
-        canvas: `(3, H, W)` uint8, RGB.
-        placement: scale and position of the photograph on the canvas.
-        settings: settings of sensor and detector (`Eye.settings`).
-        sensor: sensor of the eye; None makes one from the settings.
+    The canvas `(3, H, W)` is the photograph fitted into the detector's input, or into the canvas of the sensor. A view
+    is computed on request, by applying the sensor of the eye to the canvas. A stimulus from a file has no sensor, so
+    the sensor is made from the settings of the eye (`sensor_of`).
     """
 
     canvas: Tensor

@@ -15,7 +15,7 @@ from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
-from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, pair
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
 from semfov.zoom.certainty import SPREAD, number_of, reacts
 from semfov.zoom.closer import SEEN
@@ -33,8 +33,8 @@ _WINDOW = Object(_WINDOW_VALUES, None, tuple(_WINDOW_VALUES))
 """A window in a file."""
 
 _LATTICE = {
-    "size": pair(Number(low=1, whole=True)),
-    "canvas": pair(Number(low=1, whole=True)),
+    "size": Array(Number(low=1, whole=True), 2),
+    "canvas": Array(Number(low=1, whole=True), 2),
     "magnifications": Array(POSITIVE, least=1, ascending=True),
 }
 _OBJECTS = ("boxes", "scores", "labels", "passes")
@@ -53,7 +53,7 @@ _TENSORS = {
 _VALUES: dict[str, Json] = {
     "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
     "windows": Array(_WINDOW, "n"),
-    "unseen": Maybe(pair(Number(low=0))),
+    "unseen": Maybe(Array(Number(low=0), 2)),
     "spread": Maybe(Number(low=0)),
     "seconds": Array(Number(low=0)),
 }

@@ -15,14 +15,7 @@ SensorName = Literal["published", "published-narrow", "gradual", "log-polar", "m
 
 @dataclass(frozen=True)
 class _NamedSensor:
-    """How a named sensor is made.
-
-    Attributes:
-        make: class of the sensor.
-        settings: all settings of the class.
-        published: whether the sensor is one of the paper's, for which observation models that are fitted by maximum
-            likelihood are shipped.
-    """
+    """How a named sensor is made; for those of the paper observation models of maximum likelihood are shipped."""
 
     make: type[Sensor]
     settings: Mapping[str, Any]

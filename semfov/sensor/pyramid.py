@@ -24,13 +24,7 @@ _REDUCED, _EXPANDED = (8, 32), (8, 16)
 
 @dataclass(frozen=True)
 class Bands:
-    """A Laplacian pyramid, see `laplacian_pyramid`.
-
-    Attributes:
-        details: bands `L_0..L_{K-1}`, `(B, C, h_k, w_k)`, finest first.
-        base: the coarsest level `G_K`.
-        convention: convention of the pyramid, which determines the positions of a band's pixels in the image.
-    """
+    """A Laplacian pyramid: bands `L_0..L_{K-1}`, `(B, C, h_k, w_k)`, finest first, and the coarsest level `G_K`."""
 
     details: tuple[Tensor, ...]
     base: Tensor

@@ -133,12 +133,7 @@ class Boxes:
 
 @dataclass(frozen=True)
 class Regions(Boxes):
-    """The regions of the sphere that boxes in camera images cover, exact also at the poles and across the seam.
-
-    Attributes:
-        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
-        camera: cameras of M poses.
-    """
+    """Regions of the sphere that boxes in the images of M cameras cover, exact also at the poles and at the seam."""
 
     camera: Camera
 

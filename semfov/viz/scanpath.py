@@ -16,7 +16,6 @@ from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
-from semfov.paths.merging import number_of
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     LABEL,
@@ -70,7 +69,7 @@ def _draw_objects(
     last = len(record) if last is None else last
     rows = [row for row in record.object_rows() if row["look"] <= last]
     width, height = record.size
-    refuted = [look.box for look in record.refuted if number_of(look) <= last]
+    refuted = [look.box for look in record.refuted if look.of_look <= last]
     drawn = [artist for box in refuted for artist in draw_boxes(axes, box[None], FOUND, ":", 1.6)]
     tags: list[Tag] = []
     many = len(rows) > _NAMED

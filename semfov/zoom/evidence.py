@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.belief.evidence import neighbourhood_peak
+from semfov.belief.evidence import neighbourhood_peak, network
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
@@ -98,7 +98,7 @@ def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> T
     return ((place[:, None] - place).abs() <= side // 2).to(dtype) / side
 
 
-def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
+def _through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
     """Compute selected outputs of a network without calls of modules, which cost most of the time in one so small."""
     last = len(network) - 1
     for place, layer in enumerate(network):
@@ -113,13 +113,6 @@ def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None
         elif layer.training:  # dropout
             values = layer(values)
     return values
-
-
-def _small_network(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    """A network of two hidden layers."""
-    return nn.Sequential(
-        nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
-    )
 
 
 class Survey(nn.Module):
@@ -140,7 +133,7 @@ class Survey(nn.Module):
         self.foresight = foresight
         self.mix = nn.Linear(classes, _CHANNELS, bias=False)
         nn.init.normal_(self.mix.weight, std=0.3)
-        self.rate = _small_network(_INPUTS, _WIDTH, STEPS)
+        self.rate = network(_INPUTS, _WIDTH, STEPS)
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
 
     def rates(self, look: Gist, targets: Tensor | None = None, before: Tensor | None = None) -> Tensor:
@@ -161,7 +154,7 @@ class Survey(nn.Module):
             *_memory_maps(best[None], before),
         ]
         maps = torch.cat([*best_maps, kinds, _neighbourhood_mean(kinds, _NEAR), *surroundings])
-        value = through(self.rate, maps.movedim(0, -1)) - 6
+        value = _through(self.rate, maps.movedim(0, -1)) - 6
         return value.clamp(max=3).movedim(-1, 0)[None]
 
     def taper(self, span: int) -> Tensor:
@@ -327,9 +320,9 @@ class GlimpseEvidence(Pretrained):
         self.company = nn.Sequential(
             nn.Linear(classes + _SUMMARY + 1, width), nn.GELU(), nn.Dropout(0.4), nn.Linear(width, classes)
         )
-        self.shape = _small_network(_SHAPE, _SHAPE_WIDTH, 1)
-        self.rate = _small_network(_RATE, _RATE_WIDTH, STEPS)
-        self.judge = _small_network(CASE, _JUDGE_WIDTH, 1)
+        self.shape = network(_SHAPE, _SHAPE_WIDTH)
+        self.rate = network(_RATE, _RATE_WIDTH, STEPS)
+        self.judge = network(CASE, _JUDGE_WIDTH)
         with torch.no_grad():
             # Until the network is fitted, the best score is the probability.
             for parameter in self.judge[-1].parameters():
@@ -381,7 +374,7 @@ class GlimpseEvidence(Pretrained):
         if target is not None:
             one = slice(target - 1, target)
             own, slope, offset = own[:, one], slope[one], offset[one]
-        value = slope * own + offset + through(self.company, inputs, one)
+        value = slope * own + offset + _through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
         facts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), value]
         return torch.stack(facts, -1)
@@ -399,7 +392,7 @@ class GlimpseEvidence(Pretrained):
         own = facts[..., :1]
         earlier = torch.zeros_like(own) if before is None else before.view_as(own) / 3
         inputs = torch.cat([facts[..., :5], earlier, torch.full_like(own, float(before is not None))], -1)
-        value: Tensor = facts[..., 5] + through(self.shape, inputs)[..., 0]
+        value: Tensor = facts[..., 5] + _through(self.shape, inputs)[..., 0]
         return value
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
@@ -428,7 +421,7 @@ class GlimpseEvidence(Pretrained):
         usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
         crowd = _neighbourhood_mean(best[None], _CROWD)[0]
         maps = [*_hint_maps(own, best, detections, look.size, crowd), usual.expand_as(own), *_memory_maps(own, before)]
-        value: Tensor = through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
+        value: Tensor = _through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
@@ -441,7 +434,7 @@ class GlimpseEvidence(Pretrained):
         Returns:
             Log odds, `(...)`.
         """
-        value: Tensor = torch.logit(best, eps=1e-4) + through(self.judge, case)[..., 0]
+        value: Tensor = torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
         return value
 
     def taper(self, span: int) -> Tensor:

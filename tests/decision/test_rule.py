@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid, InputError
+from semfov.agents.fovea import _goal_cells
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import Decision, conclude, decide, goal_cells
-from semfov.decision.rule import _strength, _strongest
+from semfov.decision import Decision, conclude, decide
 from semfov.gaze.policies import Policy
 from tests.small import Coloured
 
@@ -116,9 +116,9 @@ def random_looks(count, most, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_strongest_detection_equals_a_loop(seed):
+def test_the_box_of_a_decision_is_that_of_the_strongest_detection_by_a_loop(seed):
     grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
-    parts = [looks[row : row + 1] for row in range(3)]
+    parts, belief = [looks[row : row + 1] for row in range(3)], Known(torch.zeros(1, 12), torch.ones(1), None)
     for cell in range(12):
         for target in (1, 3):
             best, expected = 0.0, None
@@ -131,21 +131,18 @@ def test_strongest_detection_equals_a_loop(seed):
                     score = weight * float(looks.scores[look, detection, target])
                     if score > best * (1 + 1e-6):
                         best, expected = score, box
-            evidence, got = _strongest(parts, grid, cell, target)
-            assert evidence == pytest.approx(best)
+            got = conclude(1, belief, parts, grid, target, cell).box
             assert (got is None) == (expected is None)
             if expected is not None:
                 assert torch.equal(got, expected)
 
 
-def test_strongest_detection_without_overlapping_detections_is_none():
-    grid = Grid(4, 3, SIZE)
-    assert _strongest([], grid, 0, 1) == (0.0, None)
-    assert _strongest([Detections.empty(1, 3)], grid, 0, 1) == (0.0, None)
+def test_a_decision_has_no_box_where_no_detection_overlaps_the_cell():
     far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
-    assert _strongest([far], grid, 0, 1) == (0.0, None)
-    assert _strongest([far], grid, 11, 1)[1].tolist() == [130, 100, 150, 110]
-    assert _strongest([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) == (0.0, None)
+    masked, belief = replace(far, mask=torch.zeros(1, 1).bool()), Known(torch.zeros(1, 12), torch.ones(1), None)
+    for looks, cell in (([], 0), ([Detections.empty(1, 3)], 0), ([far], 0), ([masked], 11)):
+        assert conclude(1, belief, looks, Grid(4, 3, SIZE), 1, cell).box is None
+    assert conclude(1, belief, [far], Grid(4, 3, SIZE), 1, 11).box.tolist() == [130, 100, 150, 110]
 
 
 class Square(Coloured):
@@ -249,14 +246,13 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     ]
     decision = conclude(1, belief, parts, grid, 2)
     assert decision.cell == value.index(max(value))
-    assert torch.equal(decision.box, _strongest(parts, grid, decision.cell, 2)[1])
+    assert torch.equal(decision.box, conclude(1, belief, parts, grid, 2, decision.cell).box)
     assert decision.probability == 0.75
     assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
     # Without detections the belief alone decides.
     nothing = [Detections.empty(1, 3)]
     assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
-    assert _strength(nothing[0], grid, 2).tolist() == [0.0] * 12
 
 
 @pytest.mark.parametrize(
@@ -341,7 +337,7 @@ def test_without_thresholds_a_detection_confirms_the_target(image):
 
 def test_goal_cells_are_the_cells_that_boxes_overlap():
     grid = Grid(4, 2, (80, 40))
-    assert goal_cells([[0, 0, 20, 20], [61, 21, 80, 40]], grid, torch.zeros(())).nonzero()[:, 0].tolist() == [0, 7]
+    assert _goal_cells([[0, 0, 20, 20], [61, 21, 80, 40]], grid, torch.zeros(())).nonzero()[:, 0].tolist() == [0, 7]
     for wrong, message in (
         ([[20, 0, 0, 20]], "x1 < x2"),
         ([0.0, 0, 20, 20], "shape"),
@@ -349,4 +345,4 @@ def test_goal_cells_are_the_cells_that_boxes_overlap():
         ([[0, 0, math.inf, 5]], "finite"),
     ):
         with pytest.raises(InputError, match=f"boxes: .*{message}"):
-            goal_cells(wrong, grid, torch.zeros(()))
+            _goal_cells(wrong, grid, torch.zeros(()))

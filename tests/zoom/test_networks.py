@@ -5,23 +5,24 @@ import torch
 from torch.nn import functional
 
 from semfov.belief.evidence import neighbourhood_peak
+from semfov.belief.evidence import network as small_network
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import _neighbourhood_mean, _small_network, features, through
+from semfov.zoom.evidence import _neighbourhood_mean, _through, features
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
 def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     torch.manual_seed(0)
-    network, values = _small_network(5, 16, 3).to(device), torch.randn(shape, device=device)
+    network, values = small_network(5, 16, 3).to(device), torch.randn(shape, device=device)
     expected = network(values)
-    torch.testing.assert_close(through(network, values), expected)
-    torch.testing.assert_close(through(network, values, slice(1, 2)), expected[..., 1:2])
+    torch.testing.assert_close(_through(network, values), expected)
+    torch.testing.assert_close(_through(network, values, slice(1, 2)), expected[..., 1:2])
 
 
 def test_a_network_called_layer_by_layer_has_the_gradient_of_the_module():
     torch.manual_seed(0)
-    network, values = _small_network(5, 16, 3), torch.randn(40, 5)
-    (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
+    network, values = small_network(5, 16, 3), torch.randn(40, 5)
+    (gradient,) = torch.autograd.grad(_through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)
 

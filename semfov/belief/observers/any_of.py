@@ -49,11 +49,6 @@ class _AnyBelief(Belief):
         """Probability that an object that is meant is anywhere in the image, `(B,)`."""
         return self._any(lambda belief, index: belief.presence(index))
 
-    def likeliest(self) -> Tensor:
-        """The class with the most probable cell, weights included, `(B,)`."""
-        peaks = [weight * belief.probability(index).amax(-1) for belief, index, weight in self._each()]
-        return torch.tensor(list(self.weights), device=peaks[0].device)[torch.stack(peaks).argmax(0)]
-
     def _each(self) -> list[tuple[Belief, int, float]]:
         beliefs = self.inner if len(self.inner) > 1 else self.inner * len(self.weights)
         return [(belief, index, weight) for belief, (index, weight) in zip(beliefs, self.weights.items(), strict=True)]
@@ -120,5 +115,8 @@ class AnyOf(Observer):
 
 
 def class_meant(belief: Belief, target: int) -> int:
-    """The class that a search is about: the likeliest one of several, otherwise the target."""
-    return int(belief.likeliest()) if isinstance(belief, _AnyBelief) else target
+    """The class that a search is about: of several the one with the most probable cell, weights included."""
+    if not isinstance(belief, _AnyBelief):
+        return target
+    peaks = [weight * each.probability(index).amax(-1) for each, index, weight in belief._each()]
+    return list(belief.weights)[int(torch.stack(peaks).argmax(0))]

@@ -77,29 +77,17 @@ class LearnedMap(Gatherer[MapEvidence]):
         belief, look = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
         columns = look.columns
         all_looks = self.gather(belief, look)
-        gathered = *self.read(all_looks), look.target, look.stands_for
-        probabilities = self.each(lambda *rows: self._read(*rows, columns=columns), *gathered)
-        return MapBelief(**all_looks, probabilities=probabilities)
 
-    def _read(
-        self,
-        nearest: Tensor,
-        best: Tensor,
-        mean: Tensor,
-        closest: Tensor,
-        score: Tensor,
-        looks: Tensor,
-        visited: Tensor,
-        targets: Tensor,
-        stands_for: Tensor,
-        *,
-        columns: int,
-    ) -> Tensor:
-        """Probabilities `(B, X·Y, T+1)` from the gathered evidence."""
-        classes = nearest.shape[1]
-        nearest, best, mean = (values.flatten(0, 1) for values in (nearest, best, mean))
-        distance, number, seen = (values.repeat_interleave(classes, 0) for values in (closest, looks, visited))
-        rows = Gathered(nearest, best, mean, distance, score.flatten(), number, seen, targets.flatten())
-        cells = self.model.log_odds(rows, columns, classes)
-        nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
-        return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)
+        def probabilities(*gathered: Tensor) -> Tensor:
+            """Probabilities `(B, X·Y, T+1)` from the gathered evidence, whose rows are of T classes each."""
+            *by_class, closest, score, looks, visited, targets, stands_for = gathered
+            classes = by_class[0].shape[1]
+            nearest, best, mean = (values.flatten(0, 1) for values in by_class)
+            distance, number, seen = (values.repeat_interleave(classes, 0) for values in (closest, looks, visited))
+            rows = Gathered(nearest, best, mean, distance, score.flatten(), number, seen, targets.flatten())
+            cells = self.model.log_odds(rows, columns, classes)
+            nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
+            return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)
+
+        values = self.each(probabilities, *self.read(all_looks), look.target, look.stands_for)
+        return MapBelief(**all_looks, probabilities=values)

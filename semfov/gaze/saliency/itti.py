@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike, as_batch
-from semfov.errors import check, check_shape
 from semfov.gaze.saliency.blur import rescale
 from semfov.gaze.saliency.opponent import anchor, double_opponency
 from semfov.sensor.lines import constant
@@ -32,7 +31,6 @@ _FLAT = 32
 
 def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
     """Dyadic Gaussian pyramid (`cv2.pyrDown`); channels `(B, C, H, W)`."""
-    check(levels >= 0, "levels", "0 or more", levels)
     pyramid = [channels]
     for _ in range(levels):
         pyramid.append(pyrdown(pyramid[-1], "opencv"))
@@ -64,7 +62,6 @@ def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIE
 
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
-    check_shape(intensity, "intensity", None, 1, None, None)
     kernels = _gabor_kernels(tuple(orientations), intensity.dtype, intensity.device)
     reach = _TAPS // 2
     answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels)

@@ -8,11 +8,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike, as_batch
-from semfov.errors import check, check_shape, lookup
+from semfov.errors import check, lookup
 from semfov.gaze.saliency.blur import enlarge, gaussian_blur, rescale
 from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 _ColorSpace = Literal["opponent", "lab"]
+_Fusion = Literal["mean", "max"]
 
 # Maps of `lab` with a smaller range, in units of the rounding error at 1, hold rounding errors alone.
 _FLAT = 8
@@ -40,8 +41,6 @@ def _twin_pyramids(
 
     Shapes: channels `(B, C, H, W)`.
     """
-    check_shape(channels, "channels", None, None, None, None)
-    check(min(channels.shape[-2:]) > 0, "channels", "at least one pixel", tuple(channels.shape))
     _check_settings(centre_sigma, surround_sigma, layers, scales)
     wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
     # From one scale to the next the variance grows by this factor.
@@ -62,18 +61,11 @@ def _twin_pyramids(
     return pyramids
 
 
-_Fusion = Literal["mean", "max"]
-
-
 def _combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: _Fusion = "mean") -> Tensor:
     """Mean or maximum of all maps, each enlarged to `size` by cubic interpolation.
 
     Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
     """
-    lookup(fusion, get_args(_Fusion), "fusion")
-    check(len(maps) > 0, "maps", "at least one tensor", 0)
-    for layer in maps:
-        check_shape(layer, "maps", maps[0].shape[0], maps[0].shape[1], None, None)
     if fusion == "mean":
         # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
         enlarged = (enlarge(layer.mean(1), size) for layer in maps)
@@ -124,7 +116,7 @@ def vocus2_saliency(
     >>> 10 <= row < 14 and 30 <= column < 34
     True
     """
-    lookup(fusion, ("mean", "max"), "fusion")
+    lookup(fusion, get_args(_Fusion), "fusion")
     lookup(color_space, get_args(_ColorSpace), "color space")
     # Contrasts are small differences, so half precision is not enough.
     with torch.autocast(image.device.type, enabled=False):
@@ -169,7 +161,7 @@ class VOCUS2(nn.Module):
     ) -> None:
         super().__init__()
         _check_settings(centre_sigma, surround_sigma, layers, scales)
-        lookup(fusion, ("mean", "max"), "fusion")
+        lookup(fusion, get_args(_Fusion), "fusion")
         lookup(color_space, get_args(_ColorSpace), "color space")
         self.centre_sigma = centre_sigma
         self.surround_sigma = surround_sigma

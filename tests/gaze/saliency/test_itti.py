@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
-from semfov.gaze.saliency.itti import _dyadic_pyramid, _orientation_energy, _promote
+from semfov.gaze.saliency.itti import _promote
 from tests.refusals import refused
 
 
@@ -123,5 +123,3 @@ def test_gradients_without_normalising_and_of_a_uniform_image():
 
 def test_bad_input() -> None:
     refused("image", IttiKoch(), torch.zeros(1, 4, 8, 8))
-    refused("levels", _dyadic_pyramid, torch.zeros(1, 3, 8, 8), -1)
-    refused("intensity", _orientation_energy, torch.zeros(1, 3, 8, 8))

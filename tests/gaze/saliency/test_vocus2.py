@@ -9,7 +9,6 @@ import torch
 from skimage import color
 
 from semfov.gaze.saliency import VOCUS2, vocus2_saliency
-from semfov.gaze.saliency.vocus2 import _twin_pyramids
 from tests.refusals import refused
 
 
@@ -129,4 +128,4 @@ def test_bad_settings(settings: dict[str, object]) -> None:
 
 def test_bad_image() -> None:
     refused("image", VOCUS2(), torch.zeros(2, 3, 8, 8, 8))
-    refused("channels", _twin_pyramids, torch.zeros(1, 3, 0, 8))
+    refused("image", VOCUS2(), torch.zeros(1, 3, 0, 8))
