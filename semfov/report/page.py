@@ -90,11 +90,14 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
+    about = _about_html(episodes)
     contents = {
         "title": escape(title),
         "data": json_script(data),
         "sections": sections,
-        "about": _about_html(episodes),
+        # What the sections sum up comes before the facts about one episode.
+        "about": "" if sections else about,
+        "of_episode": about if sections else "",
         "looks": "".join(
             _looks_html(episode, f"large-{number}", headed=number == 0)
             for number, episode in enumerate(episodes)

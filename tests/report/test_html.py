@@ -45,6 +45,14 @@ def test_names_are_never_interpreted_as_markup(kind, hostile, request):
     assert hostile in {each["label"] for each in episode["maps"]}
 
 
+def test_a_page_begins_with_its_summary_or_else_with_the_facts_of_the_episode(run_page, scanpath, image, tmp_path):
+    run = run_page.read_text(encoding="utf-8")
+    assert run.index("<section><h2>") < run.index('id="viewer"') < run.index('id="about"')
+    data = episode_data(scanpath, image, [image] * 3, name="kitchen")
+    single = write_page(tmp_path / "page.html", "Cup", [data]).read_text(encoding="utf-8")
+    assert single.index('id="about"') < single.index('id="viewer"')
+
+
 def test_names_are_not_interpreted_as_placeholders_of_the_template(scanpath, image, tmp_path):
     data = episode_data(scanpath, image, [image] * 3, name="{{program}}")
     page = write_page(tmp_path / "page.html", "{{data}}", [data]).read_text(encoding="utf-8")
