@@ -323,7 +323,7 @@ def _objects(data: Data, place: str) -> str:
     rows = []
     for order, each in enumerate(data["objects"], 1):
         cells = [escape(each["label"]), f"{each['score']:.2f}"]
-        cells += [f"{each['pan']:.0f}°, {each['tilt']:.0f}°"] if data["turns"] else []
+        cells += [f"{each['pan']:z.0f}°, {each['tilt']:z.0f}°"] if data["turns"] else []
         cells += [str(each["look"]), *(["yes" if each["confirmed"] else "no"] if data["confirmable"] else [])]
         cells.append(_corners(each["box"]))
         rows.append(

@@ -77,6 +77,7 @@ def test_boxes_of_a_flat_scene_are_in_pixels_of_the_picture(agent):
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
     first = agent.search(Flat(image, degree=4), "green", passes=1, confirm=1.0)
+    assert first.page_data()["looks"][0]["turned"].startswith("pan 0°, tilt 0°, ")  # and not -0°
     seen = [n for n, gaze in enumerate(first.views.gaze) if (gaze - torch.tensor([519.5, 219.5])).abs().max() < 30]
     paths = [agent.search(Flat(image, degree=4), "green", passes=1, confirm=0.0, start=start) for start in seen]
     boxes = torch.stack([path.decision.box for path in paths if path.decision.box is not None])
