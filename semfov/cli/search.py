@@ -257,8 +257,8 @@ def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
                 tqdm.write(outcome.text, file=sys.stdout)
         complete = True
         longest = max((max(row["width"], row["height"]) for row in outputs.rows.values() if "width" in row), default=0)
-        detector = job.agent.eye.detector
-        if detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):
+        detector, by_windows = job.agent.eye.detector, job.options.how in ("auto", "windows")
+        if by_windows and detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):
             print("in large pictures yolox-nano finds more small objects, in less time: --detector yolox-nano")
     finally:
         if outputs.rows:

@@ -588,6 +588,8 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     agent.eye.detector.name = "yolov3-tiny"  # which finds fewer small objects
     _, printed = run("explore", large, "--worth", 1000)
     assert "--detector yolox-nano" in printed.out
+    _, printed = run("explore", large, "--how", "fovea", "--shifts", 1)
+    assert "--detector yolox-nano" not in printed.out
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):
