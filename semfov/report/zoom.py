@@ -105,7 +105,8 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     turned = None
     if path.how == "head":
-        turned = "pan {pan:z.0f}°, tilt {tilt:z.0f}°, field of view {field:.0f}°".format(**look.more)
+        pan, tilt, field = (look.more[name] for name in ("pan", "tilt", "field"))
+        turned = f"pan {pan:z.0f}°, tilt {tilt:z.0f}°, field of view {field:.0f}°"
     where = f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}" if turned is None else f": {turned}"
     where = ", at the whole picture" if whole else where
     sentences = [f"Look {number} of {len(path) - 1}{where}."]
