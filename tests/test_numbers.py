@@ -30,7 +30,7 @@ from semfov.head import Speeds
 from semfov.live import _FOVEA_RATE, _WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
-from semfov.zoom.closer import PART, PhotographPlaces
+from semfov.zoom.closer import USUAL_WINDOW, PhotographPlaces
 from semfov.zoom.eye import _WIDE_BORDER
 from tests.test_house_rules import MOST_LINES
 
@@ -132,7 +132,7 @@ KNOWN = {
     "docs/zoom.md": {
         f"confidence of {FAINT}": "code",
         f"candidates of {PhotographPlaces.least}": "code",
-        f"window is {PART} times as long": "code",
+        f"window is {USUAL_WINDOW[0]} times as long": "code",
         f"within {_WIDE_BORDER:g} canvas px": "code",
         "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
         f"probability {LIKELY} on": "code",
@@ -158,7 +158,7 @@ KNOWN = {
         "is 0.356 ± 0.051 higher (331 held-out": "a study that was removed; the page names the commits",
     },
     "docs/decisions/closer_looks.md": {
-        f"shows {PART} of the longer side": "code",
+        f"shows {USUAL_WINDOW[0]} of the longer side": "code",
         "photograph holds and 25 that": "tried on the fit set, without a command",
         "958 searches of 116 photographs": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",

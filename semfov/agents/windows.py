@@ -25,7 +25,7 @@ from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells, not_blank
 from semfov.zoom.certainty import SPREAD
-from semfov.zoom.closer import candidates, closer_window, look_closely
+from semfov.zoom.closer import USUAL_WINDOW, candidates, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
@@ -276,6 +276,8 @@ class WindowEpisode(Episode[ZoomPath]):
     ) -> None:
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
+        photograph = None if evidence is None else evidence.photograph
+        self._closer = USUAL_WINDOW if photograph is None else photograph.window
         self.batch, self.worth, self._least = batch, worth, least
         self._confirm = 0.5 if confirm is None else confirm
         self._decisions: WindowDecisions | None = None
@@ -389,7 +391,7 @@ class WindowEpisode(Episode[ZoomPath]):
     def _close_up(self, box: Tensor) -> Detections:
         """Spend a pass on a closer look at a box."""
         assert self._glances is not None
-        glance = look_closely(self._glances, box)
+        glance = look_closely(self._glances, box, self._closer)
         self._looks.append(_Look(self.passes, self._frame, glance, 0.0, perf_counter() - self._began, closely=True))
         self.passes += 1
         return candidates(glance)
@@ -456,7 +458,7 @@ class WindowEpisode(Episode[ZoomPath]):
             number=self.passes - 1,
             next_window=self._last.choices[0][0]
             if candidate is None
-            else closer_window(self._glances.lattice, candidate.box),
+            else closer_window(self._glances.lattice, candidate.box, self._closer),
         )
 
     def _recorded(self) -> dict[str, Any]:

@@ -64,12 +64,12 @@ class _WholeSearch(TargetSearch[WindowLook]):
         *,
         spare: bool = False,
     ) -> None:
-        places = partial(PhotographPlaces, target, glances.lattice)
+        places = partial(PhotographPlaces, target, glances.lattice, window=model.window)
         super().__init__(
             number,
             target,
             places,
-            lambda box: candidates(look_closely(glances, box)),
+            lambda box: candidates(look_closely(glances, box, model.window)),
             present=len(objects) > 0,
             spare=spare,
         )
@@ -109,7 +109,7 @@ def fit_photographs(
     count, held = len(pictures), torch.zeros(len(pictures), model.classes, dtype=torch.bool)
     for index in range(count):
         held[index, pictures.annotation(index).labels - 1] = True
-    evidence = PhotographEvidence(model.classes).eval().requires_grad_(False)
+    evidence = PhotographEvidence(model.classes, window=config.window).eval().requires_grad_(False)
     evidence.usual.copy_(_usual(held.sum(0), count))
     searches: list[_WholeSearch] = []
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}

@@ -8,6 +8,7 @@ from semfov.fit.settings import FitConfig
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Count, Range, Share, Whole
 from semfov.runs.window_looking import TileSize
+from semfov.zoom.closer import USUAL_WINDOW
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class FitMosaicsConfig(FitConfig):
         photographs: number of photographs that are looked at by themselves, those with most pixels first, to fit the
             evidence for photographs; 0 leaves it out.
         worth: least worth of a closer look in a photograph: the probability that it shows the target at a new place.
+        window: the window of a closer look in a photograph: its least side, in longer sides of the photograph, and its
+            side in longer sides of the place.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
@@ -63,6 +66,7 @@ class FitMosaicsConfig(FitConfig):
     place: Share = 0.2
     photographs: Whole = 320
     worth: Share = 0.2
+    window: tuple[Share, float] = USUAL_WINDOW
     steps: Count = 800
     survey_steps: Count = 1500
     judging: Count = 300

@@ -19,8 +19,8 @@ from semfov.zoom.lattice import Lattice
 _CONTEXT = 3.0
 """Side of the window of a closer look, in longer sides of the examined box."""
 
-PART, _AROUND = 0.6, 2.0
-"""Least side of that window in a photograph, in longer sides of the photograph, and of the box."""
+USUAL_WINDOW = 0.6, 2.0
+"""Least side of that window in a photograph, in longer sides of the photograph, and its side in those of the box."""
 
 MOST_IN_PHOTOGRAPH = 3
 """Default for the largest number of closer looks in a photograph: more would go to the objects of a crowd."""
@@ -34,14 +34,14 @@ _WHOLE = 0.9
 _SMALLEST = 1e-4
 
 
-def closer_window(lattice: Lattice, box: Tensor) -> Window:
+def closer_window(lattice: Lattice, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Window:
     """The window that shows a box closely, with its surroundings; box `(4,)`.
 
     It is three times as large as the longer side of the box (`semfov.sensor.glimpse.window_around`), but its
-    magnification is at most one octave above that of the last level: pictures show no more beyond it. In a photograph
-    it is twice as large, and at least 0.6 of the longer side: it shows other places, too.
+    magnification is at most one octave above that of the last level: pictures show no more beyond it. In a `photograph`
+    two numbers of its evidence say how large it is: usually 0.6 of the longer side at least, to show other places, too.
     """
-    context, least = _AROUND, PART
+    least, context = photograph
     if lattice.levels > 1:
         context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
     window = window_around(box.double(), lattice.size, context=context, least=least)
@@ -49,9 +49,9 @@ def closer_window(lattice: Lattice, box: Tensor) -> Window:
     return around(lattice, (x1, y1, x2, y2))
 
 
-def look_closely(glances: Glances, box: Tensor) -> Glance:
+def look_closely(glances: Glances, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Glance:
     """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
-    return glances.see([closer_window(glances.lattice, box)], hints=glances.lattice.levels == 1)[0]
+    return glances.see([closer_window(glances.lattice, box, photograph)], hints=glances.lattice.levels == 1)[0]
 
 
 def candidates(glance: Glance) -> Detections:
@@ -160,9 +160,15 @@ class PhotographPlaces(CandidateBoxes):
     least = SEEN
     by_worth = True
 
-    def __init__(self, target: int, lattice: Lattice, forgetting: Forgetting | None = None) -> None:
+    def __init__(
+        self,
+        target: int,
+        lattice: Lattice,
+        forgetting: Forgetting | None = None,
+        window: tuple[float, float] = USUAL_WINDOW,
+    ) -> None:
         super().__init__(target, 0.0, forgetting)
-        self._lattice = lattice
+        self._lattice, self._window = lattice, window
 
     @property
     def left(self) -> float:
@@ -177,7 +183,7 @@ class PhotographPlaces(CandidateBoxes):
 
     def seen(self, candidate: CandidatePlace) -> bool:
         """Whether the window that shows a place is nearly the whole photograph."""
-        x1, y1, x2, y2 = closer_window(self._lattice, candidate.box).region(self._lattice)
+        x1, y1, x2, y2 = closer_window(self._lattice, candidate.box, self._window).region(self._lattice)
         return (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:

@@ -148,7 +148,7 @@ class WindowDecisions:
             if photograph is None:
                 places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting)
             else:
-                places = PhotographPlaces(self.target, belief.lattice, self._forgetting)
+                places = PhotographPlaces(self.target, belief.lattice, self._forgetting, photograph.window)
                 at = at.changed(place=worth)  # all further looks are closer ones
             self.verifier = Verifier(model, places, self._close_up, at, most)
             self.criterion = self.verifier.criterion

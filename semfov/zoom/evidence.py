@@ -18,6 +18,7 @@ from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 from semfov.sensor.lines import constant
 from semfov.zoom.certainty import Certainty
+from semfov.zoom.closer import USUAL_WINDOW
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
@@ -170,7 +171,8 @@ class PhotographEvidence(nn.Module):
 
     .. math:: \operatorname{logit} P(t) = a \operatorname{logit} s + b \operatorname{logit} q_t + c
 
-    `verification` has the probabilities after a closer look, and `certainty` that of an object.
+    `verification` has the probabilities after a closer look, and `certainty` that of an object. `window` is the size of
+    the window of a closer look (`semfov.zoom.closer.closer_window`).
 
     Shapes: usual `(K,)`, :math:`\operatorname{logit} q`.
     """
@@ -178,9 +180,15 @@ class PhotographEvidence(nn.Module):
     usual: Tensor
 
     def __init__(
-        self, classes: int, *, thresholds: Thresholds | None = None, certainty: Certainty | None = None
+        self,
+        classes: int,
+        *,
+        thresholds: Thresholds | None = None,
+        certainty: Certainty | None = None,
+        window: tuple[float, float] = USUAL_WINDOW,
     ) -> None:
         super().__init__()
+        self.window = window
         self.register_buffer("usual", torch.zeros(classes))
         self.whole = nn.Linear(2, 1)
         self.verification = Verification(thresholds=thresholds)
@@ -289,7 +297,13 @@ class GlimpseEvidence(Pretrained):
             "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
             "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
             "photograph": Maybe(
-                Object({"thresholds": THRESHOLDS, "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST)))})
+                Object(
+                    {
+                        "thresholds": THRESHOLDS,
+                        "certainty": Maybe(Array(Number(low=-_LARGEST, high=_LARGEST))),
+                        "window": Array((Number(above=0, high=1), Number(1, _LARGEST))),
+                    }
+                )
             ),
         },
     )
@@ -481,7 +495,11 @@ class GlimpseEvidence(Pretrained):
             "verification": verified and {"thresholds": verified.thresholds and asdict(verified.thresholds)},
             "certainty": self.certainty and self.certainty.numbers,
             "photograph": own
-            and {"thresholds": at and asdict(at), "certainty": own.certainty and own.certainty.numbers},
+            and {
+                "thresholds": at and asdict(at),
+                "certainty": own.certainty and own.certainty.numbers,
+                "window": list(own.window),
+            },
         }
 
     @classmethod
@@ -490,6 +508,7 @@ class GlimpseEvidence(Pretrained):
         verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
         chosen, sure = record["thresholds"], verified and verified["thresholds"]
         at, certain = (photograph and photograph[name] for name in ("thresholds", "certainty"))
+        least, context = (photograph or {}).get("window", USUAL_WINDOW)
         model = cls(
             record["classes"],
             record["width"],
@@ -503,6 +522,7 @@ class GlimpseEvidence(Pretrained):
                 record["classes"],
                 thresholds=at and Thresholds(**at),
                 certainty=None if certain is None else Certainty.of(certain),
+                window=(least, context),
             ),
             metadata=record["metadata"],
         )

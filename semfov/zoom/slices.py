@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 import torch
 
-from semfov.zoom.closer import PART
 from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Window, around
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
+
+_PART = 0.6
+"""Side of a slice of a photograph, in longer sides of the photograph."""
 
 _OVERLAP = 0.2
 """Share of a slice by which neighbours overlap."""
@@ -33,7 +35,7 @@ def usual_slices(lattice: Lattice) -> list[Window]:
     has four, each 0.6 as long as its longer side.
     """
     if lattice.levels == 1:
-        side = max(1, round(PART * max(lattice.size)))
+        side = max(1, round(_PART * max(lattice.size)))
     else:
         side = round((1.5 if lattice.levels > 2 else 1.0) * min(lattice.canvas) / lattice.magnifications[-1])
     return slices(lattice, side, max(1, int(side * (1 - _OVERLAP))))

@@ -50,11 +50,12 @@ def evidence(give_up=0.1, confirm=0.6):
 def test_a_file_keeps_the_evidence_for_photographs(tmp_path):
     model = evidence()
     plain = Verification(thresholds=model.photograph.verification.thresholds)
-    model.photograph.verification = plain
+    model.photograph.verification, model.photograph.window = plain, (0.5, 3.0)
     model.save(tmp_path / "own.safetensors")
     again = GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors")
     assert all(torch.equal(tensor, again.state_dict()[name]) for name, tensor in model.state_dict().items())
     assert again.photograph.verification.thresholds == plain.thresholds
+    assert again.photograph.window == (0.5, 3.0)
     assert again.photograph.certainty == model.photograph.certainty
     GlimpseEvidence(3, 8).save(tmp_path / "without.safetensors")
     assert GlimpseEvidence.from_pretrained(tmp_path / "without.safetensors").photograph is None
@@ -156,6 +157,20 @@ def test_the_window_of_a_closer_look_shows_other_places_too():
     assert x2 <= 192
     large = closer_window(LATTICE, torch.tensor([20.0, 20, 90, 60])).within
     assert large[2] - large[0] == pytest.approx(140)
+    x1, y1, x2, y2 = closer_window(LATTICE, torch.tensor([150.0, 100, 160, 110]), (1 / 3, 3.0)).within
+    assert (x1, y1, x2, y2) == pytest.approx((123, 73, 187, 137))
+
+
+@pytest.mark.parametrize("window", [(0.6, 2.0), (0.4, 2.0), (0.3, 3.0)])
+def test_evidence_says_how_large_the_window_of_a_closer_look_is(detector, photograph, window):
+    model = evidence()
+    model.photograph.window = window
+    path = ZoomAgent(WindowEye(detector), model).search(photograph, "red", closer=1)
+    whole, closer = path.glances
+    box = whole.detections.boxes[0, whole.detections.scores[0, :, 1].argmax()]
+    side = float((box[2:] - box[:2]).max())
+    x1, _, x2, _ = closer.window.within
+    assert x2 - x1 == pytest.approx(max(window[0] * 192, window[1] * side))
 
 
 def test_hints_below_the_threshold_of_detections_are_places(detector, photograph):
