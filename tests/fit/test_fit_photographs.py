@@ -52,7 +52,7 @@ def fitted():
     model = GlimpseEvidence(3, 8).requires_grad_(False)
     eye = WindowEye(Squares().eval())
     report = fit_photographs(
-        model, Photographs(), eye, SimpleNamespace(photographs=COUNT, worth=0.1, surest=0.9, seed=0)
+        model, Photographs(), eye, SimpleNamespace(photographs=COUNT, worth=0.1, window=(0.6, 2.0), surest=0.9, seed=0)
     )
     return model, eye, report
 
