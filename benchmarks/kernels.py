@@ -40,15 +40,18 @@ def pyramid() -> Comparison:
 
 
 def at_once(name: str, ours: Callable[[], Tensor], one: Callable[[int], Tensor], count: int) -> Comparison:
-    """Many views at once, compared with one at a time."""
+    """Many views at once, compared with one at a time, as a list and as the same tensor."""
 
     def one_by_one() -> list[Tensor]:
         return [one(number) for number in range(count)]
 
-    def agree() -> None:
-        torch.testing.assert_close(ours().squeeze(), torch.cat(one_by_one()).squeeze())
+    def joined() -> Tensor:
+        return torch.cat(one_by_one())
 
-    return Comparison(name, ours, {"one at a time": one_by_one}, {}, agree)
+    def agree() -> None:
+        torch.testing.assert_close(ours().squeeze(), joined().squeeze())
+
+    return Comparison(name, ours, {"one at a time": one_by_one, "one at a time, joined": joined}, {}, agree)
 
 
 def pictures(count: int = 32) -> Comparison:
