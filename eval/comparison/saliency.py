@@ -55,7 +55,7 @@ class SaliencyStore(SceneStore):
             "sensor": sensor if view == "foveated" else None,
             "grid": list(grid),
         }
-        if name == "people":
+        if name not in SALIENCY_CLASSES:  # which see the pixels alone
             what["detector"] = detector
         cells = grid[0] * grid[1]
         schema = Schema({"saliency": Field(("F", cells), low=0)})
@@ -74,7 +74,7 @@ class SaliencyStore(SceneStore):
 
 def saliency_map(name: str, detector: Detector) -> _SaliencyMap:
     """What gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`."""
-    if name != "people":
+    if name in SALIENCY_CLASSES:
         return SALIENCY_CLASSES[name]()
     density = FixationDensity.for_detector(detector).requires_grad_(False)
     return lambda image: density(detector.features(image, [*density.layers])).exp()
