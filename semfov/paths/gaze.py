@@ -172,7 +172,8 @@ class GazePrediction:
 
         Returns:
             For each place `x` and `y` in pixels of the picture, and `share`, the probability of a fixation within 5 %
-            of the longer side around it. Places are at least twice as far apart.
+            of the longer side around it. Places are at least twice as far apart. Near fixations count more in their
+            choice, so that a place is where the density is high.
 
         Raises:
             InputError: `count` is out of range.
@@ -183,16 +184,17 @@ class GazePrediction:
         x = (torch.arange(columns) + 0.5) * (width / columns)
         y = (torch.arange(rows) + 0.5) * (height / rows)
         places = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
-        near = torch.cdist(places, places) <= _REACH * max(self.size)
-        share = near.to(self.cells) @ self.cells.flatten()
+        distance = torch.cdist(places, places) / (_REACH * max(self.size))
+        share = (distance <= 1).to(self.cells) @ self.cells.flatten()
+        value = (1 - distance).clamp(min=0).to(self.cells) @ self.cells.flatten()
         free = torch.ones(len(places), dtype=torch.bool)
         found: list[dict[str, float]] = []
         while len(found) < count and bool(free.any()):
-            best = int(torch.where(free, share, -1.0).argmax())
+            best = int(torch.where(free, value, -1.0).argmax())
             at = places[best].tolist()
             found.append({"x": at[0] - 0.5, "y": at[1] - 0.5, "share": float(share[best])})
-            free &= torch.cdist(places[best][None], places)[0] > 2 * _REACH * max(self.size)
-        return found
+            free &= distance[best] > 2
+        return sorted(found, key=lambda place: -place["share"])
 
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.

@@ -59,6 +59,10 @@ def test_places_are_the_peaks_in_order(gaze):
     near = (torch.arange(104) - first["x"]) ** 2 + (torch.arange(78)[:, None] - first["y"]) ** 2 <= 5.2**2
     assert first["share"] == pytest.approx(float(gaze.density[near].sum()), rel=0.1)
     refused("count", gaze.peaks, 0)
+    # A place is on what is looked at, where a disc of equal weight may hold it anywhere.
+    log = (0.001 * rand(39, 52) + bump(30, 20, width=0.4)).log()
+    (sharp,) = GazePrediction(gaze.model, {"map": log[None]}, gaze.size, gaze.photograph, gaze.source).peaks(1)
+    assert (sharp["x"], sharp["y"]) == (60.5, 40.5)
 
 
 def test_scanpaths_last_as_long_as_people_view(gaze):
