@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -95,6 +96,9 @@ def foveate(
         result = _collapse(bands, fixation, widths, growth)
         return result if many else result[:, 0]
     views = like.new_empty(batch, number, like.shape[1], *size)
+    if like.dtype.itemsize > 2:
+        # NumPy asks for large pages of memory, of which fewer are fetched when the views are written.
+        views = torch.from_numpy(np.empty_like(views.numpy()))
     for b in (slice(n, n + max(1, step // number)) for n in range(0, batch, max(1, step // number))):
         if isinstance(source, Bands):
             own = Bands(tuple(band[b] for band in source.details), source.base[b], source.convention)
