@@ -14,10 +14,11 @@ from tqdm import tqdm
 from eval.human.folds import in_first
 from semfov.belief.grid import Grid
 from semfov.data.pictures import Pictures
+from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.fit.gaze import MapsOfPicture, maps_of, score
 from semfov.fit.gaze_folds import Fold, FoldStore
-from semfov.fit.viewing import Events, MapSource, no_detections
+from semfov.fit.viewing import Events, MapSource
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.code import modules_digest
@@ -67,7 +68,7 @@ def views_of(image: Tensor, source: MapSource) -> tuple[FeatureMaps, Tensor]:
     fixations = Grid(*CELLS, (width, height)).centres
     seen = [source.maps(foveate(image[None], each[None], sigma=FOVEA * max(width, height))) for each in fixations]
     maps = {name: torch.cat([each.maps[name] for each in seen]) for name in source.layers}
-    return replace(seen[0], maps=maps, detections=no_detections()), fixations
+    return replace(seen[0], maps=maps, detections=Detections.empty(0, 0)), fixations
 
 
 def so_far(

@@ -20,13 +20,14 @@ from eval.comparison.saliency import SALIENCY_CLASSES
 from eval.human.folds import Maps, StudiedFold, in_first, spread, viewed_by
 from eval.human.glimpses import glimpsed, glimpses_table
 from eval.page.origin import END, PLACE
+from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.detection.load import load_detector
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Scores, joined
-from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look, no_detections
+from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.io.code import modules_digest
@@ -156,7 +157,7 @@ def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
     """Maps `(B, C, rows, columns)` over the whole of pictures of `(height, width)`, without detections."""
     rows, columns = next(iter(maps.values())).shape[-2:]
     placement = Placement((size[1], size[0]), (columns / size[1], rows / size[0]), (0, 0))
-    return FeatureMaps(maps, (columns, rows), placement, no_detections())
+    return FeatureMaps(maps, (columns, rows), placement, Detections.empty(0, 0))
 
 
 def _without_maps(group: Viewed) -> Viewed:

@@ -14,12 +14,13 @@ from semfov.agents.picture import PictureLike
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
 from semfov.cli.results import kind_of
 from semfov.cli.sources import PictureSource
-from semfov.cli.truth import Truth, read_truth
+from semfov.cli.truth import Truth
 from semfov.data.classes import canonical_name
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
 from semfov.paths import Record, Scanpath
+from semfov.paths.conversion import coco_categories
 from semfov.paths.look import detections_in_words
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief, plot_belief_bars
@@ -144,10 +145,6 @@ class PictureOutcome:
     figures: Mapping[str, bytes] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
 
-    def values(self) -> dict[str, Any]:
-        """The JSON values, from which `PictureOutcome(**values)` makes the outcome again without its files."""
-        return {name: getattr(self, name) for name in ("ended", "text", "row", "episode", "names")}
-
 
 def _result_row(
     record: Record,
@@ -176,7 +173,10 @@ def _result_row(
         results = record.to_coco(row["image_id"], numbers)
         row["parts"] = [each for each in results if each["category_id"] != -1]
     elif kind == ".coco.json":
-        row["categories"] = _categories(record.classes[1:])
+        row["categories"] = coco_categories()
+        known = {canonical_name(each["name"]) for each in row["categories"]}
+        if not {canonical_name(each) for each in record.classes[1:]} <= known:
+            row["categories"] = [{"id": number, "name": each} for number, each in enumerate(record.classes[1:], 1)]
         row["parts"] = [
             {**each, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
             for each in record.to_coco(0, row["categories"])
@@ -191,6 +191,7 @@ def picture_outcome(
     options: PictureOptions,
     seconds: float,
     settings: Mapping[str, Any],
+    truth: Truth | None,
 ) -> PictureOutcome:
     """Make the text, the row, the part of a page and the figures of a record, as the options say."""
     usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
@@ -198,7 +199,6 @@ def picture_outcome(
     text = _outcome_text(record, source.name, seconds)
     episode = None
     kind = None if options.out is None else kind_of(options.out)
-    truth = None if options.annotations is None else read_truth(options.annotations)
     row = _result_row(record, source.name, seconds, kind, source.file, truth)
     if options.report is not None:
         name = Path(source.name).name
@@ -245,13 +245,3 @@ def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawi
             film: Any = record.animate(boxes=boxes)
             drawn += film.save(Path(folder) / "animation.gif")
         return {path.name: path.read_bytes() for path in drawn}
-
-
-def _categories(classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Categories of the classes: COCO's own, or numbers from 1 if COCO has not all of them."""
-    from semfov.paths.conversion import coco_categories
-
-    categories = coco_categories()
-    if {canonical_name(name) for name in classes} <= {canonical_name(each["name"]) for each in categories}:
-        return categories
-    return [{"id": number, "name": name} for number, name in enumerate(classes, 1)]

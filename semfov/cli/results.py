@@ -110,7 +110,10 @@ class ResultsFile:
             "pictures": pictures, "skipped": [self._skipped[number] for number in sorted(self._skipped)]
         }  # fmt: skip
         if self.kind == ".csv":
-            return self._csv(pictures)
+            table = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
+            turned = ("pan", "tilt") if any("pan" in row for row in table) else ()
+            columns = _DECISIONS if self.searched else (*_OBJECTS, *turned)
+            return csv_text([columns, *([row.get(name) for name in columns] for row in table)])
         if self.kind == ".geojson":
             unit = rows[0]["coordinates"] if rows else ""
             features = [each for row in rows for each in row["parts"]]
@@ -127,12 +130,6 @@ class ResultsFile:
             categories = rows[0]["categories"] if rows else []
             whole = {"images": images, "annotations": annotations, "categories": categories}
         return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
-
-    def _csv(self, pictures: list[dict[str, Any]]) -> str:
-        rows = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
-        turned = ("pan", "tilt") if any("pan" in row for row in rows) else ()
-        columns = _DECISIONS if self.searched else (*_OBJECTS, *turned)
-        return csv_text([columns, *([row.get(name) for name in columns] for row in rows)])
 
 
 def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:

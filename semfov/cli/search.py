@@ -36,7 +36,7 @@ from semfov.cli.options import (
 from semfov.cli.outcome import PictureOutcome, picture_outcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
-from semfov.cli.truth import read_truth
+from semfov.cli.truth import Truth
 from semfov.data.classes import class_index
 from semfov.data.sources import embedded_picture
 from semfov.data.word_vectors import WordVectors, spread
@@ -58,13 +58,13 @@ from semfov.threads import available_cores
 class _PictureJob(ABC):
     """Looks at pictures as the options say; any process can make it from the options."""
 
-    agent: ActivePerception
     title: str
     target: str | None = None
+    weights: dict[str, float] | None = None
     drawings: tuple[Drawing, ...] = ALL_DRAWINGS
     every = False
 
-    def __init__(self, options: Any) -> None:
+    def __init__(self, options: Any, agent: ActivePerception | None = None) -> None:
         self.options: Any = options
         self._sources = picture_sources(options)
         self.several = len(self._sources) > 1
@@ -73,10 +73,18 @@ class _PictureJob(ABC):
             again = [place for place, times in places.items() if times > 1]
             expected = f"pictures of different names with --{name}, whose files have their names"
             check(not again or getattr(options, name) is None, name, expected, ", ".join(again[:3]))
-        self.truth = None if options.annotations is None else read_truth(options.annotations)
+        self.truth = None if options.annotations is None else Truth(options.annotations)
         if self.truth is not None:
             for source in self._sources:
                 self.truth.image_id(source.name)
+        self.start = _check(options)
+        self.aim(detector_classes(options) if agent is None else agent.classes[1:])
+        self.agent = make_agent(options) if agent is None else agent
+        self.aim(self.agent.classes[1:])
+
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """Take the target from the options; before the names of the classes are known it is not checked."""
+        self.title = "exploration"
 
     @property
     def sources(self) -> list[PictureSource]:
@@ -88,13 +96,18 @@ class _PictureJob(ABC):
 
     def depends_on(self) -> dict[str, Any]:
         """What outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
-        agent, folder = self.agent, self.options.models
+        agent, folder, parts = self.agent, self.options.models, list[Any]()
+        for place, part in agent.named_modules():
+            # Agents that Python makes are told apart by the settings of their parts.
+            numbers = {name: value for name, value in vars(part).items() if type(value) in (bool, int, float, str)}
+            parts.append((place, type(part).__qualname__, numbers))
         return {
             "options": {name: value for name, value in self.options.plain().items() if name not in (*WHERE, "quiet")},
             "eye": agent.eye.settings(),
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
-            "parts": [(place, type(part).__qualname__, _numbers(part)) for place, part in agent.named_modules()],
+            "parts": parts,
+            "weights": self.weights,
             "folder": None if folder is None else sha256(folder / MANIFEST),
             "annotations": None if self.truth is None else self.truth.digest,
         }
@@ -111,7 +124,8 @@ class _PictureJob(ABC):
                 picture = source.opened(self.options.how)
                 record = self.look(picture, self._shared(picture, source), source)
                 seconds = time.perf_counter() - began
-                return picture_outcome(record, picture, source, self.options, seconds, self.agent.eye.settings())
+                settings = self.agent.eye.settings()
+                return picture_outcome(record, picture, source, self.options, seconds, settings, self.truth)
         except SemfovError as error:
             return error
         except Exception as error:
@@ -131,11 +145,6 @@ class _PictureJob(ABC):
             bar = tqdm(desc=Path(source.name).name, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
             arguments["on_look"] = lambda record: bar.update(record.passes - bar.n)
         return arguments
-
-
-def _numbers(part: object) -> dict[str, Any]:
-    """The settings of a part of an agent, by which agents that Python makes are told apart."""
-    return {name: value for name, value in vars(part).items() if type(value) in (bool, int, float, str)}
 
 
 def _make_again(kind: type[_PictureJob], options: PictureOptions) -> _PictureJob:
@@ -177,13 +186,6 @@ class _PictureFiles:
         if self.job.several and out != STDOUT:
             self.finished = unfinished(file, self.job.depends_on(), self.job.sources)
 
-    def before(self) -> dict[int, PictureOutcome]:
-        """Outcomes of an interrupted command with the same options and models, by the numbers of the pictures."""
-        if self.finished is None:
-            return {}
-        stored = self.finished.items(len(self.job.sources))
-        return {number: PictureOutcome(**each["records"][0]) for number, each in stored}
-
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""
         self.rows[number] = outcome.row["picture"]
@@ -200,7 +202,9 @@ class _PictureFiles:
         if outcome.episode is not None:
             self.episodes[number] = outcome.episode
         if self.finished is not None and not before:
-            self.finished.save(number, [outcome.values()], {})
+            # From these values the outcome is made again, without its files.
+            kept = {name: getattr(outcome, name) for name in ("ended", "text", "row", "episode", "names")}
+            self.finished.save(number, [kept], {})
 
     def skip(self, number: int, reason: str) -> None:
         """Note a picture that could not be read, and the reason."""
@@ -238,7 +242,10 @@ def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
         print("no picture was given: looking at an embedded scene")
     outputs = _PictureFiles(job, stream)
     complete, endings = False, Counter[str]()
-    before = outputs.before()
+    before: dict[int, PictureOutcome] = {}
+    if outputs.finished is not None:  # by an interrupted command with the same options and models
+        stored = outputs.finished.items(len(sources))
+        before = {number: PictureOutcome(**each["records"][0]) for number, each in stored}
     if before:
         print(f"continuing: {len(before)} of {len(sources)} pictures were looked at before")
     try:
@@ -323,26 +330,20 @@ class _SearchJob(_PictureJob):
 
     drawings = get_args(Drawing)
 
-    def __init__(self, options: SearchOptions, agent: ActivePerception | None = None) -> None:
-        super().__init__(options)
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """The classes that the target may mean, each with a weight."""
+        options = self.options
         if not options.target:
             name = options.detector if options.models is None else options.models
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
-        self.start = _check(options)
-        classes = detector_classes(options) if agent is None else agent.classes[1:]
-        weights = None if classes is None else _meant(options, classes)
-        self.agent = make_agent(options) if agent is None else agent
-        self.weights = _meant(options, self.agent.classes[1:]) if weights is None else weights
-        self.target = next(iter(self.weights))
-        self.title = f"search for “{self.target}”"
-
-    def depends_on(self) -> dict[str, Any]:
-        """What outcomes depend on, with the classes that word vectors tell."""
-        return {**super().depends_on(), "weights": self.weights}
+        if classes is not None and self.weights is None:
+            self.weights = _meant(options, classes)
+            self.target = next(iter(self.weights))
+            self.title = f"search for “{self.target}”"
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Search a picture."""
-        agent, options, weights = self.agent, self.options, self.weights
+        agent, options, weights = self.agent, self.options, self.weights or {}
         settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
         foveal = len(weights) > 1 or self.start is not None or shared.get("shifts") is not None
         kind = agent.kind_of_look(picture, shared["how"], foveal=foveal)
@@ -360,16 +361,11 @@ class _FindJob(_PictureJob):
 
     every = True
 
-    def __init__(self, options: FindOptions, agent: ActivePerception | None = None) -> None:
-        if options.start is not None:
-            raise InputError(
-                f"start: expected none for find, which begins with the whole picture, got {options.start!r}"
-            )
-        super().__init__(options)
-        _check(options)
-        several_classes(options.target, detector_classes(options) if agent is None else None)
-        self.agent = make_agent(options) if agent is None else agent
-        self.targets = several_classes(options.target, self.agent.classes[1:])
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """The classes to find; None for all."""
+        start = self.options.start
+        check(start is None, "start", "none for find, which begins with the whole picture", repr(start))
+        self.targets = several_classes(self.options.target, classes)
         self.target = None if self.targets is None else self.targets[0]
         self.title = f"all objects{': ' if self.targets else ''}{', '.join(self.targets or [])}"
 
@@ -381,15 +377,6 @@ class _FindJob(_PictureJob):
 
 class _ExploreJob(_PictureJob):
     """Explores pictures."""
-
-    title = "exploration"
-
-    def __init__(self, options: ExploreOptions, agent: ActivePerception | None = None) -> None:
-        super().__init__(options)
-        self.start = _check(options)
-        if agent is None:
-            detector_classes(options)
-        self.agent = make_agent(options) if agent is None else agent
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Explore a picture."""
@@ -515,7 +502,7 @@ def _check(options: PictureOptions) -> Any:
     return start_of(options.start)
 
 
-def _meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]:
+def _meant(options: SearchOptions, classes: Sequence[str]) -> dict[str, float]:
     """The classes that a target may mean, each with a weight, the most likely first."""
     target = options.target or ""
     try:
@@ -531,7 +518,7 @@ def _meant(options: SearchOptions, classes: tuple[str, ...]) -> dict[str, float]
     return weights
 
 
-def _other_ways(target: str, classes: tuple[str, ...], refused: str) -> str:
+def _other_ways(target: str, classes: Sequence[str], refused: str) -> str:
     """What else a target that is no class can be, after the message that refuses it."""
     names = target.split(",")
     with suppress(InputError):

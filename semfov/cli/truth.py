@@ -6,7 +6,6 @@ import contextlib
 import io
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -81,16 +80,3 @@ class Truth:
 def _parts(name: str) -> tuple[str, ...]:
     """The parts of a path, of Windows or not."""
     return PurePosixPath(name.replace("\\", "/")).parts or (name,)
-
-
-def read_truth(path: Path) -> Truth:
-    """The annotations of a file, read once in each process while the file does not change."""
-    with contextlib.suppress(OSError):
-        status = path.stat()
-        return _read_once(path.resolve(), path, status.st_mtime_ns, status.st_size)
-    return Truth(path)
-
-
-@lru_cache(maxsize=1)
-def _read_once(_: Path, path: Path, *version: int) -> Truth:
-    return Truth(path)

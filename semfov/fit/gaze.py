@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -119,15 +119,19 @@ def _train(
     warm: float,
     clip: float = math.inf,
 ) -> list[float]:
-    """Train on random batches of pictures of one group, given with its number; returns the mean loss of each epoch."""
+    """Train on random batches of pictures of one group, in random order; returns the mean loss of each epoch."""
     steps = sum(-(-len(some) // batch) for some in pictures) * epochs
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=warm)
     means = []
     with tqdm(total=epochs, desc=title, unit="epoch", leave=False, disable=not title) as bar:
         for _ in range(epochs):
-            losses = []
-            for number, some in _batches(pictures, batch, generator):
-                loss = loss_of(groups[number], number, some)
+            losses, batches = [], list[tuple[int, list[int]]]()
+            for group, some in enumerate(pictures):
+                order = [some[int(place)] for place in torch.randperm(len(some), generator=generator)]
+                batches += [(group, order[start : start + batch]) for start in range(0, len(order), batch)]
+            for place in torch.randperm(len(batches), generator=generator).tolist():
+                number, chosen = batches[place]
+                loss = loss_of(groups[number], number, chosen)
                 if loss is None:
                     continue
                 optimiser.zero_grad()
@@ -159,16 +163,6 @@ def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pi
     with torch.no_grad():
         model.shift.sub_((model.read / scale) @ torch.cat(means))
     return scale
-
-
-def _batches(pictures: _Pictures, batch: int, generator: torch.Generator) -> Iterator[tuple[int, list[int]]]:
-    """Random batches of pictures of the same group, in random order."""
-    batches = []
-    for group, some in enumerate(pictures):
-        order = [some[int(place)] for place in torch.randperm(len(some), generator=generator)]
-        batches += [(group, order[start : start + batch]) for start in range(0, len(order), batch)]
-    for place in torch.randperm(len(batches), generator=generator).tolist():
-        yield batches[place]
 
 
 @torch.no_grad()

@@ -153,11 +153,6 @@ def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
     return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
 
 
-def no_detections() -> Detections:
-    """Those of no picture."""
-    return Detections(torch.zeros(0, 0, 4), torch.zeros(0, 0, 1), torch.zeros(0, 0, dtype=torch.bool))
-
-
 def look(data: ViewingData, source: MapSource) -> list[Viewed]:
     """Look at all pictures, or read their maps from the cache; those of one data set and size are together."""
     # Dimensions are numbered, as a dash in the name of a layer would be a minus in theirs.
@@ -187,7 +182,10 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
                 width, height, across, down, left, top, *canvas = kept["placed"].tolist()
                 placement = Placement((int(width), int(height)), (across, down), (left, top))
                 maps = {name: kept[name][None] for name in source.layers}
-                yield FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, no_detections()), people[str(name)]
+                yield (
+                    FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, Detections.empty(0, 0)),
+                    people[str(name)],
+                )
 
         groups += _grouped(seen(), data.seconds[number] if number < len(data.seconds) else 3.0, number)
     return groups
@@ -210,7 +208,7 @@ def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> li
         first = several[0][0]
         maps = {name: torch.cat([features.maps[name].half() for features, _ in several]) for name in first.maps}
         everyone = tuple(tuple(some) for _, some in several)
-        groups.append(Viewed(replace(first, maps=maps, detections=no_detections()), everyone, seconds, source))
+        groups.append(Viewed(replace(first, maps=maps, detections=Detections.empty(0, 0)), everyone, seconds, source))
     return groups
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from types import FrameType, UnionType
 from typing import (
@@ -154,11 +155,7 @@ def command(
     main: Callable[[_Config], int | None], config: type[_Config], description: str | None
 ) -> Callable[..., int]:
     """Make the function `main` of a module that is a command: it takes the arguments and returns the exit code."""
-
-    def run(arguments: Sequence[str] | None = None) -> int:
-        return run_command(main, config, description, arguments)
-
-    return run
+    return partial(run_command, main, config, description)
 
 
 class _Terminated(BaseException):

@@ -111,7 +111,7 @@ def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -
     """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
     return any(
         policy.scores == "calibrated"
-        or _of(policy.misses, belief.misses)
+        or (belief.misses if policy.misses is None else policy.misses)
         or (policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model)
         for policy in policies
     )
@@ -135,22 +135,18 @@ def _make_strategy(
         return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
-    misses = _of(policy.misses, belief.misses)
+    names = ("footprint", "tempering", "memory", "misses")
+    common_or_own = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in names}
+    if common_or_own.pop("misses"):
+        common_or_own["misses"] = _required(models.observation, "misses", "an observation model")
     observer = Semantic(
         components,
         _required(models.observation, "scores", "an observation model") if calibrated else None,
         prior=belief.prior,
         fusion=belief.fusion,
-        footprint=_of(policy.footprint, belief.footprint),
-        tempering=_of(policy.tempering, belief.tempering),
-        memory=_of(policy.memory, belief.memory),
-        misses=_required(models.observation, "misses", "an observation model") if misses else None,
+        **common_or_own,
     )
     return Strategy(observer, chosen)
-
-
-def _of(own: _T | None, common: _T) -> _T:
-    return common if own is None else own
 
 
 def _required(model: _T | None, argument: str, expected: str) -> _T:

@@ -21,7 +21,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import _with_target
 from semfov.cli.sources import picture_sources
-from semfov.cli.truth import Truth, read_truth
+from semfov.cli.truth import Truth
 from semfov.data.sources import picture_files
 from tests.colours import write_network
 
@@ -210,16 +210,6 @@ def test_annotations_judge_nothing_where_no_picture_was_looked_at(run, make_trut
     files = *(tmp_path / name for name in names), "--annotations", tmp_path / "truth.json"
     code, printed = run("find", *files, "--out", tmp_path / "boxes.coco.json")
     assert (code, "2 pictures: 2 skipped" in printed.out, "AP" in printed.out) == (1, True, False)
-
-
-def test_annotations_that_have_changed_are_read_again(make_truth, tmp_path):
-    make_truth("x.jpg", "y.jpg")
-    path = tmp_path / "truth.json"
-    first = read_truth(path)
-    assert first.image_id("y.jpg") == 2
-    assert read_truth(path) is first
-    make_truth("x.jpg", "long.jpg", "y.jpg")
-    assert read_truth(path).image_id("y.jpg") == 3
 
 
 def test_a_name_with_brackets_is_that_of_its_file(tmp_path):
