@@ -66,11 +66,11 @@ def fit_verification(config: FitVerificationConfig) -> None:
     folder, components = store_folder(config.cache) / "searches", len(eye.detector.classes) + 1
     store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
     photographs = open_photographs(eye, scenes, chosen, config, store=store)
-    fitted = fit_in_folds(photographs, evidence, config)
-    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
+    model, folds, closer, searches = fit_in_folds(photographs, evidence, config)
+    model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
-    fitted.model.save(path)
-    text, figures = verification_report(fitted, f"{len(photographs)} photographs")
+    model.save(path)
+    text, figures = verification_report(model, folds, closer, searches, f"{len(photographs)} photographs")
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
 
 

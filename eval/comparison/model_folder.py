@@ -12,7 +12,7 @@ from semfov.gaze.acquisition.base import FUNCTIONS
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DetectorConfig, PolicyConfig
 from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
-from semfov.runs.presets import PolicyChoice, resolve
+from semfov.runs.presets import resolve
 
 _Config = TypeVar("_Config", bound=ComparedConfig)
 
@@ -71,7 +71,7 @@ def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfi
     return DetectorConfig(name=source, **{"background": None, **options})
 
 
-def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> PolicyChoice:
+def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | PolicyConfig:
     """The policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
@@ -85,7 +85,7 @@ def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> PolicyCh
     )
 
 
-def _needs(choice: PolicyChoice, config: ComparedConfig) -> list[str]:
+def _needs(choice: str | PolicyConfig, config: ComparedConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:

@@ -35,7 +35,7 @@ from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
-from semfov.runs.looks import BoxKey, photograph_looks
+from semfov.runs.looks import photograph_looks
 from semfov.runs.results import ResultRecord
 from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
@@ -168,7 +168,7 @@ class DecisionRun(ComparedLooking):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(self, closer: Callable[[BoxKey], Detections], grid: Grid, target: int) -> Verifier[Step]:
+    def _verifier(self, closer: Callable[[tuple[float, ...]], Detections], grid: Grid, target: int) -> Verifier[Step]:
         """The closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
@@ -239,7 +239,7 @@ class DecisionRun(ComparedLooking):
             tiles = [self.eye.detector(tile) for tile in quarters(image)] if self.config.rules else []
         watch.lap("look")
         store = self.store if self.config.store and everywhere is None else None
-        remembered: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
+        remembered: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
         glances = StoredGlances(self.by_windows, self.scenes, index, None)

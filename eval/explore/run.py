@@ -20,7 +20,6 @@ from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig
 from semfov.runs.exploration_protocol import (
-    COUNTS,
     Exploration,
     counts_of,
     explorations_of,
@@ -119,8 +118,8 @@ class ExploreRun(ComparedLooking):
         with torch.inference_mode():
             sharp = self.eye.detector(self.scenes[index].image[None])
             for name, probabilities in _sharp_maps(sharp, grid).items():
-                counts = [each.tolist() * (protocol.shifts + 1) for each in counts_of(probabilities, answers)]
-                named: tuple[list[int], dict[str, list[int]]] = [], dict(zip(COUNTS, counts, strict=True))
+                counts = counts_of(probabilities, answers).items()
+                named = list[int](), {each: count.tolist() * (protocol.shifts + 1) for each, count in counts}
                 records += [self._record(name, answers, episode, named) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -11,9 +11,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.gaze import GazeFit, fit_oculomotor
-from semfov.fit.gaze_folds import Fold, Groups, flat_maps
+from semfov.fit.gaze_folds import Fold, flat_maps
 from semfov.fit.viewing import Viewed, counted, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+
+Groups = Callable[[], Sequence[Viewed]]
+"""Gives the pictures, by data set and size."""
 
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from semfov.belief.grid import Grid
 from semfov.data.pictures import Pictures
 from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps
-from semfov.fit.gaze import MapsOfPicture, maps_of, score
+from semfov.fit.gaze import maps_of, score
 from semfov.fit.gaze_folds import Fold, FoldStore
 from semfov.fit.viewing import Events, MapSource
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -46,7 +46,10 @@ def glimpsed(
             model, (group, place) = store.model(name, fold), in_first(fold, picture)
             views, fixations = views_of(Pictures(root, [group.people[place][0].picture], ())[0].image, source)
             seen = partial(so_far, model, views, fixations, group.size)
-            maps: dict[str, MapsOfPicture] = {"sharp picture": maps_of(model, group, [place])[0], "seen so far": seen}
+            maps: dict[str, Tensor | Callable[[Events], Tensor]] = {
+                "sharp picture": maps_of(model, group, [place])[0],
+                "seen so far": seen,
+            }
             return {
                 f"{term}: {row}": each
                 for row, one in maps.items()

@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.comparison.saliency import SALIENCY_CLASSES
-from eval.human.folds import Maps, StudiedFold, in_first, spread, viewed_by
+from eval.human.folds import Groups, Maps, StudiedFold, in_first, spread, viewed_by
 from eval.human.glimpses import glimpsed, glimpses_table
 from eval.page.origin import END, PLACE
 from semfov.detection.detections import Detections
@@ -26,7 +26,7 @@ from semfov.detection.load import load_detector
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Scores, joined
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
 from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of

@@ -21,7 +21,6 @@ from semfov.runs.config import (
     Scores,
     SensorConfig,
 )
-from semfov.runs.presets import PolicyChoice
 from semfov.runs.settings import Count, Settings, Workers
 from semfov.sensor.named import SensorName
 
@@ -160,7 +159,7 @@ class _Study:
     """Runs on photographs of the fit set with different settings; a table row is a setting and a policy."""
 
     settings: dict[str, _Changes]
-    policies: tuple[PolicyChoice, ...]
+    policies: tuple[str | PolicyConfig, ...]
     explores: bool = False
     shifts: tuple[int, ...] = (1, 5, 15, 30)
     model: str | None = None

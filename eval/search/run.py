@@ -13,7 +13,7 @@ from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import EpisodeOutcome, Trial, episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, episodes_of, run_episodes, tie_noise
 from semfov.runs.settings import Whole
 
 
@@ -72,7 +72,7 @@ class SearchRun(ComparedLooking):
             records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
         return records, watch.seconds
 
-    def _record(self, policy: str, episode: Trial, outcome: EpisodeOutcome) -> ResultRecord:
+    def _record(self, policy: str, episode: Trial, outcome: tuple[list[int], int]) -> ResultRecord:
         return {
             "policy": policy,
             **episode._asdict(),

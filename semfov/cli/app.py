@@ -24,7 +24,7 @@ from semfov.cli.options import AppOptions
 from semfov.data.classes import class_index
 from semfov.data.inputs import as_image
 from semfov.data.scenes import EmbeddedScenes
-from semfov.errors import DataError, InputError, SemfovError
+from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
 from semfov.report.episode import pillow
@@ -41,6 +41,7 @@ _VIEWERS = 15  # whose scanpaths the page of a prediction has
 _HEIGHT = 820  # pixels of the screen for the page of a record
 _LONGEST = 1600  # longer side in pixels of the picture that is clicked on
 
+_PICTURE, _CLASS = "one, or an example", "one to search for"  # what is expected
 _CLICK = "Choose a class, and click on the picture to look there."
 _STYLE = "footer { display: none !important; } .page iframe { width: 100%; border: 0; border-radius: 8px; }"
 
@@ -116,14 +117,16 @@ class _Calls:
     def look(self, picture: Any, target: str, task: str, passes: float) -> tuple[str, str]:
         """Words about a record of the picture, and its page in a frame."""
         with _told():
-            agent, picture, passes = self.agent, _given(picture), int(passes)
+            agent, passes = self.agent, int(passes)
+            check(picture is not None, "picture", _PICTURE, "none")
+            check(task != "search" or target in self.classes, "class", _CLASS, target)
             if task == "gaze":
                 prediction = agent.gaze(picture)
                 part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
                 words, page = prediction.describe(), gaze_page_html("Where people look", [part])
             else:
                 if task == "search":
-                    record = agent.search(picture, _one(target, self.classes), passes=passes)
+                    record = agent.search(picture, target, passes=passes)
                 elif task == "find all":
                     record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
                 else:
@@ -137,12 +140,14 @@ class _Calls:
     def click(self, picture: Any, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
         """The cells with that of the click, and what they show."""
         with _told():
-            image = as_image(_given(picture), argument="picture")
+            check(picture is not None, "picture", _PICTURE, "none")
+            check(target in self.classes, "class", _CLASS, target)
+            image = as_image(picture, argument="picture")
             scale = image.shape[-1] / _reduced(image).width
             point = torch.tensor([[side * scale for side in event.index]])
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
             cells = [*cells, int(grid.cell_of(point)[0])]
-            looked = _look_at_cells(self.agent, image, _one(target, self.classes), cells)
+            looked = _look_at_cells(self.agent, image, target, cells)
             return (
                 cells,
                 _clicked(image, looked),
@@ -210,20 +215,6 @@ def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
             changed(calls.fresh, [picture], outputs, api_visibility="private")
         own.select(click, [picture, target, cells], outputs, api_visibility="private")
     return page
-
-
-def _given(picture: Any) -> Any:
-    """The picture; refused where there is none."""
-    if picture is None:
-        raise DataError("picture: expected one, or an example, got none")
-    return picture
-
-
-def _one(target: str, classes: list[str]) -> str:
-    """The class to search for."""
-    if target not in classes:
-        raise DataError(f"class: expected one to search for, got {target}")
-    return target
 
 
 def _reduced(image: Tensor) -> Image.Image:

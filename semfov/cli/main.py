@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
-    from semfov.runs.command import GOES_ON, make_parser, run_command
+    from semfov.runs.command import make_parser, run_command
 
     options, positional, program = _options_of(name), _SUBCOMMANDS[name][0], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     dotted = ["detector.classes"] if name == "fit" else []
     words = partial(texts.in_command_words, options=[*dotted, *(field.name for field in fields(options))])
-    names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": GOES_ON if name == "fit" else ""}
+    names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with _plain_warnings(words):
         return run_command(partial(_run, name), options, texts.HELP[name], rest, words=words, **names)
 

@@ -30,14 +30,10 @@ class Difference(NamedTuple):
         """Whether the mean is positive and greater than its standard error."""
         return math.isfinite(self.error) and self.mean > 0 and self.mean > self.error
 
-
-def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
-    """Format a paired difference, times `scale`, with its unit, its standard error and its number of photographs."""
-    digits = 1 if scale > 1 else 3
-    return (
-        f"{plus_minus(scale * gain.mean, scale * gain.error, digits, sign='+')} {unit} "
-        f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
-    )
+    def in_words(self, unit: str, scale: float = 1.0) -> str:
+        """The difference times `scale`, with its unit, its standard error and its number of photographs."""
+        shown = plus_minus(scale * self.mean, scale * self.error, 1 if scale > 1 else 3, sign="+")
+        return f"{shown} {unit} on {self.photographs} held-out photograph{'s' if self.photographs != 1 else ''}"
 
 
 def mean_percent(values: FloatArray) -> str:

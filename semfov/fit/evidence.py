@@ -24,10 +24,10 @@ from semfov.decision import OUTCOMES, confirms, decide, place_known
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
 from semfov.fit.descent import descend
-from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
+from semfov.fit.detector_report import Difference, curves_figure, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult
+from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import Policy
@@ -239,12 +239,8 @@ def _judge_evidence(
     return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 
-Bounds = Any
-"""Limits on wrong decisions: settings with the `false_alarms`, `surest` and `lost` of `FitSearchConfig`."""
-
-
-def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
-    """Choose thresholds with few false alarms and few missed targets.
+def choose_thresholds(config: Any, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
+    """Choose thresholds with few false alarms and few missed targets, with the limits of a `FitSearchConfig`.
 
     For each candidate of the `place` threshold, the lowest `confirm` threshold is computed that respects the limit on
     false alarms. Of these pairs, the one with the highest `place` is taken that misses few enough of the targets found
@@ -438,11 +434,11 @@ class EvidenceFit(PartFit):
         curves = _search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
-        at = min(MAP_SHIFTS, protocol.shifts)
+        at = inputs.compared_at
         gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
+            f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {gain.in_words('points gained', 100)}"
         )
         rules: dict[str, tuple[Strategy, _Rule]] = {
             "fitted": (learned, lambda step, target, grid: decide(step, target, thresholds)),

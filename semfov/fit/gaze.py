@@ -23,7 +23,7 @@ _EVENTS = 12
 _SCORED = 40
 """Fixations of a picture on which conditional densities are scored, drawn at random."""
 
-MapsOfPicture = Tensor | Callable[[Events], Tensor]
+_MapsOfPicture = Tensor | Callable[[Events], Tensor]
 """Map of a picture, `(1, rows, columns)`, one for each person, or what gives one for each event."""
 _Pictures = Sequence[Sequence[int]]
 """Pictures of each group."""
@@ -216,7 +216,7 @@ def fit_oculomotor(
     )  # fmt: skip
 
 
-def _for_events(maps: MapsOfPicture, events: Events) -> Tensor:
+def _for_events(maps: _MapsOfPicture, events: Events) -> Tensor:
     """The map of each event."""
     if not isinstance(maps, Tensor):
         return maps(events)
@@ -240,7 +240,7 @@ def _drawn(events: Events, size: tuple[int, int], generator: torch.Generator) ->
 def score(
     model: FixationDensity,
     group: Viewed,
-    maps: Sequence[MapsOfPicture],
+    maps: Sequence[_MapsOfPicture],
     pictures: Sequence[int],
     *,
     conditional: bool,

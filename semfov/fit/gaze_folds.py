@@ -20,9 +20,6 @@ from semfov.runs.scene_run import digest_of
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
 
-Groups = Callable[[], Sequence[Viewed]]
-"""Gives the pictures, by data set and size."""
-
 CENTRE = "centre bias"
 ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
 """Rows by the terms of their models, without and with the scanpath."""
@@ -44,7 +41,7 @@ class Fold:
     The pictures are looked at when they are needed.
     """
 
-    def __init__(self, groups: Groups, number: int, count: int, settings: GazeFit) -> None:
+    def __init__(self, groups: Callable[[], Sequence[Viewed]], number: int, count: int, settings: GazeFit) -> None:
         self._groups, self.number, self.count, self.settings = groups, number, count, settings
 
     @property

@@ -20,10 +20,10 @@ from semfov.belief.observers.learned_map import MapBelief, MapLook
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError, InputError
 from semfov.fit.descent import descend
-from semfov.fit.detector_report import Difference, curves_figure, in_words, mean_percent, section
+from semfov.fit.detector_report import Difference, curves_figure, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
 from semfov.fit.outputs import Fit, split, training_of
-from semfov.fit.part import MAP_SHIFTS, PartFit, PartInputs, PartResult
+from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
@@ -352,7 +352,7 @@ class MapFit(PartFit):
             way.eval().requires_grad_(False)
         protocol = inputs.protocol
         curves = _explore_curves(run, inputs.judged, ways, protocol)
-        at = min(MAP_SHIFTS, protocol.shifts)
+        at = inputs.compared_at
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):
             raise DataError("data: none of the held-out photographs contains an object; give more photographs")
@@ -363,7 +363,7 @@ class MapFit(PartFit):
         why = (
             f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are classified correctly after "
             f"{at} gaze shifts, {100 * objects['raw'][:, at].mean():.1f} % with raw scores and random gaze; "
-            f"{in_words(gain, 'points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
+            f"{gain.in_words('points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
             f"{100 * every['raw'][:, at].mean():.1f} %"
         )
         sections = []

@@ -13,7 +13,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.eye import Eye
-from semfov.fit.detector_report import Difference, in_words, section
+from semfov.fit.detector_report import Difference, section
 from semfov.fit.outputs import split
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.metrics.calibration import calibration, surprisal
@@ -134,7 +134,7 @@ class ObservationFit(PartFit):
         ]
         why = (
             f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
-            f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats gained')}"
+            f"{figures['raw'].nll:.3f}; {gain.in_words('nats gained')}"
         )
         figure = plot_reliability({name: (p, judged.labels) for name, p in posteriors.items()})
         save_figure(figure, self.config.out / "reliability.png")

@@ -28,8 +28,6 @@ _FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
-MAP_SHIFTS = 5
-"""Gaze shifts after which searches and explorations are compared."""
 _LONGEST = 15
 """Maximum number of gaze shifts in them."""
 
@@ -53,6 +51,8 @@ class PartInputs:
         shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
         """The protocol of the searches and explorations that are compared."""
+        self.compared_at = min(5, shifts)
+        """Gaze shifts after which they are compared."""
         self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
         self.judged: Sequence[int] = self.held_out[: self.config.judged]
         """The held-out photographs on which searches and explorations are compared."""

@@ -14,7 +14,6 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import (
-    VerificationResult,
     choose_confirm,
     examine,
     fit,
@@ -183,5 +182,5 @@ def _fit_closer(
     fitted = fit(closer, closer.fold >= 0, prior)
     fitted.thresholds = Thresholds(confirm, config.worth, config.worth)
     evidence.verification = fitted
-    result = VerificationResult(fitted, chosen, closer, decisions)
-    return verification_report(result, f"{len({each.picture for each in searches})} photographs")[0]
+    pictures = f"{len({each.picture for each in searches})} photographs"
+    return verification_report(fitted, chosen, closer, decisions, pictures)[0]

@@ -24,7 +24,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import CellLooks
-from semfov.runs.looks import BoxKey, photograph_looks
+from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
@@ -84,7 +84,7 @@ class SearchedPhotograph:
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
         self.grid, self.targets, self.store, self.everywhere = grid, targets, store, everywhere
-        self.looks: RememberedLooks[int | BoxKey, Detections] = RememberedLooks(
+        self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
         )
         self._image: Tensor | None = None

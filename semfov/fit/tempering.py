@@ -13,7 +13,7 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.fit.detector_report import Difference, in_words, section
+from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import FOOTPRINT, PartFit, PartInputs, PartResult
 from semfov.io.manifest import Part
 from semfov.runs.progress import track
@@ -131,7 +131,7 @@ class TemperingFit(PartFit):
         before = mean_hits(holdout, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
-            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
+            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {gain.in_words('points gained', 100)}"
         )
         rows = [
             ["scores", "exponent", "next fixations that hit, %"],

@@ -16,7 +16,7 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
-from semfov.fit.detector_report import Difference, in_words
+from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import SUREST_OF_FEW
 from semfov.fit.outputs import training_of
 from semfov.fit.part import PartFit, PartInputs, PartResult
@@ -113,23 +113,17 @@ class _CloserLooks(NamedTuple):
     fold: Tensor
 
 
-class VerificationResult(NamedTuple):
-    """A fitted model and its evaluation in folds."""
-
-    model: Verification
-    folds: list[Verification]
-    closer: _CloserLooks
-    searches: list[_VerifiedSearch]
-
-
 def fit_in_folds(
     photographs: Sequence[SearchedPhotograph],
     evidence: TargetEvidence,
     config: VerificationConfig,
     prior: Verification | None = None,
     surest: float = _LEVELS[-1],
-) -> VerificationResult:
-    """Fit the model to closer looks at photographs, search again in folds, and choose the threshold `confirm`."""
+) -> tuple[Verification, list[Verification], _CloserLooks, list[_VerifiedSearch]]:
+    """Fit the model to closer looks at photographs, search again in folds, and choose the threshold `confirm`.
+
+    Returns the model, those of the folds, the closer looks, and the searches of photographs that were left out.
+    """
     closer = examine(photograph_searches(photographs, evidence, config.looks, "looking"), config.folds)
     if closer is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
@@ -140,7 +134,7 @@ def fit_in_folds(
     searches = list(verify(again, folds, limits, evidence.thresholds))
     confirm = choose_confirm(searches, config.false_alarms, surest)
     model.thresholds = Thresholds(confirm, config.give_up, config.place)
-    return VerificationResult(model, folds, closer, searches)
+    return model, folds, closer, searches
 
 
 @torch.inference_mode()
@@ -275,13 +269,15 @@ def mean_of(models: Sequence[Verification]) -> Verification:
 
 
 def verification_report(
-    fitted: VerificationResult,
+    model: Verification,
+    folds: Sequence[Verification],
+    closer: _CloserLooks,
+    searches: Sequence[_VerifiedSearch],
     pictures: str,
     how: str = "Each photograph is evaluated with a model fitted to other folds.",
 ) -> tuple[str, dict[str, float | None]]:
     """Evaluate the models in folds."""
-    closer, searches = fitted.closer, fitted.searches
-    odds = torch.stack([fold(closer.features) for fold in fitted.folds])
+    odds = torch.stack([fold(closer.features) for fold in folds])
     odds = odds[closer.fold, torch.arange(len(closer.fold))]
     figures: dict[str, float | None] = {}
     for name, logit, there in (
@@ -303,8 +299,8 @@ def verification_report(
         ("in the image, after", "presence"),
     ):
         chances.append([where, *(_figure_text(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
-    assert fitted.model.thresholds is not None
-    chosen = fitted.model.thresholds.confirm
+    assert model.thresholds is not None
+    chosen = model.thresholds.confirm
     decisions = [
         ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
     ]
@@ -392,17 +388,17 @@ class VerificationFit(PartFit):
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(photographs)), give_up=give_up)
         prior = mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
-        fitted = fit_in_folds(photographs, evidence, config, prior, SUREST_OF_FEW)
-        assert fitted.model.thresholds is not None
-        confirm = fitted.model.thresholds.confirm
-        after = _scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
-        before = _scores(fitted.searches, [each.unverified for each in fitted.searches])
+        model, folds, closer, searches = fit_in_folds(photographs, evidence, config, prior, SUREST_OF_FEW)
+        assert model.thresholds is not None
+        confirm = model.thresholds.confirm
+        after = _scores(searches, [each.found(confirm) for each in searches])
+        before = _scores(searches, [each.unverified for each in searches])
         gain = Difference.of(after, before)
         why = (
             f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
-            f"{in_words(gain, 'points gained', 100)}"
+            f"{gain.in_words('points gained', 100)}"
         )
-        fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
+        model.metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
         text = (
             "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
             "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
@@ -410,8 +406,8 @@ class VerificationFit(PartFit):
             "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
         return PartResult(
-            self.write(fitted.model, gain.better, why),
-            text + verification_report(fitted, f"{len(photographs)} photographs")[0],
+            self.write(model, gain.better, why),
+            text + verification_report(model, folds, closer, searches, f"{len(photographs)} photographs")[0],
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,11 +21,10 @@ from semfov.data.scene import Annotation, ChosenScenes, Scenes
 from semfov.decision import OUTCOMES, SAME, settle
 from semfov.errors import check
 from semfov.fit.descent import descend
-from semfov.fit.evidence import Bounds, choose_thresholds
+from semfov.fit.evidence import choose_thresholds
 from semfov.fit.outputs import training_of
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import (
-    VerificationResult,
     choose_confirm,
     examine,
     fit,
@@ -133,7 +132,7 @@ def _fit_judge(model: GlimpseEvidence, searches: _Searches, steps: int, batch: i
 
 
 @torch.no_grad()
-def _judge_searches(model: GlimpseEvidence, searches: _Searches, bounds: Bounds) -> list[str]:
+def _judge_searches(model: GlimpseEvidence, searches: _Searches, bounds: Any) -> list[str]:
     """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them."""
     anywhere = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
@@ -251,7 +250,7 @@ def _fit_closer(
         looks.save()
     how = f"The model was fitted to {len(training.fold)} closer looks at pictures of other photographs."
     judged = f"{sum(len(opened) for _, opened in pictures['judged'])} pictures of held-out photographs"
-    return verification_report(VerificationResult(fitted, [fitted], held_out, decisions), judged, how)[0]
+    return verification_report(fitted, [fitted], held_out, decisions, judged, how)[0]
 
 
 def crowded(scenes: Scenes, share: float) -> ChosenScenes:

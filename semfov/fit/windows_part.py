@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.detector_report import Difference, in_words, mean_percent, section
+from semfov.fit.detector_report import Difference, mean_percent, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
@@ -131,7 +131,7 @@ class WindowsFit(PartFit):
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {_RECALL_PASSES[-1]} passes, "
             f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
-            f"passes {in_words(gain, 'points gained', 100)}"
+            f"passes {gain.in_words('points gained', 100)}"
         )
         rows = [["looks", *(f"after {n} passes" for n in _RECALL_PASSES), "mean"]]
         rows += [

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _Config = TypeVar("_Config", bound=Settings)
 
-GOES_ON = "; give the same command again to continue"
+_GOES_ON = "; give the same command again to continue"
 """What is said about an interrupted command that keeps what it has finished."""
 
 _PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
@@ -105,12 +105,13 @@ def run_command(
     *,
     positional: tuple[str, str] | None = None,
     program: str | None = None,
-    goes_on: str = GOES_ON,
+    goes_on: bool = True,
     words: Callable[[str], str] = str,
 ) -> int:
-    """Parse `arguments` into a `config` and call `main` with it."""
+    """Parse `arguments` into a `config` and call `main` with it; one that is interrupted may go on (`goes_on`)."""
+    more = _GOES_ON if goes_on else ""
     try:
-        with _signals(goes_on):
+        with _signals(more):
             parser = make_parser(config, description, positional, program)
             command_line = sys.argv[1:] if arguments is None else arguments
             try:
@@ -141,12 +142,12 @@ def run_command(
         # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
         # it and would end by the signal although it was caught here. A string that runs to its end resets this.
         exec("")  # noqa: S102
-        print(f"{_ENDINGS[signal.SIGINT]}{goes_on}", file=sys.stderr)
+        print(f"{_ENDINGS[signal.SIGINT]}{more}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated as ended:
         number: int = ended.args[0]
         with suppress(OSError):  # the terminal may be gone
-            print(f"{_ENDINGS[number]}{goes_on}", file=sys.stderr)
+            print(f"{_ENDINGS[number]}{more}", file=sys.stderr)
         return 128 + number
     return code or 0
 

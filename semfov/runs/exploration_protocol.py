@@ -23,10 +23,6 @@ class Exploration(NamedTuple):
     start: int
 
 
-COUNTS = ("right", "right_without_background", "right_everywhere")
-"""Names of the counts of right cells (`counts_of`)."""
-
-
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
     """All explorations of a scene; their starts differ as long as there are enough cells."""
     generator = generator_for("start", protocol.seed, scenes.ids[index])
@@ -72,14 +68,17 @@ def run_explorations(
             counts.append(counts_of(probabilities, answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
-        tables = zip(*(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True)), strict=True)
-        rows = [dict(zip(COUNTS, row, strict=True)) for row in tables]
+        tables = {name: torch.stack([each[name] for each in counts], 1).tolist() for name in counts[0]}
+        rows = [dict(zip(tables, row, strict=True)) for row in zip(*tables.values(), strict=True)]
         progress += list(zip(torch.stack(visits, 1).tolist(), rows, strict=True))
     return progress
 
 
-def counts_of(probabilities: Tensor, answers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The three `COUNTS` for maps `(B, X·Y, K+1)`, each `(B,)`."""
+def counts_of(probabilities: Tensor, answers: Tensor) -> dict[str, Tensor]:
+    """Numbers of right cells of maps `(B, X·Y, K+1)`, each `(B,)`."""
     everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
-    without = count_right(probabilities[..., 1:], answers[:, 1:])
-    return count_right(probabilities, answers), without, count_right(probabilities, everywhere)
+    return {
+        "right": count_right(probabilities, answers),
+        "right_without_background": count_right(probabilities[..., 1:], answers[:, 1:]),
+        "right_everywhere": count_right(probabilities, everywhere),
+    }

@@ -12,9 +12,6 @@ from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.eye import Eye, View
 
-BoxKey = tuple[float, ...]
-"""`(x1, y1, x2, y2)`."""
-
 LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
 
@@ -30,14 +27,16 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def photograph_looks(eye: Eye, image: Callable[[], Tensor], grid: Grid) -> Callable[[int | BoxKey], Detections]:
+def photograph_looks(
+    eye: Eye, image: Callable[[], Tensor], grid: Grid
+) -> Callable[[int | tuple[float, ...]], Detections]:
     """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
 
     Shapes: image `(1, 3, H, W)`.
     """
     view: View | None = None
 
-    def look(action: int | BoxKey) -> Detections:
+    def look(action: int | tuple[float, ...]) -> Detections:
         nonlocal view
         if isinstance(action, tuple):
             return tight(eye.close_up(image(), torch.tensor(action)))

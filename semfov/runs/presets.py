@@ -34,14 +34,6 @@ _MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 _OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
 """Settings of the map of all classes."""
 
-PolicyChoice = str | PolicyConfig
-"""A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
-
-
-def _valid_policies(task: Task) -> list[str]:
-    """The values that `PolicyConfig.policy` may have."""
-    return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
-
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
     """The presets for a task."""
@@ -81,15 +73,15 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
     return MappingProxyType({**alone, **both, **same})
 
 
-def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
-    """The settings of a policy."""
+def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
+    """The settings of a policy, which is given by the name of a preset or by settings."""
     by_name = presets(task)
     if isinstance(choice, str):
         if choice[:1] in ("[", "{"):
             settings = ", ".join(field.name for field in fields(PolicyConfig))
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return by_name[lookup(choice, by_name, "policy")]
-    lookup(choice.policy, _valid_policies(task), "policy")
+    lookup(choice.policy, [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])], "policy")
     saliency = choice.saliency if choice.policy == Static.name else None
     if choice.policy == Static.name and saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
@@ -119,7 +111,7 @@ def resolve(choice: PolicyChoice, task: Task) -> PolicyConfig:
     return choice
 
 
-def label(choice: PolicyChoice, task: Task) -> str:
+def label(choice: str | PolicyConfig, task: Task) -> str:
     """The name of a policy in tables: the preset that it is based on, and the settings that differ from it."""
     settings = resolve(choice, task)
     names = {

@@ -30,7 +30,7 @@ class Trial(NamedTuple):
     commonest: bool
 
 
-EpisodeOutcome = tuple[list[int], int]
+_Outcome = tuple[list[int], int]
 """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
 
 
@@ -149,12 +149,12 @@ def run_episodes(
     *,
     shifts: int,
     batch: int,
-) -> list[EpisodeOutcome]:
+) -> list[_Outcome]:
     """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
 
     Shapes: noise `(episodes, shifts+1, X·Y)`.
     """
-    outcomes: list[EpisodeOutcome] = []
+    outcomes: list[_Outcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
         outcomes += _run_batch(episodes[part], strategy, looks.of(part), noise[part], shifts)
@@ -163,7 +163,7 @@ def run_episodes(
 
 def _run_batch(
     episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, shifts: int
-) -> list[EpisodeOutcome]:
+) -> list[_Outcome]:
     grid = looks.grid
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
     for row, episode in enumerate(episodes):

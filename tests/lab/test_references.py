@@ -83,7 +83,7 @@ def test_counts_equal_a_loop_over_cells(seed, device):
     answers = torch.rand(40, 4, generator=generator) < 0.3
     answers[:, 0] = False
     got = counts_of(probabilities.to(device), answers.to(device))
-    assert [tuple(each.shape) for each in got] == [(6,)] * 3
+    assert [tuple(each.shape) for each in got.values()] == [(6,)] * 3
     expected = [counts_by_loop(rows, answers) for rows in probabilities]
-    assert torch.stack(got, 1).tolist() == expected
+    assert torch.stack([*got.values()], 1).tolist() == expected
     assert all(sum(column) > 0 for column in zip(*expected, strict=True))

@@ -28,7 +28,7 @@ from semfov.runs.policy_looking import (
     _Models,
     _needs_observation,
 )
-from semfov.runs.presets import _valid_policies, presets, resolve
+from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
 from tests.refusals import refused
 
@@ -89,7 +89,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
     assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
     without = {"random", "closer-look", "saliency", "expected-gain"}
-    for name in _valid_policies("exploration"):
+    for name in policies.policy_names("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
         assert needs_model(None, given, task="exploration") == (name not in without)
