@@ -20,7 +20,7 @@ from benchmarks.tables import begin, command, number, page, spread, table, write
 from benchmarks.timing import Run, Spread, interleaved
 from semfov import EmbeddedScenes, Grid, ZoomAgent, acquisition, foveate
 from semfov.belief import fuse
-from semfov.data.large import to_bytes
+from semfov.data.images import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.scores import Candidates
 from semfov.paths import ZoomPath

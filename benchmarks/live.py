@@ -12,7 +12,7 @@ import torch
 from benchmarks.tables import begin, command, comparison_rows, page, table, write
 from benchmarks.timing import Comparison, measure
 from semfov import ActivePerception, EmbeddedScenes, as_image
-from semfov.data.large import to_bytes
+from semfov.data.images import to_bytes
 
 FRAMES = 30
 TEXT = f"""\

@@ -32,7 +32,7 @@ from eval.zoom.objects import average_precision
 from eval.zoom.orders import adaptive_slices, in_order, quad_tree, sparse
 from eval.zoom.run import SEMFOV, ZoomConfig, ZoomRun
 from semfov.agents.windows import ZoomAgent
-from semfov.data.large import to_bytes
+from semfov.data.images import to_bytes
 from semfov.detection.objects import FAINTEST, Objects
 from semfov.io.files import write_text
 from semfov.runs.command import command

@@ -17,7 +17,7 @@ import torch
 from benchmarks.tables import begin, command, number, page, spread, table, write
 from benchmarks.timing import Clock, Run, Spread, interleaved
 from semfov import EmbeddedScenes, ZoomAgent
-from semfov.data.large import to_bytes
+from semfov.data.images import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.selection import select
 from semfov.paths import ZoomPath

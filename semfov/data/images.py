@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.errors import DataError, SemfovError
+from semfov.data.windowed import LargePicture, PixelBox
+from semfov.errors import DataError, SemfovError, check_pixels
 from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
@@ -50,7 +51,11 @@ _MOVES = {
     8: "ROTATE_90",
 }
 _INVERSE = {6: 8, 8: 6}
+_WIDTH_TAG, _HEIGHT_TAG = 256, 257
 _SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
+
+_PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
+_ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
 
 
 def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
@@ -81,7 +86,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     """
     check_white(white)
     with opening(Path(path), "decoded"), open_pillow(path) as image:
-        check_proportion(image, path)
+        _check_proportion(image, path)
         _check_pixels(image.size, f"image {Path(path)}")
         wide = image.mode in _SIXTEEN_BITS and white is None
         array = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
@@ -186,7 +191,7 @@ def _seek_picture(image: Any) -> None:
     image.seek(0)
 
 
-def check_proportion(image: Any, path: str | PathLike[str]) -> None:
+def _check_proportion(image: Any, path: str | PathLike[str]) -> None:
     """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
     pixels, size = math.prod(image.size), Path(path).stat().st_size
     if pixels > _SMALL and pixels > _MOST_A_BYTE * size:
@@ -222,7 +227,7 @@ def _check_pixels(size: tuple[int, int], name: str) -> None:
         raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; {_SMALLER}")
 
 
-def orientation(image: Any) -> int:
+def _orientation(image: Any) -> int:
     """The EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
     try:
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
@@ -231,7 +236,7 @@ def orientation(image: Any) -> int:
     return orientation if orientation in _MOVES else 1
 
 
-def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
+def _turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
     """Turn a picture upright, or back to the orientation of its file."""
     from PIL.Image import Transpose
 
@@ -241,18 +246,18 @@ def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
 
 def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
-    stored = orientation(image)
+    stored = _orientation(image)
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     inverted = image.mode in _SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
     image.load()
-    pixels = _rgb(turned(image, stored, orientation(image), upright=upright), name, white)
+    pixels = _rgb(_turned(image, stored, _orientation(image), upright=upright), name, white)
     return 1 - pixels if inverted else pixels
 
 
 def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1] of a Pillow image of any mode."""
     wide = image.mode in _SIXTEEN_BITS or image.mode == "F"
-    pixels = np.asarray(image if wide else over_white(image).convert("RGB"))
+    pixels = np.asarray(image if wide else _over_white(image).convert("RGB"))
     if white is not None:
         pixels = between(pixels, black_and_white(white, pixels))
     elif not wide:
@@ -267,7 +272,7 @@ def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
     return np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels
 
 
-def over_white(image: Any) -> Any:
+def _over_white(image: Any) -> Any:
     """A Pillow image, whose transparent pixels are blended with white."""
     from PIL import Image
 
@@ -277,3 +282,57 @@ def over_white(image: Any) -> Any:
         image = image.convert("LA")
     image = image.convert("RGBA")
     return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+
+
+class PhotographPicture(LargePicture):
+    """A picture in a file that Pillow reads."""
+
+    path: Path
+
+    def __init__(self, path: str | PathLike[str], white: White | None = None) -> None:
+        self.path, self._white = Path(path), white
+        self._array: NDArray[np.uint8] | None = None
+        with opening(self.path, "opened"), open_pillow(self.path) as image:
+            _check_proportion(image, self.path)
+            self.size = upright_size(image)
+
+    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+        x1, y1, x2, y2 = box
+        if self._array is None:
+            with opening(self.path, "decoded"), open_pillow(self.path) as image:
+                if image.mode in _PLAIN and self._white is None:
+                    stored = _orientation(image)
+                    image.load()
+                    self._array = _rgb_bytes(_turned(image, stored, _orientation(image), upright=True))
+                else:
+                    self._array = to_bytes(read_image(self.path, white=self._white))
+        return self._array[y1:y2, x1:x2]
+
+
+def _rgb_bytes(image: Any) -> NDArray[np.uint8]:
+    """Bytes `(H, W, 3)` of a Pillow image of 8 bits, converted a few rows at a time."""
+    width, height = image.size
+    array = np.empty((height, width, 3), np.uint8)
+    for top in range(0, height, _ROWS):
+        rows = image.crop((0, top, width, min(top + _ROWS, height)))
+        array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
+    return array
+
+
+def upright_size(image: Any) -> tuple[int, int]:
+    """Size of a Pillow image after it is turned upright."""
+    if _orientation(image) < 5:
+        return image.size
+    # Pillow swaps the sides of TIFFs itself before it turns them.
+    tags = getattr(image, "tag_v2", {})
+    width, height = tags.get(_WIDTH_TAG, image.size[0]), tags.get(_HEIGHT_TAG, image.size[1])
+    return height, width
+
+
+def to_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """Bytes `(H, W, 3)` of an image `(3, H, W)`, which is RGB in [0, 1] or bytes."""
+    if image.dtype != torch.uint8:
+        check_pixels(image, "image")
+        image = image.clamp(0, 1).mul(255).round()
+    pixels: NDArray[np.uint8] = image.permute(1, 2, 0).to("cpu", torch.uint8).contiguous().numpy()
+    return pixels

@@ -101,8 +101,9 @@ def as_pixels(
 ) -> Tensor:
     """The pixels of a picture or a batch, RGB `(B, 3, H, W)`, with the numbers as they are given (`as_images`)."""
     check_white(white)
-    pixels = channels_first(pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
-    return in_rgb(pixels, images, color)
+    pixels = _channels_first(_pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
+    swap = lookup(color, get_args(Color), "order of channels") == "bgr"
+    return pixels.flip(1) if swap and isinstance(images, Tensor | np.ndarray) else pixels  # files are RGB already
 
 
 def as_batch(images: ImageLike) -> Tensor:
@@ -112,18 +113,12 @@ def as_batch(images: ImageLike) -> Tensor:
     return as_images(images)
 
 
-def in_rgb(pixels: Tensor, source: ImageLike, color: Color) -> Tensor:
-    """Pixels `(B, 3, H, W)` in the order red, green, blue; files and Pillow images are RGB already."""
-    swap = lookup(color, get_args(Color), "order of channels") == "bgr"
-    return pixels.flip(1) if swap and isinstance(source, Tensor | np.ndarray) else pixels
-
-
 def is_batch(image: object) -> bool:
     """Whether this is a batch of pictures instead of a single one."""
     return isinstance(image, Tensor | np.ndarray) and image.ndim > 3
 
 
-def pixels_of(image: ImageLike, argument: str = "image", white: White | None = None) -> Tensor:
+def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
     """The pixels of a picture; arrays and tensors keep their layout, without `white` also their dtype."""
     if white is not None and isinstance(image, Tensor | np.ndarray):
         values = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
@@ -164,7 +159,7 @@ def check_local(path: str | PathLike[str], argument: str) -> None:
     check(not separator, argument, "a file on this machine", f"an address, {kind}://…; {remedy}")
 
 
-def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = True) -> Tensor:
+def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
     """Convert pixels from any layout that `as_image` accepts to channels first; choose `(3, H, 3)` → `(B, 3, H, W)`."""
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")

@@ -8,11 +8,10 @@ import weakref
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
@@ -21,26 +20,20 @@ from torch import Tensor
 
 from semfov.data.gdal import MOST_SIDE, open_raster, raster_settings
 from semfov.data.images import (
-    check_proportion,
+    PhotographPicture,
     check_tile,
     open_pillow,
     opening,
-    orientation,
-    over_white,
     quiet_decoders,
-    read_image,
-    turned,
+    to_bytes,
+    upright_size,
     warn_of_range,
 )
-from semfov.data.inputs import Color, ImageLike, as_image, channels_first, check_local, in_rgb, pixels_of
+from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.data.windowed import BY_WINDOWS, FIRST, RASTERS, ChosenBands, LargePicture, PixelBox, bytes_of
-from semfov.errors import DataError, check, check_pixels, lookup
+from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture, PixelBox, bytes_of
+from semfov.errors import DataError, check, lookup
 from semfov.io.files import check_regular
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
 
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
@@ -283,18 +276,14 @@ class _RasterPicture(LargePicture):
             grey = int(bytes_between(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]), self._tone)[0])
             self.nothing = grey, grey, grey
 
-    @cached_property
-    def _first(self) -> int:
-        return FIRST if self._has_overviews else super()._first
-
     def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
         return self._window(box, 1)
 
-    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
-        """Read a window; coarse ones from the overviews of the file, else as in other large pictures."""
-        if reduction < FIRST or not self._has_overviews:
-            return super().read(box, reduction)
-        x1, y1, x2, y2 = self._inside(box)
+    def _reduced(self, box: PixelBox, reduction: int) -> Tensor:
+        """A window from the overviews of the file, or from a copy where it has none."""
+        if not self._has_overviews:
+            return super()._reduced(box, reduction)
+        x1, y1, x2, y2 = box
         right, bottom = (min(-(-n // reduction) * reduction, m) for n, m in zip((x2, y2), self.size, strict=True))
         outwards = x1 // reduction * reduction, y1 // reduction * reduction, right, bottom
         return bytes_of(self._window(outwards, reduction))
@@ -320,11 +309,6 @@ class _RasterPicture(LargePicture):
             else:
                 found = self._file.read(self._bands, out_shape=(len(self._bands), *shape), **window)
         return np.moveaxis(found, 0, -1)
-
-
-_ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
-_PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
-_WIDTH, _HEIGHT = 256, 257  # tags of a TIFF
 
 
 class _ArrayPicture(LargePicture):
@@ -355,55 +339,11 @@ class _MemoryPicture(_ArrayPicture):
             and image.dtype in (torch.uint8, np.dtype(np.uint8))
         ):
             # Bytes are not converted to floats in between, which would take four times the memory.
-            pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
+            pixels = as_pixels(image, argument="picture", color=color)
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
-            super().__init__(to_bytes(in_rgb(pixels, image, color)[0]))
+            super().__init__(to_bytes(pixels[0]))
         else:
             super().__init__(to_bytes(as_image(image, argument="picture", color=color, white=white).detach()))
-
-
-def to_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Bytes `(H, W, 3)` of an image `(3, H, W)`, which is RGB in [0, 1] or bytes."""
-    if image.dtype != torch.uint8:
-        check_pixels(image, "image")
-        image = image.clamp(0, 1).mul(255).round()
-    pixels: NDArray[np.uint8] = image.permute(1, 2, 0).to("cpu", torch.uint8).contiguous().numpy()
-    return pixels
-
-
-class _PhotographPicture(LargePicture):
-    """A picture in a file that Pillow reads."""
-
-    path: Path
-
-    def __init__(self, path: str | PathLike[str], white: White | None = None) -> None:
-        self.path, self._white = Path(path), white
-        self._array: NDArray[np.uint8] | None = None
-        with opening(self.path, "opened"), open_pillow(self.path) as image:
-            check_proportion(image, self.path)
-            self.size = _upright_size(image)
-
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
-        x1, y1, x2, y2 = box
-        if self._array is None:
-            with opening(self.path, "decoded"), open_pillow(self.path) as image:
-                if image.mode in _PLAIN and self._white is None:
-                    stored = orientation(image)
-                    image.load()
-                    self._array = _rgb(turned(image, stored, orientation(image), upright=True))
-                else:
-                    self._array = to_bytes(read_image(self.path, white=self._white))
-        return self._array[y1:y2, x1:x2]
-
-
-def _rgb(image: "Image") -> NDArray[np.uint8]:
-    """Bytes `(H, W, 3)` of a Pillow image of 8 bits, converted a few rows at a time."""
-    width, height = image.size
-    array = np.empty((height, width, 3), np.uint8)
-    for top in range(0, height, _ROWS):
-        rows = image.crop((0, top, width, min(top + _ROWS, height)))
-        array[top : top + _ROWS] = np.asarray(over_white(rows).convert("RGB"))
-    return array
 
 
 def open_large(
@@ -444,7 +384,7 @@ def open_large(
     if kind in BY_WINDOWS:
         picture = (_raster if kind in RASTERS else _tiff)(source, white, bands)
     else:
-        picture = _PhotographPicture(source, white)
+        picture = PhotographPicture(source, white)
     if white is not None or bands is not None:
         values = white if white is None or isinstance(white, str) else black_and_white(white, np.zeros(0))
         picture.shown = {"white": values, "bands": bands}
@@ -458,7 +398,7 @@ def _raster(path: str | PathLike[str], white: White | None, bands: ChosenBands) 
     except DataError:
         if Path(path).suffix.lower() == ".jp2" and bands is None:
             with suppress(DataError):
-                return _PhotographPicture(path, white)
+                return PhotographPicture(path, white)
         raise
 
 
@@ -467,7 +407,7 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) ->
     if _is_converted(path):
         expected = f"None for {path}, which is turned, or of other colours than grey and RGB"
         check(bands is None, "bands", expected, f"{bands}; convert it")
-        return _PhotographPicture(path, white)
+        return PhotographPicture(path, white)
     try:
         tiff = _TiffPicture(path, white=white, bands=bands)
         if not tiff.has_overviews:
@@ -477,7 +417,7 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) ->
             return _RasterPicture(path, white=white, bands=bands)
         if bands is None:
             with suppress(DataError):
-                photograph = _PhotographPicture(path, white)
+                photograph = PhotographPicture(path, white)
                 photograph.read((0, 0, 1, 1))
                 return photograph
         raise error from None
@@ -499,21 +439,11 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
             with suppress(DataError):
                 return open_large(path).size
         with opening(path, "opened"), open_pillow(path) as image:
-            return _upright_size(image)
+            return upright_size(image)
     if isinstance(source, Pillow.Image):
-        return _upright_size(source)
-    height, width = channels_first(pixels_of(source, "picture"), "picture").shape[-2:]
+        return upright_size(source)
+    height, width = as_pixels(source, argument="picture").shape[-2:]
     return width, height
-
-
-def _upright_size(image: "Image") -> tuple[int, int]:
-    """Size of a Pillow image after it is turned upright."""
-    if orientation(image) < 5:
-        return image.size
-    # Pillow swaps the sides of TIFFs itself before it turns them.
-    tags = getattr(image, "tag_v2", {})
-    width, height = tags.get(_WIDTH, image.size[0]), tags.get(_HEIGHT, image.size[1])
-    return height, width
 
 
 _ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which the values of a picture are looked at

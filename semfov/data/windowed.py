@@ -1,7 +1,7 @@
 """Pictures that are read window by window: their base, and what their files have in common."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ PixelBox = tuple[int, int, int, int]
 _STRIP = 1 << 23
 """Pixels that are read at once for a copy."""
 
-FIRST = 4
+_FIRST = 4
 """Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
 
 _LARGEST = 1 << 25
@@ -40,18 +40,6 @@ def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
     while ratio >= 2 * oversampling * reduction:
         reduction *= 2
     return reduction
-
-
-def _first_for(size: tuple[int, int]) -> int:
-    """Factor by which the largest copy of a picture is reduced, so that it has at most `_LARGEST` pixels.
-
-    >>> _first_for((20_000, 15_000)), _first_for((40_000, 40_000))
-    (4, 8)
-    """
-    first = FIRST
-    while size[0] * size[1] > _LARGEST * first**2:
-        first *= 2
-    return first
 
 
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -74,56 +62,6 @@ def bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
     return shared.permute(2, 0, 1)
 
 
-class _ReducedCopies:
-    """Copies of a picture, each reduced by a power of two. A copy is made when it is first needed, and kept.
-
-    A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
-    borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
-
-    Shapes: read `(h, w, 3)`.
-    """
-
-    def __init__(self, size: tuple[int, int], read: Callable[[PixelBox], NDArray[np.uint8]]) -> None:
-        self.size, self.first = size, _first_for(size)
-        self._read = read
-        self._copies: dict[int, Tensor] = {}
-
-    def window(self, box: PixelBox, reduction: int) -> Tensor:
-        """Read a window from a copy; → `(3, h, w)`."""
-        copy = self._copy(reduction)
-        high, wide = copy.shape[1:]
-        x1, y1, x2, y2 = box
-        left, top = min(x1 // reduction, wide - 1), min(y1 // reduction, high - 1)
-        return copy[:, top : max(-(-y2 // reduction), top + 1), left : max(-(-x2 // reduction), left + 1)]
-
-    def _copy(self, reduction: int) -> Tensor:
-        """The picture reduced by a factor, `(3, h, w)`, channels last in memory."""
-        if reduction not in self._copies:
-            if reduction == self.first:
-                self._copies[reduction] = self._largest()
-            else:
-                larger = self._copy(reduction // 2)
-                high, wide = (max(1, length // 2) for length in larger.shape[1:])
-                self._copies[reduction] = resized(larger[:, : 2 * high, : 2 * wide], (high, wide))[0]
-        return self._copies[reduction]
-
-    def _largest(self) -> Tensor:
-        """The largest copy, made strip by strip."""
-        first = self.first
-        wide, high = (max(1, length // first) for length in self.size)
-        width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
-        rows = max(1, _STRIP // self.size[0] // first)
-        copy = torch.empty(high, wide, 3, dtype=torch.uint8)
-        for top in range(0, high, rows):
-            bottom = min(top + rows, high)
-            # The filter reaches over the borders of a strip by less than one pixel of the copy.
-            low, end = max(top - 1, 0), min(bottom + 1, high)
-            strip = bytes_of(self._read((0, low * first, width, min(end * first, height))))
-            part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
-            copy[top:bottom] = part.permute(1, 2, 0)
-        return copy.permute(2, 0, 1)
-
-
 RASTERS = (".vrt", ".jp2")
 """Ends of the names of files that only GDAL reads by windows; TIFFs can also be read without it."""
 
@@ -143,6 +81,7 @@ class LargePicture(ABC):
     size: tuple[int, int]
     path: Path | None = None
     shown: Mapping[str, Any] | None = None  # `white` and `bands` with which the file was opened; None for neither
+    _has_overviews = False  # whether coarse windows are read from reduced copies in the file
     nothing: tuple[int, int, int] | None = None  # the colour in which pixels without data are shown, if a file has some
 
     @abstractmethod
@@ -165,9 +104,8 @@ class LargePicture(ABC):
         Shapes: → `(3, h, w)`.
         """
         self._inside(box)
-        if reduction < self._first or self.size[0] * self.size[1] <= _LARGE:
-            return bytes_of(self._given(box))
-        return self._copies.window(box, reduction)
+        coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
+        return self._reduced(box, reduction) if coarse and reduction >= self._first else bytes_of(self._given(box))
 
     def _given(self, box: PixelBox) -> NDArray[np.uint8]:
         """The pixels of a window; raises `InputError` where a reader gives others."""
@@ -186,9 +124,48 @@ class LargePicture(ABC):
 
     @cached_property
     def _first(self) -> int:
-        """Least factor by which windows are read reduced."""
-        return _first_for(self.size)
+        """Least factor by which windows are read reduced, so that the largest copy has at most `_LARGEST` pixels."""
+        first = _FIRST
+        while not self._has_overviews and self.size[0] * self.size[1] > _LARGEST * first**2:
+            first *= 2
+        return first
+
+    def _reduced(self, box: PixelBox, reduction: int) -> Tensor:
+        """A window of a copy, `(3, h, w)`."""
+        copy = self._copy(reduction)
+        high, wide = copy.shape[1:]
+        x1, y1, x2, y2 = box
+        left, top = min(x1 // reduction, wide - 1), min(y1 // reduction, high - 1)
+        return copy[:, top : max(-(-y2 // reduction), top + 1), left : max(-(-x2 // reduction), left + 1)]
 
     @cached_property
-    def _copies(self) -> _ReducedCopies:
-        return _ReducedCopies(self.size, self._given)
+    def _copies(self) -> dict[int, Tensor]:
+        """Copies `(3, h, w)` by their reduction, channels last in memory; each is made when it is first needed."""
+        return {}
+
+    def _copy(self, reduction: int) -> Tensor:
+        """A copy, without what is left of sides that are no multiples of the reduction, less than one of its pixels."""
+        if reduction not in self._copies:
+            if reduction == self._first:
+                self._copies[reduction] = self._largest()
+            else:
+                larger = self._copy(reduction // 2)
+                high, wide = (max(1, length // 2) for length in larger.shape[1:])
+                self._copies[reduction] = resized(larger[:, : 2 * high, : 2 * wide], (high, wide))[0]
+        return self._copies[reduction]
+
+    def _largest(self) -> Tensor:
+        """The largest copy, made strip by strip."""
+        first = self._first
+        wide, high = (max(1, length // first) for length in self.size)
+        width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
+        rows = max(1, _STRIP // self.size[0] // first)
+        copy = torch.empty(high, wide, 3, dtype=torch.uint8)
+        for top in range(0, high, rows):
+            bottom = min(top + rows, high)
+            # The filter reaches over the borders of a strip by less than one pixel of the copy.
+            low, end = max(top - 1, 0), min(bottom + 1, high)
+            strip = bytes_of(self._given((0, low * first, width, min(end * first, height))))
+            part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
+            copy[top:bottom] = part.permute(1, 2, 0)
+        return copy.permute(2, 0, 1)

@@ -1,7 +1,7 @@
 """Darknet cfgs, the sections that describe a network layer by layer: read from a file, or of a published YOLOv3."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -102,9 +102,31 @@ _ANCHORS = "10,13, 16,30, 33,23, 30,61, 62,45, 59,119, 116,90, 156,198, 373,326"
 _TINY_ANCHORS = "10,14, 23,27, 37,58, 81,82, 135,169, 344,319"
 
 
-def yolov3(classes: int = 80) -> list[Section]:
-    """YOLOv3: Darknet-53 and heads at strides 32, 16 and 8 on a 416 x 416 input; 75 convolutions."""
-    return _yolov3(416, classes, [])
+def _yolov3(classes: int = 80, size: int = 416, pyramid: Sequence[Section] = ()) -> list[Section]:
+    """YOLOv3: Darknet-53 and heads at strides 32, 16 and 8 on a square input; 75 convolutions."""
+    sections = [_section("net", width=size, height=size, channels=3), _convolution(32, 3)]
+    ends = []
+    for filters, blocks in ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4)):
+        sections.append(_convolution(filters, 3, stride=2))
+        sections += [
+            _convolution(filters // 2, 1),
+            _convolution(filters, 3),
+            _section("shortcut", **{"from": -3}, activation="linear"),
+        ] * blocks
+        ends.append(len(sections) - 2)  # minus 2, because [net] is not a layer
+    for width, mask, lateral in ((512, "6,7,8", None), (256, "3,4,5", ends[3]), (128, "0,1,2", ends[2])):
+        if lateral is not None:
+            sections += [
+                _section("route", layers="-4"),
+                _convolution(width, 1),
+                _section("upsample", stride=2),
+                _section("route", layers=f"-1,{lateral}"),
+            ]
+        sections += [_convolution(width, 1), _convolution(2 * width, 3), _convolution(width, 1)]
+        sections += pyramid if lateral is None else []
+        sections += [_convolution(2 * width, 3), _convolution(width, 1), _convolution(2 * width, 3)]
+        sections += _head(mask, _ANCHORS, classes)
+    return sections
 
 
 def _yolov3_spp(classes: int = 80) -> list[Section]:
@@ -118,7 +140,7 @@ def _yolov3_spp(classes: int = 80) -> list[Section]:
         _section("route", layers="-1,-3,-5,-6"),
         _convolution(512, 1),
     ]
-    return _yolov3(608, classes, pyramid)
+    return _yolov3(classes, 608, pyramid)
 
 
 def _yolov3_tiny(classes: int = 80) -> list[Section]:
@@ -154,36 +176,10 @@ def _yolov3_tiny(classes: int = 80) -> list[Section]:
 
 
 ARCHITECTURES: dict[str, Callable[..., list[Section]]] = {
-    "yolov3": yolov3,
+    "yolov3": _yolov3,
     "yolov3-tiny": _yolov3_tiny,
     "yolov3-spp": _yolov3_spp,
 }
-
-
-def _yolov3(size: int, classes: int, pyramid: list[Section]) -> list[Section]:
-    sections = [_section("net", width=size, height=size, channels=3), _convolution(32, 3)]
-    ends = []
-    for filters, blocks in ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4)):
-        sections.append(_convolution(filters, 3, stride=2))
-        sections += [
-            _convolution(filters // 2, 1),
-            _convolution(filters, 3),
-            _section("shortcut", **{"from": -3}, activation="linear"),
-        ] * blocks
-        ends.append(len(sections) - 2)  # minus 2, because [net] is not a layer
-    for width, mask, lateral in ((512, "6,7,8", None), (256, "3,4,5", ends[3]), (128, "0,1,2", ends[2])):
-        if lateral is not None:
-            sections += [
-                _section("route", layers="-4"),
-                _convolution(width, 1),
-                _section("upsample", stride=2),
-                _section("route", layers=f"-1,{lateral}"),
-            ]
-        sections += [_convolution(width, 1), _convolution(2 * width, 3), _convolution(width, 1)]
-        sections += pyramid if lateral is None else []
-        sections += [_convolution(2 * width, 3), _convolution(width, 1), _convolution(2 * width, 3)]
-        sections += _head(mask, _ANCHORS, classes)
-    return sections
 
 
 def _section(kind: str, **options: int | str) -> Section:

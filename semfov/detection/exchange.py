@@ -21,12 +21,15 @@ def named_detections(
     boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, Any]
 ) -> supervision.Detections:
     """`supervision.Detections` of boxes, with classes from 0, their names unless None, and further data."""
-    library, numbers = _supervision(), (labels - 1).numpy()
+    try:
+        from supervision import Detections
+    except ImportError:
+        raise InputError(
+            "supervision: expected the package supervision, which is not installed; pip install supervision"
+        ) from None
+    numbers = (labels - 1).numpy()
     names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
-    made: supervision.Detections = library.Detections(
-        boxes.numpy(), None, scores.numpy(), numbers, data={**data, **names}
-    )
-    return made
+    return Detections(boxes.numpy(), None, scores.numpy(), numbers, data={**data, **names})
 
 
 def coco_results(
@@ -65,13 +68,3 @@ def category_ids(
 def _is_whole(value: object) -> bool:
     """Whether a value is a whole number of any library."""
     return hasattr(value, "__index__") and not isinstance(value, bool)
-
-
-def _supervision() -> Any:
-    try:
-        import supervision
-    except ImportError:
-        raise InputError(
-            "supervision: expected the package supervision, which is not installed; pip install supervision"
-        ) from None
-    return supervision

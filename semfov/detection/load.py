@@ -54,8 +54,8 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
       `semfov.detection.onnx.load_onnx`. The last one needs `weights=`, a file that you have.
     - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.load_torchvision`.
     - `"hf:<owner>/<name>"`: models of Hugging Face's hub; options of `semfov.detection.transformers.load_hub`.
-    - A model of torchvision, transformers or Ultralytics: options of `wrap_torchvision`, `wrap_transformers` and
-      `wrap_ultralytics` in the modules of these names in `semfov.detection`.
+    - A model of torchvision, transformers or Ultralytics: options of `TorchvisionDetector`, `TransformersDetector`
+      and `UltralyticsDetector` in the modules of these names in `semfov.detection`.
     - A `Detector`: returned as it is.
 
     The weights of a named detector are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
@@ -120,29 +120,21 @@ def _loader(name: str) -> Callable[..., Detector]:
     return load_yolo
 
 
-def _comes_from(module: object, package: str) -> bool:
-    """Tell whether the class of an object, or a class that it inherits from, is defined in a package.
-
-    >>> _comes_from(nn.Linear(1, 1), "torch.nn"), _comes_from(nn.Linear(1, 1), "torchvision")
-    (True, False)
-    """
-    return any(f"{kind.__module__}.".startswith(f"{package}.") for kind in type(module).__mro__)
-
-
 def _wrapper(model: nn.Module) -> Callable[..., Detector]:
-    """The function that makes a detector of a module (in memory, not a copy), which is known by its class."""
-    if _comes_from(model, "torchvision.models.detection"):
-        from semfov.detection.torchvision import wrap_torchvision
+    """The class of detectors that holds a module (in memory, not a copy), which is known by its own class."""
+    packages = [f"{kind.__module__}." for kind in type(model).__mro__]
+    if any(package.startswith("torchvision.models.detection.") for package in packages):
+        from semfov.detection.torchvision import TorchvisionDetector
 
-        return wrap_torchvision
-    if _comes_from(model, "transformers.models"):
-        from semfov.detection.transformers import wrap_transformers
+        return TorchvisionDetector
+    if any(package.startswith("transformers.models.") for package in packages):
+        from semfov.detection.transformers import TransformersDetector
 
-        return wrap_transformers
-    if _comes_from(model, "ultralytics"):
-        from semfov.detection.ultralytics import wrap_ultralytics
+        return TransformersDetector
+    if any(package.startswith("ultralytics.") for package in packages):
+        from semfov.detection.ultralytics import UltralyticsDetector
 
-        return wrap_ultralytics
+        return UltralyticsDetector
     raise InputError(
         f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
         f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
@@ -151,9 +143,9 @@ def _wrapper(model: nn.Module) -> Callable[..., Detector]:
 
 def _options_of(load: Callable[..., Detector]) -> list[str]:
     """Names of the options of a loader, and of the one that it passes further options on to."""
-    from semfov.detection.transformers import load_hub, wrap_transformers
+    from semfov.detection.transformers import TransformersDetector, load_hub
 
-    loaders = (load, wrap_transformers) if load is load_hub else (load,)
+    loaders = (load, TransformersDetector) if load is load_hub else (load,)
     options = (each for loader in loaders for each in signature(loader).parameters.values())
     names = [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
     return [each for name in names for each in (_SELECTING if name == "selection" else [name])]
@@ -162,12 +154,12 @@ def _options_of(load: Callable[..., Detector]) -> list[str]:
 def loader_options() -> list[str]:
     """Names of the options of `load_detector` for any detector."""
     from semfov.detection.onnx import load_onnx
-    from semfov.detection.torchvision import load_torchvision, wrap_torchvision
+    from semfov.detection.torchvision import TorchvisionDetector, load_torchvision
     from semfov.detection.transformers import load_hub
-    from semfov.detection.ultralytics import wrap_ultralytics
+    from semfov.detection.ultralytics import UltralyticsDetector
 
-    loaders = load_yolo, load_onnx, load_torchvision, wrap_torchvision, load_hub, wrap_ultralytics
-    return [name for load in loaders for name in _options_of(load)]
+    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, load_torchvision, TorchvisionDetector]
+    return [name for load in [*loaders, load_hub, UltralyticsDetector] for name in _options_of(load)]
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:

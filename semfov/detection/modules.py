@@ -25,8 +25,9 @@ class ModuleDetector(Detector):
     ) -> None:
         names, places = named_outputs(classes)
         super().__init__(name, names, input_size, **options)
-        self.model = model.eval()
+        self.model = model
         self._places, self._count = places, len(classes)
+        self.eval()
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """Modules of the network that return feature maps, by what the maps are called before their stride."""

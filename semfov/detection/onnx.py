@@ -15,7 +15,7 @@ from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_clas
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
 from semfov.detection.onnx_file import check_canvas, check_elements, network_steps, read_settings, with_input_size
-from semfov.detection.onnx_heads import HEADS, STRIDES, Signature, misplaced, recognise
+from semfov.detection.onnx_heads import HEADS, Signature, misplaced, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -217,7 +217,7 @@ def load_onnx(
     published_name = name if name in _ONNX_MODELS else NETWORKS.get(sha256(file) if file.is_file() else "")
     path = file
     if published_name in _ONNX_MODELS and input_size is not None:
-        path = with_input_size(file, _sides(input_size), STRIDES)
+        path = with_input_size(file, _sides(input_size))
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(file, session.metadata)
     options = {

@@ -4,12 +4,12 @@ import ast
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
-from semfov.detection.onnx_heads import cells
+from semfov.detection.onnx_heads import STRIDES, cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
 from semfov.io.files import check_regular, inside, read_text, sha256, write_bytes
@@ -188,7 +188,7 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
     return settings
 
 
-def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int]) -> Path:
+def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
     """Find a model with another input size in the cache, and make it if it is missing; canvas `(width, height)`.
 
     A fully convolutional network knows its input size in two places: the shape of its input, and the shapes that its
@@ -204,7 +204,7 @@ def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int])
     size = sides[1].dim_value, sides[0].dim_value
     if size == canvas:
         return path
-    _resize(model.graph, size, canvas, strides)
+    _resize(model.graph, size, canvas)
     content = model.SerializeToString()
     digest = hashlib.sha256(content).hexdigest()
     new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
@@ -213,11 +213,11 @@ def with_input_size(path: Path, canvas: tuple[int, int], strides: Sequence[int])
     return new
 
 
-def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int], strides: Sequence[int]) -> None:
+def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int]) -> None:
     """Replace the sizes that a graph has in constants."""
     from onnx import numpy_helper
 
-    maps = {cells(size, stride): cells(canvas, stride) for stride in strides}
+    maps = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
     shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
     constants = {tensor.name: tensor for tensor in graph.initializer}
     constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}

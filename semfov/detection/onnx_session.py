@@ -69,10 +69,9 @@ class OnnxSession:
         import onnxruntime as ort
 
         ort.disable_telemetry_events()
-        self.path, self.spinning, self.further = Path(path), spinning, tuple(further)
+        self.path = Path(path)
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
-        self.device = torch.device(device)
         self.providers = None if providers is None else tuple(providers)
         options = ort.SessionOptions()
         options.intra_op_num_threads = self.threads
@@ -80,11 +79,18 @@ class OnnxSession:
         options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
         self.open_ended = check_file(self.path) if open_ended is None else open_ended
+        self._settings: dict[str, Any] = {
+            "threads": self.threads,
+            "device": device,
+            "providers": self.providers,
+            "spinning": spinning,
+        }
+        self._settings |= {"open_ended": self.open_ended, "further": tuple(further)}
         if self.open_ended:
             _limit_memory()
             options.add_session_config_entry("session.use_env_allocators", "1")
         try:
-            chosen = _providers(self.device) if self.providers is None else _available_providers(self.providers)
+            chosen = _providers(torch.device(device), self.providers)
             # onnxruntime's fallback would print messages and try the same again.
             model: str | bytes = fspath(path)
             if further:
@@ -176,23 +182,11 @@ class OnnxSession:
             timer.cancel()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return self._again(self.further), ()
+        return partial(OnnxSession, self.path, **self._settings), ()
 
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
-        return self._again(further)()
-
-    def _again(self, further: Sequence[str]) -> "partial[OnnxSession]":
-        return partial(
-            OnnxSession,
-            self.path,
-            threads=self.threads,
-            device=self.device,
-            providers=self.providers,
-            spinning=self.spinning,
-            open_ended=self.open_ended,
-            further=further,
-        )
+        return OnnxSession(self.path, **{**self._settings, "further": further})
 
 
 @cache
@@ -212,27 +206,22 @@ def _reason(error: Exception) -> str:
     return text if len(text) <= _MOST_REASON else f"…{text[-_MOST_REASON:]}"
 
 
-def _available_providers(providers: Sequence[Provider]) -> list[Any]:
-    """The execution providers, all of which onnxruntime has."""
+def _providers(device: torch.device, providers: Sequence[Provider] | None) -> list[Any]:
+    """The given execution providers; else those for a device, then the CPU's for what it does not support."""
     import onnxruntime as ort
 
     have = ort.get_available_providers()
-    names = [provider if isinstance(provider, str) else provider[0] for provider in providers]
-    missing = [name for name in names if name not in have]
-    check(bool(names) and not missing, "providers", f"some of {', '.join(have)}", ", ".join(missing) or "none")
-    return list(providers)
-
-
-def _providers(device: torch.device) -> list[Any]:
-    """Execution providers for a device, followed by the CPU's for operations that it does not support."""
-    import onnxruntime as ort
-
+    if providers is not None:
+        names = [provider if isinstance(provider, str) else provider[0] for provider in providers]
+        missing = [name for name in names if name not in have]
+        check(bool(names) and not missing, "providers", f"some of {', '.join(have)}", ", ".join(missing) or "none")
+        return list(providers)
     if device.type == "cpu":
         return ["CPUExecutionProvider"]
     provider = f"{device.type.upper()}ExecutionProvider"
-    if provider not in ort.get_available_providers():
-        have = ", ".join(ort.get_available_providers())
-        raise InputError(f"device: expected a device that onnxruntime can use, got {device} (its providers: {have})")
+    if provider not in have:
+        expected = "expected a device that onnxruntime can use"
+        raise InputError(f"device: {expected}, got {device} (its providers: {', '.join(have)})")
     return [(provider, {"device_id": device.index or 0}), "CPUExecutionProvider"]
 
 

@@ -26,7 +26,7 @@ _Raw = list[tuple[Tensor, Tensor]]
 PREFIX = "torchvision:"
 
 
-class _TorchvisionDetector(ModuleDetector):
+class TorchvisionDetector(ModuleDetector):
     """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
 
     The canvas is the image, resized by the model's own transform. The model's padding, its normalisation and the
@@ -39,14 +39,22 @@ class _TorchvisionDetector(ModuleDetector):
     def __init__(
         self,
         model: nn.Module,
-        classes: Sequence[str],
+        digest: str | None = None,
         *,
+        classes: Sequence[str] | None = None,
         name: str = "torchvision",
         first: int = 1,
         background: BackgroundPolicy | None = None,
         selection: Selection | None = None,
-        digest: str = "",
+        device: torch.device | str | None = None,
     ) -> None:
+        if classes is None:
+            from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
+
+            names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+            count = _output_count(model)
+            check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
+            classes = names[first:]
         head = _head_of(model)
         if head is None:
             raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
@@ -56,14 +64,14 @@ class _TorchvisionDetector(ModuleDetector):
         fixed = transform.fixed_size
         own: BackgroundPolicy = "own" if softmax else "residual"
         super().__init__(
-            model,
+            model if device is None else model.to(device),
             classes,
             name,
             (transform.max_size, transform.max_size) if fixed is None else tuple(fixed),
             background=own if background is None else background,
             selection=selection,
             stretch=fixed is not None,
-            digest=digest,
+            digest=module_digest(model) if digest is None else digest,
         )
         self.first = first
         self._outputs, self._softmax = outputs, softmax
@@ -121,35 +129,6 @@ class _TorchvisionDetector(ModuleDetector):
         return super().settings() | ({} if self.stretch else sizes)
 
 
-def wrap_torchvision(
-    model: nn.Module,
-    *,
-    classes: Sequence[str] | None = None,
-    name: str = "torchvision",
-    first: int = 1,
-    background: BackgroundPolicy | None = None,
-    selection: Selection | None = None,
-    device: torch.device | str | None = None,
-) -> _TorchvisionDetector:
-    """Make a detector of a torchvision detection model."""
-    if classes is None:
-        from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
-
-        names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
-        count = _output_count(model)
-        check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
-        classes = names[first:]
-    return _TorchvisionDetector(
-        model if device is None else model.to(device),
-        classes,
-        name=name,
-        first=first,
-        background=background,
-        selection=selection,
-        digest=module_digest(model),
-    ).eval()
-
-
 def load_torchvision(
     name: str,
     *,
@@ -160,7 +139,7 @@ def load_torchvision(
     selection: Selection | None = None,
     device: torch.device | str = "cpu",
     **model: Any,
-) -> _TorchvisionDetector:
+) -> TorchvisionDetector:
     """Load a torchvision detection model by its name."""
     from torchvision import models
 
@@ -189,15 +168,15 @@ def load_torchvision(
     if enum is None and weights is not None:
         _load_state(network, _file(weights))
     network.requires_grad_(False).to(device)
-    return _TorchvisionDetector(
+    return TorchvisionDetector(
         network,
-        classes,
+        digest,
+        classes=classes,
         name=PREFIX + name,
         first=first,
         background=background,
         selection=selection,
-        digest=digest,
-    ).eval()
+    )
 
 
 def _member(enum: Any, weights: Any) -> Any:

@@ -27,17 +27,19 @@ _SQUARE = {"height": 640, "width": 640}
 _LARGEST = 65_536  # side of a canvas in pixels
 
 
-class _TransformersDetector(ModuleDetector):
+class TransformersDetector(ModuleDetector):
     """An object detection model of transformers as a `Detector`; it is differentiable."""
 
     def __init__(
         self,
         model: nn.Module,
-        classes: Sequence[str] | None,
-        name: str | None,
-        processor: Mapping[str, Any] | None,
-        background: BackgroundPolicy | None,
-        **options: Any,
+        *,
+        classes: Sequence[str] | None = None,
+        name: str | None = None,
+        processor: Mapping[str, Any] | None = None,
+        background: BackgroundPolicy | None = None,
+        selection: Selection | None = None,
+        device: torch.device | str | None = None,
     ) -> None:
         config: Any = model.config
         detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
@@ -61,13 +63,14 @@ class _TransformersDetector(ModuleDetector):
         sides = size.get("width") or size.get("max_width"), size.get("height") or size.get("max_height")
         longest = size.get("longest_edge") or size.get("shortest_edge") or 0
         super().__init__(
-            model,
+            model if device is None else model.to(device),
             classes,
             config.model_type if name is None else name,
             (sides[0] or longest, sides[1] or longest),
             background=("own" if self.softmax else "residual") if background is None else background,
             stretch=self.limits is None,
-            **options,
+            selection=selection,
+            digest=module_digest(model),
         )
         factor = (settings.get("rescale_factor") or 1 / 255) if settings.get("do_rescale", True) else 1.0
         self.preprocessing = Preprocessing(stretch=self.limits is None, scale=255 * factor)
@@ -127,23 +130,7 @@ def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, in
     return size
 
 
-def wrap_transformers(
-    model: nn.Module,
-    *,
-    classes: Sequence[str] | None = None,
-    name: str | None = None,
-    processor: Mapping[str, Any] | None = None,
-    background: BackgroundPolicy | None = None,
-    selection: Selection | None = None,
-    device: torch.device | str | None = None,
-) -> _TransformersDetector:
-    """Make a detector of an object detection model of transformers."""
-    placed = model if device is None else model.to(device)
-    options = {"selection": selection, "digest": module_digest(model)}
-    return _TransformersDetector(placed, classes, name, processor, background, **options).eval()
-
-
-def load_hub(name: str, *, revision: str | None = None, **options: Any) -> _TransformersDetector:
+def load_hub(name: str, *, revision: str | None = None, **options: Any) -> TransformersDetector:
     """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
     repository = name.removeprefix("hf:")
     check(bool(repository), "detector", "hf:owner/name", repr(name))
@@ -164,4 +151,4 @@ def load_hub(name: str, *, revision: str | None = None, **options: Any) -> _Tran
         reason = " ".join(str(error).split())[:300]
         raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
     model.requires_grad_(False)
-    return wrap_transformers(model, **{"name": name, "processor": processor.to_dict(), **options})
+    return TransformersDetector(model, **{"name": name, "processor": processor.to_dict(), **options})

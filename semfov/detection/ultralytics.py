@@ -13,14 +13,39 @@ from semfov.detection.selection import Selection
 from semfov.errors import InputError
 
 
-class _UltralyticsDetector(ModuleDetector):
+class UltralyticsDetector(ModuleDetector):
     """A detection model of Ultralytics as a `Detector`; it is differentiable; input_size `(width, height)`."""
 
-    def __init__(self, network: Any, classes: Sequence[str] | None, **options: Any) -> None:
+    def __init__(
+        self,
+        model: nn.Module,
+        *,
+        classes: Sequence[str] | None = None,
+        name: str = "ultralytics",
+        input_size: int | tuple[int, int] = 640,
+        background: BackgroundPolicy = "residual",
+        selection: Selection | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        # An `ultralytics.YOLO` object has its network as `model`; a network has layers there.
+        inner = getattr(model, "model", None)
+        network: Any = inner if hasattr(inner, "names") else model
+        if not isinstance(network, nn.Module) or not hasattr(network, "names"):
+            raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
         if classes is None:
-            labels = network.names
+            labels: Any = network.names
             classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
-        super().__init__(network, classes, fill=114 / 255, stride=32, **options)
+        super().__init__(
+            network if device is None else network.to(device),
+            classes,
+            name,
+            (input_size, input_size) if isinstance(input_size, int) else input_size,
+            fill=114 / 255,
+            stride=32,
+            background=background,
+            selection=selection,
+            digest=module_digest(network),
+        )
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """The layers that the head reads; a network without a list of layers has none."""
@@ -38,35 +63,3 @@ class _UltralyticsDetector(ModuleDetector):
                 f"got {got}; use a detection model whose head selects no boxes (end2end off)"
             )
         return self._named(decode_yolov8(columns.to(canvas.dtype)))
-
-
-def wrap_ultralytics(
-    model: nn.Module,
-    *,
-    classes: Sequence[str] | None = None,
-    name: str = "ultralytics",
-    input_size: int | tuple[int, int] = 640,
-    background: BackgroundPolicy = "residual",
-    selection: Selection | None = None,
-    device: torch.device | str | None = None,
-) -> _UltralyticsDetector:
-    """Make a detector of a model of Ultralytics; input_size `(width, height)`."""
-    network = _network(model)
-    return _UltralyticsDetector(
-        network if device is None else network.to(device),
-        classes,
-        name=name,
-        input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
-        background=background,
-        selection=selection,
-        digest=module_digest(network),
-    ).eval()
-
-
-def _network(model: Any) -> nn.Module:
-    """The network of an `ultralytics.YOLO` object, which has it as its `model`; a network has layers there."""
-    inner = getattr(model, "model", None)
-    network = inner if hasattr(inner, "names") else model
-    if not isinstance(network, nn.Module) or not hasattr(network, "names"):
-        raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
-    return network

@@ -252,14 +252,10 @@ class _OnnxTwin:
             return f"a canvas on {canvas.device}"
         return self.obstacle(network)
 
-    def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
-        """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
-        return self.with_features(network, canvas, {})[0]
-
-    def with_features(
+    def __call__(
         self, network: Darknet, canvas: Tensor, layers: Mapping[str, int]
     ) -> tuple[Candidates, dict[str, Tensor]]:
-        """The same, and the maps of layers by name, in one run."""
+        """All boxes on a canvas `(B, 3, H, W)`, and maps of layers by name, in float32, without gradients."""
         network.check_image(canvas)
         outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
         candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
@@ -399,31 +395,7 @@ class YoloV3(Detector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        if self._onnxruntime(canvas):
-            assert self._twin is not None
-            return self._twin(self.network, canvas)
-        return self._propose_by_torch(canvas)
-
-    def _onnxruntime(self, canvas: Tensor) -> bool:
-        """Whether onnxruntime computes the network on this canvas; raises `InputError` for one without floats."""
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
-        twin = self._twin
-        return twin is not None and self._chosen(twin.obstacle_here(self.network, canvas)) == "onnxruntime"
-
-    def _propose_by_torch(self, canvas: Tensor) -> Candidates:
-        """All boxes of all heads, by torch."""
-        maps = self.network(canvas.to(next(self.network.parameters()).dtype))
-        maps = [raw.float() if raw.dtype in HALVES else raw for raw in maps]
-        size = (canvas.shape[-1], canvas.shape[-2])
-        candidates = [
-            decode_yolo(raw, head.anchors, size, head.scale) for raw, head in zip(maps, self.network.heads, strict=True)
-        ]
-        return Candidates(
-            torch.cat([some.boxes for some in candidates], 1),
-            torch.cat([some.classes for some in candidates], 1),
-            torch.cat([some.objectness for some in candidates if some.objectness is not None], 1),
-        )
+        return self._computed(canvas, {})[0]
 
     def propose_with_features(
         self, canvas: Tensor, layers: Sequence[str] | None = None
@@ -432,13 +404,27 @@ class YoloV3(Detector):
         named = self.network.landmarks()
         numbers = {**{str(n): n for n in range(len(self.network.layers))}, **named}
         asked = [*named] if layers is None else layers
-        wanted = {layer: numbers[layer] for layer in chosen(asked, [*numbers], self.name)}
-        if self._onnxruntime(canvas):
-            assert self._twin is not None
-            return self._twin.with_features(self.network, canvas, wanted)
-        with recorded({layer: self.network.layers[number] for layer, number in wanted.items()}) as maps:
-            candidates = self._propose_by_torch(canvas)
-        return candidates, {layer: each[0] for layer, each in maps.items()}
+        return self._computed(canvas, {layer: numbers[layer] for layer in chosen(asked, [*numbers], self.name)})
+
+    def _computed(self, canvas: Tensor, layers: Mapping[str, int]) -> tuple[Candidates, dict[str, Tensor]]:
+        """All boxes of all heads, and the maps of layers by name, by the runtime that this canvas allows."""
+        if not canvas.is_floating_point():
+            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        twin = self._twin
+        if twin is not None and self._chosen(twin.obstacle_here(self.network, canvas)) == "onnxruntime":
+            return twin(self.network, canvas, layers)
+        with recorded({layer: self.network.layers[number] for layer, number in layers.items()}) as found:
+            maps = self.network(canvas.to(next(self.network.parameters()).dtype))
+        maps = [raw.float() if raw.dtype in HALVES else raw for raw in maps]
+        size = (canvas.shape[-1], canvas.shape[-2])
+        heads = zip(maps, self.network.heads, strict=True)
+        candidates = [decode_yolo(raw, head.anchors, size, head.scale) for raw, head in heads]
+        whole = Candidates(
+            torch.cat([some.boxes for some in candidates], 1),
+            torch.cat([some.classes for some in candidates], 1),
+            torch.cat([some.objectness for some in candidates if some.objectness is not None], 1),
+        )
+        return whole, {layer: each[0] for layer, each in found.items()}
 
     def head_input(self, canvas: Tensor) -> Tensor:
         """Compute the input of the last convolution before the first head, by torch with any runtime."""

@@ -8,7 +8,7 @@ from PIL import Image
 from torch.nn import functional
 
 from semfov.data.large import _ArrayPicture, _TiffPicture
-from semfov.data.windowed import _ReducedCopies, resized
+from semfov.data.windowed import resized
 from tests.data.test_large import pixels
 
 
@@ -17,6 +17,18 @@ def strips(monkeypatch):
     """Small pictures are large, and are read in strips of 20 or 24 rows."""
     monkeypatch.setattr("semfov.data.windowed._STRIP", 4700)
     monkeypatch.setattr("semfov.data.windowed._LARGE", 4700)
+
+
+class Counting(_ArrayPicture):
+    """A picture that counts the rows of the windows that are read."""
+
+    def __init__(self, array):
+        super().__init__(array)
+        self.rows = []
+
+    def pixels(self, box):
+        self.rows.append(box[3] - box[1])
+        return super().pixels(box)
 
 
 def ramps(height, width):
@@ -41,13 +53,13 @@ def test_bytes_are_resampled_as_by_floats_and_as_by_pillow(size):
 
 def test_a_copy_made_in_strips_equals_the_whole_picture_reduced(strips):
     array = pixels(128, 192)
-    copies = _ReducedCopies((192, 128), lambda box: array[box[1] : box[3], box[0] : box[2]])
+    copies = _ArrayPicture(array)
     quarter = resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
-    assert torch.equal(copies.window((0, 0, 192, 128), 4), quarter)
-    assert torch.equal(copies.window((16, 8, 96, 72), 4), quarter[:, 2:18, 4:24])
+    assert torch.equal(copies.read((0, 0, 192, 128), 4), quarter)
+    assert torch.equal(copies.read((16, 8, 96, 72), 4), quarter[:, 2:18, 4:24])
     eighth = resized(quarter, (16, 24))[0]
-    assert torch.equal(copies.window((16, 8, 96, 72), 8), eighth[:, 1:9, 2:12])
-    assert torch.equal(copies.window((17, 9, 90, 70), 8), eighth[:, 1:9, 2:12])
+    assert torch.equal(copies.read((16, 8, 96, 72), 8), eighth[:, 1:9, 2:12])
+    assert torch.equal(copies.read((17, 9, 90, 70), 8), eighth[:, 1:9, 2:12])
 
 
 @pytest.mark.parametrize("shape", [(131, 190), (129, 193), (97, 254)])
@@ -74,17 +86,11 @@ def test_thin_pictures_have_copies(strips, size):
 
 
 def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
-    array, rows = pixels(128, 192), []
-
-    def read(box):
-        rows.append(box[3] - box[1])
-        return array[box[1] : box[3], box[0] : box[2]]
-
-    copies = _ReducedCopies((192, 128), read)
+    copies = Counting(pixels(128, 192))
     for reduction in (16, 4, 8, 16):
-        copies.window((0, 0, 64, 64), reduction)
-    assert 128 <= sum(rows) <= 128 * 1.5
-    assert max(rows) <= 24 + 8
+        copies.read((0, 0, 64, 64), reduction)
+    assert 128 <= sum(copies.rows) <= 128 * 1.5
+    assert max(copies.rows) <= 24 + 8
 
 
 def test_small_pictures_and_fine_windows_are_read_as_they_are(strips):
@@ -105,18 +111,12 @@ def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):
     """Copies have at most 1600 pixels here."""
     monkeypatch.setattr("semfov.data.windowed._LARGEST", 1600)
-    array, rows = pixels(256, 384), []
-
-    class Counting(_ArrayPicture):
-        def pixels(self, box):
-            rows.append(box[3] - box[1])
-            return super().pixels(box)
-
+    array = pixels(256, 384)
     picture = Counting(array)
     assert [picture.reduction(ratio) for ratio in (6, 11.9, 12, 24)] == [1, 1, 8, 16]
     assert torch.equal(
         picture.read((0, 0, 384, 256), 8), resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
     )
-    assert max(rows) < 256
+    assert max(picture.rows) < 256
     assert picture.read((0, 0, 384, 256), 16).shape == (3, 16, 24)
     assert picture.read((8, 8, 40, 40), 4).shape == (3, 32, 32)

@@ -13,7 +13,7 @@ import torch
 from semfov import Detections, Detector, Selection
 from semfov.detection.export import export_onnx
 from semfov.detection.onnx import load_onnx
-from semfov.detection.torchvision import _TorchvisionDetector
+from semfov.detection.torchvision import TorchvisionDetector
 from tests.detection.test_torchvision import MODELS, randomise_heads
 from tests.refusals import refused
 
@@ -47,7 +47,7 @@ def build_onnx(**options):
 def build_torchvision(kind):
     def build(tmp_path, make_small, make_onnx):
         torch.manual_seed(0)
-        return _TorchvisionDetector(randomise_heads(MODELS[kind]()).float().requires_grad_(False), NAMES)
+        return TorchvisionDetector(randomise_heads(MODELS[kind]()).float().requires_grad_(False), classes=NAMES)
 
     return build
 

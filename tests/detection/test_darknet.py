@@ -11,7 +11,7 @@ import torch
 from torch.nn import functional as F
 
 from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, read_weights
-from semfov.detection.darknet_config import ARCHITECTURES, Section, _parse_cfg, _yolov3_tiny, read_cfg, yolov3
+from semfov.detection.darknet_config import ARCHITECTURES, Section, _parse_cfg, _yolov3_tiny, read_cfg
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import DataError
 from tests.refusals import refused, unusable
@@ -117,7 +117,7 @@ def test_gradient_reaches_the_image_and_the_network_compiles_to_a_single_graph(s
 
 def test_keeps_only_outputs_that_later_layers_need():
     # If no outputs were dropped, the 107 layers of YOLOv3 would need many times the memory of the largest one.
-    network = Darknet(yolov3(classes=1)).requires_grad_(False)
+    network = Darknet(ARCHITECTURES["yolov3"](classes=1)).requires_grad_(False)
     alive = []
     original = network.run
 

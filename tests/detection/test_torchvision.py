@@ -9,7 +9,7 @@ from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
 from semfov import DataError, Selection, load_detector
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.torchvision import _output_count, _TorchvisionDetector, load_torchvision
+from semfov.detection.torchvision import TorchvisionDetector, _output_count, load_torchvision
 from semfov.io.files import sha256
 from tests.refusals import refused, unusable
 
@@ -91,9 +91,9 @@ def normalise(model: nn.Module) -> None:
 
 
 @pytest.fixture(scope="module", params=MODELS)
-def small(request: pytest.FixtureRequest) -> _TorchvisionDetector:
+def small(request: pytest.FixtureRequest) -> TorchvisionDetector:
     torch.manual_seed(0)
-    return _TorchvisionDetector(randomise_heads(MODELS[request.param]()), NAMES)
+    return TorchvisionDetector(randomise_heads(MODELS[request.param]()), classes=NAMES)
 
 
 def noise(*shape, seed=0):
@@ -182,7 +182,7 @@ def test_candidates_have_all_class_scores_before_any_threshold(small):
 def test_faster_rcnn_without_a_proposal():
     model = MODELS["Faster R-CNN"]()
     model.rpn.score_thresh = 1.1
-    found = _TorchvisionDetector(model, NAMES)(torch.rand(2, 3, 64, 64))
+    found = TorchvisionDetector(model, classes=NAMES)(torch.rand(2, 3, 64, 64))
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
 
@@ -201,14 +201,14 @@ def test_the_canvas_equals_the_output_of_the_transform(small):
 
 
 def test_settings_contain_the_input_size():
-    detector = _TorchvisionDetector(MODELS["FCOS"](), NAMES)
+    detector = TorchvisionDetector(MODELS["FCOS"](), classes=NAMES)
     assert detector.settings()["min_size"] == [64]
     assert detector.input_size == (96, 96)
-    assert _TorchvisionDetector(MODELS["SSD"](), NAMES).input_size == (72, 56)
+    assert TorchvisionDetector(MODELS["SSD"](), classes=NAMES).input_size == (72, 56)
 
 
 @pytest.fixture(scope="module")
-def lite() -> _TorchvisionDetector:
+def lite() -> TorchvisionDetector:
     torch.manual_seed(0)
     return load_torchvision(LITE, weights=None, classes=NAMES)
 
@@ -287,7 +287,7 @@ def test_a_model_in_memory_is_a_detector(kind):
     model = randomise_heads(MODELS[kind]())
     detector = load_detector(model, classes=NAMES, limit=7)
     image = torch.rand(1, 3, 60, 80)
-    other = _TorchvisionDetector(model, NAMES, selection=Selection(limit=7))
+    other = TorchvisionDetector(model, classes=NAMES, selection=Selection(limit=7))
     assert torch.equal(detector(image).scores, other(image).scores)
     assert _output_count(model) == 4
     assert len(detector.digest) == 64
@@ -298,7 +298,7 @@ def test_models_may_have_the_outputs_of_coco_or_none_for_background():
     model = RetinaNet(Backbone(32), 91, anchor_generator=anchors((16,), (32,)), **SMALL)
     assert load_detector(model).classes == COCO_CLASSES
     model = RetinaNet(Backbone(32), 3, anchor_generator=anchors((16,), (32,)), **SMALL)
-    detector = _TorchvisionDetector(model, NAMES, first=0)
+    detector = TorchvisionDetector(model, classes=NAMES, first=0)
     canvas = torch.rand(1, 3, 64, 64)
     assert torch.equal(detector.propose(canvas).classes[0], detector.outputs(canvas)[0][1])
 
@@ -313,6 +313,6 @@ def test_invalid_options_are_refused():
         (LITE, {"weights": None, "classes": NAMES, "first": 0}, "first"),
     ):
         refused(message, load_torchvision, name, **options)
-    refused("expected Faster R-CNN", _TorchvisionDetector, nn.Linear(1, 1), NAMES)
-    detector = _TorchvisionDetector(MODELS["FCOS"](), NAMES[:2])
+    refused("expected Faster R-CNN", TorchvisionDetector, nn.Linear(1, 1), classes=NAMES)
+    detector = TorchvisionDetector(MODELS["FCOS"](), classes=NAMES[:2])
     refused("classes: expected 3 names", detector.propose, torch.rand(1, 3, 64, 64))
