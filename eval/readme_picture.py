@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import skimage
+from numpy.typing import NDArray
 from PIL import Image
 from torchvision.ops import box_iou
 
@@ -21,7 +23,7 @@ from semfov.data import Scene
 from semfov.data.mosaics import Mosaics
 from semfov.io.files import replacing
 from semfov.viz import plot_scanpath
-from semfov.viz.animation import Frame, render
+from semfov.viz.animation import render
 
 _PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 _PHOTOGRAPH = Path(skimage.__file__).parent / "data" / "astronaut.png"  # NASA, public domain
@@ -57,7 +59,7 @@ def _make_zoom_picture(path: Path, weights: str | None) -> None:
     _write_picture(render([figure], dpi=110)[0], path)
 
 
-def _write_picture(frame: Frame, path: Path) -> None:
+def _write_picture(frame: NDArray[np.uint8], path: Path) -> None:
     """Write a picture as a small PNG, atomically."""
     with replacing(path) as temporary:
         image = Image.fromarray(frame)

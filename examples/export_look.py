@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from examples.look_graph import IR_VERSION, OPSET, LookGraph
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
-from semfov.detection.onnx import OnnxDetector, probe
+from semfov.detection.onnx import OnnxDetector
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
@@ -106,8 +106,7 @@ def export_look(
         names = ["rates", *(f"odds_{step}" for step in range(1, STEPS + 1))]
         outputs |= dict(zip(names, zip(predictions, shapes, strict=True), strict=True))
     for name, (value, _) in outputs.items():
-        graph.add("Identity", value)
-        graph.name_last(name)
+        graph.add("Identity", value, output=name)
     described = [
         helper.make_tensor_value_info(name, TensorProto.BOOL if name == "cut" else TensorProto.FLOAT, shape)
         for name, (_, shape) in outputs.items()
@@ -181,7 +180,7 @@ def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, st
     wide, high = detector.input_size
     if isinstance(detector, OnnxDetector):
         outputs = _network(graph, detector, canvas)
-        raw = probe(detector.session, detector.input_size)
+        raw = detector.session.probe(detector.input_size)
         decoding = _exported(_Decoding(detector, list(raw)), *raw.values())
         proposals = graph.append(decoding, "head/", _named(outputs))
     else:

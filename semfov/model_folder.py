@@ -14,7 +14,6 @@ from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
-from semfov.detection.torchvision import PREFIX
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import DataError, InputError, lookup
 from semfov.eye import Eye
@@ -45,7 +44,7 @@ def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
     path, text = Path(name), os.fspath(name)
     if path.is_dir():
         return ModelFolder(path)
-    if text in WEIGHTS or path.suffix or text.startswith(PREFIX):
+    if text in WEIGHTS or path.suffix or text.startswith("torchvision:"):
         return None
     raise InputError(
         f"name: expected a folder of models, or a detector that they are shipped for, got {text!r}; make a folder by "

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.viz.curves import highlighted, others_named
+from semfov.viz.curves import highlighted
 
 _Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def curves_html(curves: Mapping[str, _Array], errors: Mapping[str, _Array], labe
         shapes.append(f'<polyline {_line(order, len(named))} points="{points}"/>')
     samples = [f'<polyline {_line(order, len(named))} points="0,6 38,6"/>' for order in range(len(named))]
     if rest:
-        named = [*named, others_named(len(rest))]
+        named = [*named, f"{len(rest)} other{'s' if len(rest) != 1 else ''}"]
         samples.append('<polyline class="rest" points="0,6 38,6"/>')
     legend = "".join(
         f'<li><svg viewBox="0 0 38 12" aria-hidden="true">{sample}</svg> {escape(name)}</li>'

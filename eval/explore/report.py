@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from eval.comparison.report_page import write_run_report
 from eval.comparison.summary import (
     LAST_COLUMN,
@@ -18,7 +20,7 @@ from eval.comparison.summary import (
 )
 from eval.explore.run import ExploreRun
 from semfov.errors import DataError
-from semfov.metrics.episodes import FloatArray, success_rate
+from semfov.metrics.episodes import FloatArray
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.viz.style import save_figure
@@ -67,7 +69,7 @@ def success(records: list[ResultRecord], policies: Sequence[str], answer: str) -
 
 
 def _rate(record: ResultRecord, field: str) -> FloatArray:
-    return success_rate(record[field], record["grid_cells" if field == "right_everywhere" else "object_cells"])
+    return np.asarray(record[field]) / record["grid_cells" if field == "right_everywhere" else "object_cells"]
 
 
 def _exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.comparison.summary import Curve, by_scene, curve_of
-from semfov.metrics.episodes import FloatArray, cumulative_performance, standard_error, success_rate
+from semfov.metrics.episodes import FloatArray, cumulative_performance, standard_error
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus
 
@@ -37,7 +37,7 @@ def _curve_of_record(record: ResultRecord, last: int, field: str = "right") -> F
     """Measure of an episode after 0..`last` gaze shifts; in explorations, `field` says which answers are counted."""
     if "found_at" in record:
         return cumulative_performance(np.array([record["found_at"]]), last)
-    return success_rate(record[field], record["object_cells"])[: last + 1]
+    return np.asarray(record[field])[: last + 1] / record["object_cells"]
 
 
 def _per_image(records: list[ResultRecord], last: int, field: str = "right") -> FloatArray:

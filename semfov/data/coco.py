@@ -18,7 +18,7 @@ from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_image
-from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
+from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check
 from semfov.io.files import check_regular, json_sha256, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
@@ -48,7 +48,13 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
         _check(data)
     except _Fault as fault:
         raise DataError(f"{name}: {fault}; correct or replace the file") from None
-    return _index(data), hashlib.sha256(raw).hexdigest()
+    from pycocotools.coco import COCO
+
+    coco = COCO()
+    coco.dataset = data
+    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
+        coco.createIndex()
+    return coco, hashlib.sha256(raw).hexdigest()
 
 
 class _Fault(Exception):
@@ -63,16 +69,6 @@ def _read(path: str | PathLike[str], name: str) -> bytes:
         raise DataError(f"{name}: no such file; check data.annotations") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{name}: cannot be read ({error})") from None
-
-
-def _index(data: dict[str, Any]) -> Any:
-    from pycocotools.coco import COCO
-
-    coco = COCO()
-    coco.dataset = data
-    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-        coco.createIndex()
-    return coco
 
 
 def _check(data: dict[str, Any]) -> None:
@@ -219,7 +215,7 @@ class CocoScenes(Scenes):
         max_target_area: float | None = 0.2,
         limit: int | None = None,
         ids: Collection[int | str] | None = None,
-        coverage: Coverage = "sum",
+        coverage: Literal["sum", "union"] = "sum",
         crowd: Literal["keep", "drop"] = "keep",
     ) -> None:
         check(min_instances >= 0, "min_instances", "at least 0", min_instances)
@@ -377,18 +373,16 @@ class _Packed:
 
 def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, stacklevel: int = 3) -> None:
     """Warn of boxes `(N, 4)` in pictures of sizes `(N, 4)` that look like no [x, y, width, height] in pixels."""
-    if seems := _other_form(boxes, limits):
-        said = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}"
-        warnings.warn(said, stacklevel=stacklevel)
-
-
-def _other_form(boxes: torch.Tensor, limits: torch.Tensor) -> str | None:
-    """What boxes `(N, 4)` in pictures of sizes `(N, 4)` look like if they are not [x, y, width, height] in pixels."""
-    if len(boxes) and float(boxes.max()) <= 1 and float(limits.min()) > 2:
-        return "fractions of the picture"
+    if not len(boxes):
+        return
     corners = bool(((boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)).all())
     beyond = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1).double().mean()
-    return "corners [x1, y1, x2, y2]" if len(boxes) and corners and float(beyond) >= _BEYOND else None
+    seems = "corners [x1, y1, x2, y2]" if corners and float(beyond) >= _BEYOND else None
+    if float(boxes.max()) <= 1 and float(limits.min()) > 2:
+        seems = "fractions of the picture"
+    if seems is not None:
+        said = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}"
+        warnings.warn(said, stacklevel=stacklevel)
 
 
 def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[int | str, int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.data.windowed import LargePicture, PixelBox
+from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, SemfovError, check_pixels
 from semfov.io.files import check_regular
 
@@ -170,7 +170,14 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, Image.open(file, formats=[n for n in _FORMATS if n in Image.OPEN]) as image:
         if image.format == "TIFF":
-            _seek_picture(image)
+            page: Any = image
+            if page.tag_v2.get(_SUBFILE, 0) & 1:  # a reduced copy, such as a thumbnail, of another page
+                for number in range(1, min(getattr(page, "n_frames", 1), _PAGES)):
+                    page.seek(number)
+                    if not page.tag_v2.get(_SUBFILE, 0) & 1:
+                        break
+                else:
+                    page.seek(0)
             tags: Any = getattr(image, "tag_v2", {})
             side = (tags[322], tags[323]) if 322 in tags else (image.width, tags.get(278, image.height))
             bits = tags.get(258, (1,))
@@ -180,15 +187,6 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
             for count in tags.get(325 if 322 in tags else 279, ()):
                 check_tile(size, count, f"image {Path(path)}")
         yield image
-
-
-def _seek_picture(image: Any) -> None:
-    """Go to the first page of a TIFF that is no reduced copy, such as a thumbnail of another one."""
-    for page in range(1, min(getattr(image, "n_frames", 1), _PAGES) if image.tag_v2.get(_SUBFILE, 0) & 1 else 0):
-        image.seek(page)
-        if not image.tag_v2.get(_SUBFILE, 0) & 1:
-            return
-    image.seek(0)
 
 
 def _check_proportion(image: Any, path: str | PathLike[str]) -> None:
@@ -296,7 +294,7 @@ class PhotographPicture(LargePicture):
             _check_proportion(image, self.path)
             self.size = upright_size(image)
 
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+    def pixels(self, box: tuple[int, int, int, int]) -> NDArray[np.uint8]:
         x1, y1, x2, y2 = box
         if self._array is None:
             with opening(self.path, "decoded"), open_pillow(self.path) as image:

@@ -90,10 +90,14 @@ def as_images(
     torch.Size([2, 3, 8, 9])
     """
     pixels = as_pixels(images, argument=argument, color=color, white=white)
-    whole, pixels = not pixels.is_floating_point(), _in_unit(pixels, like, argument)
-    if not whole:
+    device = pixels.device if like is None else like.device
+    if pixels.is_floating_point():
+        pixels = pixels.to(device, pixels.dtype if like is None else like.dtype)
         check_pixels(pixels, argument)
-    return pixels
+        return pixels
+    got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
+    check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
+    return pixels.to(device, torch.float32 if like is None else like.dtype).div_(_WHITE[pixels.dtype])
 
 
 def as_pixels(
@@ -111,11 +115,6 @@ def as_batch(images: ImageLike) -> Tensor:
     if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
         return images
     return as_images(images)
-
-
-def is_batch(image: object) -> bool:
-    """Whether this is a batch of pictures instead of a single one."""
-    return isinstance(image, Tensor | np.ndarray) and image.ndim > 3
 
 
 def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
@@ -203,13 +202,3 @@ def as_positions(values: Tensor, like: Tensor | None = None) -> Tensor:
     """
     base = values if like is None else like
     return values.to(base.device, torch.promote_types(base.dtype, torch.float32))
-
-
-def _in_unit(pixels: Tensor, like: Tensor | None, argument: str) -> Tensor:
-    """Pixels as floats with the dtype and device of `like`; integers are divided by their largest value."""
-    dtype = like.dtype if like is not None else pixels.dtype if pixels.is_floating_point() else torch.float32
-    if pixels.is_floating_point():
-        return pixels.to(pixels.device if like is None else like.device, dtype)
-    got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
-    check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
-    return pixels.to(pixels.device if like is None else like.device, dtype).div_(_WHITE[pixels.dtype])

@@ -31,10 +31,11 @@ from semfov.data.images import (
 )
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture, PixelBox, bytes_of
+from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture, bytes_of
 from semfov.errors import DataError, check, lookup
 from semfov.io.files import check_regular
 
+_Box = tuple[int, int, int, int]
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
 _JPEG = 7
@@ -65,13 +66,13 @@ class _TiffPicture(LargePicture):
             raise DataError(f"{path}: expected tifffile for reading TIFFs; pip install tifffile") from None
         self.path, self._lock = Path(path), Lock()
         with opening(self.path, "opened"):
-            self._file = tifffile.TiffFile(path)
-            weakref.finalize(self, self._file.close)
-            pages: Any = self._file.pages
+            self.file = tifffile.TiffFile(path)
+            weakref.finalize(self, self.file.close)
+            pages: Any = self.file.pages
             # The first page may be a thumbnail of another one.
             first = (number for number in range(min(len(pages), 64)) if not pages[number].is_reduced)
-            self._page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
-        page: Any = self._page
+            self.page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
+        page: Any = self.page
         count = int(page.samplesperpixel)
         self.size = int(page.imagewidth), int(page.imagelength)
         self._check_kind(known=white is not None)
@@ -106,7 +107,7 @@ class _TiffPicture(LargePicture):
         """Raise `DataError` for a TIFF that is left to other readers; `known` says which values are white."""
         import tifffile
 
-        page, count = self._page, int(self._page.samplesperpixel)
+        page, count = self.page, int(self.page.samplesperpixel)
         kind = "" if page.dtype is None else page.dtype.kind
         plain = page.dtype in (np.uint8, np.uint16)
         fits = kind in "uif" and len(page.shape) == 2 + (count > 1) and page.bitspersample == 8 * page.dtype.itemsize
@@ -122,21 +123,14 @@ class _TiffPicture(LargePicture):
             got = f"{self.size[0]} × {self.size[1]}"
             raise DataError(f"{self.path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}")
 
-    @property
-    def has_overviews(self) -> bool:
-        """Whether the file has reduced copies of its own, which `tifffile` does not tell apart from other pages."""
-        with opening(self.path, "opened"):
-            pages: Any = self._file.pages[1:]
-            return bool(self._page.subifds) or any(page.is_reduced for page in pages)
-
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+    def pixels(self, box: _Box) -> NDArray[np.uint8]:
         with opening(self.path, "decoded"):
             return self._bytes(self._values(box))
 
-    def _values(self, box: PixelBox) -> NDArray[Any]:
+    def _values(self, box: _Box) -> NDArray[Any]:
         """The values of the channels in a window, the alpha last, `(h, w, C)`."""
         x1, y1, x2, y2 = box
-        page, channels = self._page, self._channels
+        page, channels = self.page, self._channels
         wide, high = (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
         across, down = -(-self.size[0] // wide), -(-self.size[1] // high)
         planes = page.planarconfig == _PLANES and page.samplesperpixel > 1
@@ -165,14 +159,14 @@ class _TiffPicture(LargePicture):
 
     def _tile(self, number: int, size: int) -> NDArray[Any] | None:
         """A tile; None for one that is not stored in the file."""
-        page = self._page
+        page = self.page
         offset, count = page.dataoffsets[number], page.databytecounts[number]
         if not count:
             return None
         check_tile(size, count, f"image {self.path}")
         with self._lock:
-            self._file.filehandle.seek(offset)
-            data = self._file.filehandle.read(count)
+            self.file.filehandle.seek(offset)
+            data = self.file.filehandle.read(count)
         make = _INFLATERS.get(int(page.compression))
         most = 2 * size + 2**16
         if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
@@ -186,7 +180,7 @@ class _TiffPicture(LargePicture):
         """Grey or RGB bytes, in which 0 is black."""
         count = len(self._channels) - bool(self._alpha)
         tile = bytes_between(values[..., :count], self._tone)
-        if self._page.photometric == _WHITE_IS_ZERO:
+        if self.page.photometric == _WHITE_IS_ZERO:
             tile = 255 - tile
         if self._alpha:
             most = np.iinfo(values.dtype).max if values.dtype.kind in "ui" else 1.0
@@ -199,12 +193,12 @@ class _TiffPicture(LargePicture):
         """The colour in which pixels without data are shown; None where the file does not tell them."""
         if self._alpha:
             return 255, 255, 255
-        kind = self._page.dtype.kind
-        limits = np.iinfo(self._page.dtype) if kind in "ui" else None
+        kind = self.page.dtype.kind
+        limits = np.iinfo(self.page.dtype) if kind in "ui" else None
         value = self._nodata
         if value is None or (limits and not (limits.min <= value <= limits.max and math.isfinite(value))):
             return None
-        red, green, blue = self._bytes(np.full((1, 1, len(self._channels)), value, self._page.dtype))[0, 0].tolist()
+        red, green, blue = self._bytes(np.full((1, 1, len(self._channels)), value, self.page.dtype))[0, 0].tolist()
         return red, green, blue
 
 
@@ -276,10 +270,10 @@ class _RasterPicture(LargePicture):
             grey = int(bytes_between(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]), self._tone)[0])
             self.nothing = grey, grey, grey
 
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+    def pixels(self, box: _Box) -> NDArray[np.uint8]:
         return self._window(box, 1)
 
-    def _reduced(self, box: PixelBox, reduction: int) -> Tensor:
+    def _reduced(self, box: _Box, reduction: int) -> Tensor:
         """A window from the overviews of the file, or from a copy where it has none."""
         if not self._has_overviews:
             return super()._reduced(box, reduction)
@@ -288,14 +282,14 @@ class _RasterPicture(LargePicture):
         outwards = x1 // reduction * reduction, y1 // reduction * reduction, right, bottom
         return bytes_of(self._window(outwards, reduction))
 
-    def _window(self, box: PixelBox, reduction: int) -> NDArray[np.uint8]:
+    def _window(self, box: _Box, reduction: int) -> NDArray[np.uint8]:
         pixels = bytes_between(self._values(box, reduction), self._tone)
         if self._masked:
             share = self._values(box, reduction, mask=True).astype(np.uint16)
             pixels = ((pixels * share + 127) // 255 + (255 - share)).clip(max=255).astype(np.uint8)
         return np.repeat(pixels, 3, -1) if len(self._bands) == 1 else pixels
 
-    def _values(self, box: PixelBox, reduction: int, *, mask: bool = False) -> NDArray[Any]:
+    def _values(self, box: _Box, reduction: int, *, mask: bool = False) -> NDArray[Any]:
         """Values of the bands, or of their mask, `(h, w, C)`."""
         from rasterio.enums import Resampling
         from rasterio.windows import Window
@@ -323,7 +317,7 @@ class _ArrayPicture(LargePicture):
         self._array = array
         self.size = array.shape[1], array.shape[0]
 
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+    def pixels(self, box: _Box) -> NDArray[np.uint8]:
         x1, y1, x2, y2 = box
         window = self._array[y1:y2, x1:x2]
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
@@ -410,8 +404,11 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) ->
         return PhotographPicture(path, white)
     try:
         tiff = _TiffPicture(path, white=white, bands=bands)
-        if not tiff.has_overviews:
-            return tiff
+        with opening(tiff.path, "opened"):
+            # `tifffile` does not tell reduced copies apart from other pages.
+            pages: Any = tiff.file.pages[1:]
+            if not tiff.page.subifds and not any(page.is_reduced for page in pages):
+                return tiff
     except DataError as error:
         with suppress(DataError):
             return _RasterPicture(path, white=white, bands=bands)
@@ -483,7 +480,7 @@ def _chosen_bands(
 def _tone_of(
     picture: LargePicture,
     white: White | None,
-    values: Callable[[PixelBox], NDArray[Any]],
+    values: Callable[[_Box], NDArray[Any]],
     *,
     nodata: float | None,
     wide: bool,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape
 
-Coverage = Literal["sum", "union"]
+_Coverage = Literal["sum", "union"]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Scenes(ABC):
         return legal_targets(self.annotation(index))
 
 
-def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum") -> float:
+def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: _Coverage = "sum") -> float:
     """Compute the fraction of the image that boxes cover.
 
     - `sum`: Σ_i area(b_i) / (W·H). Overlaps count several times, so it may exceed 1.
@@ -162,7 +162,7 @@ def boxes_meet(box: Sequence[float], other: Sequence[float]) -> bool:
     return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
 
 
-def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: Coverage = "sum") -> list[int]:
+def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: _Coverage = "sum") -> list[int]:
     """List the classes that are present and whose boxes cover at most a given fraction of the image.
 
     Args:

@@ -15,7 +15,7 @@ from torch.utils.dlpack import from_dlpack
 
 from semfov.errors import check
 
-PixelBox = tuple[int, int, int, int]
+_Box = tuple[int, int, int, int]
 
 _STRIP = 1 << 23
 """Pixels that are read at once for a copy."""
@@ -85,7 +85,7 @@ class LargePicture(ABC):
     nothing: tuple[int, int, int] | None = None  # the colour in which pixels without data are shown, if a file has some
 
     @abstractmethod
-    def pixels(self, box: PixelBox) -> NDArray[np.uint8]:
+    def pixels(self, box: _Box) -> NDArray[np.uint8]:
         """Read a window, in one thread at a time but not always the same one (`zoom.episode`); → `(h, w, 3)`."""
 
     def reduction(self, ratio: float, oversampling: float = _OVERSAMPLING) -> int:
@@ -94,7 +94,7 @@ class LargePicture(ABC):
         reduction = reduction_for(ratio, oversampling) if many else 1
         return reduction if reduction >= self._first else 1
 
-    def read(self, box: PixelBox, reduction: int = 1) -> Tensor:
+    def read(self, box: _Box, reduction: int = 1) -> Tensor:
         """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
 
         The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels (25
@@ -107,14 +107,14 @@ class LargePicture(ABC):
         coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
         return self._reduced(box, reduction) if coarse and reduction >= self._first else bytes_of(self._given(box))
 
-    def _given(self, box: PixelBox) -> NDArray[np.uint8]:
+    def _given(self, box: _Box) -> NDArray[np.uint8]:
         """The pixels of a window; raises `InputError` where a reader gives others."""
         (x1, y1, x2, y2), pixels = box, self.pixels(box)
         fits = pixels.dtype == np.uint8 and pixels.shape == (y2 - y1, x2 - x1, 3)
         check(fits, "pixels", f"bytes of shape {(y2 - y1, x2 - x1, 3)}", f"{pixels.dtype} of {pixels.shape}")
         return pixels
 
-    def _inside(self, box: PixelBox) -> PixelBox:
+    def _inside(self, box: _Box) -> _Box:
         """The box; raises `InputError` where it is empty or not inside the picture."""
         x1, y1, x2, y2 = box
         width, height = self.size
@@ -130,7 +130,7 @@ class LargePicture(ABC):
             first *= 2
         return first
 
-    def _reduced(self, box: PixelBox, reduction: int) -> Tensor:
+    def _reduced(self, box: _Box, reduction: int) -> Tensor:
         """A window of a copy, `(3, h, w)`."""
         copy = self._copy(reduction)
         high, wide = copy.shape[1:]

@@ -169,16 +169,14 @@ class _Builder:
                 raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")
         return self._makers[section.kind](section)
 
-    def _note(self, channels: int, step: Fraction, *sources: int) -> None:
-        self._append(_Shape(channels, step), (len(self.shapes) - 1, *sources))
-
-    def _append(self, shape: _Shape, sources: tuple[int, ...]) -> None:
+    def _note(self, channels: int, step: Fraction, *further: int, sources: tuple[int, ...] | None = None) -> None:
         """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
+        shape = _Shape(channels, step)
         if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
             raise DataError(
                 f"cfg: layer {len(self.shapes)} has a map of more than {_MOST_ELEMENTS:,} numbers; check the cfg"
             )
-        self.sources.append(sources)
+        self.sources.append((len(self.shapes) - 1, *further) if sources is None else sources)
         self.shapes.append(shape)
         self._here = shape
 
@@ -236,7 +234,7 @@ class _Builder:
                 f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
                 f"{counts}, got group_id={excerpt(group)} and groups={excerpt(groups)}"
             )
-        self._append(_Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
+        self._note(sum(shape.channels for shape in shapes) // groups, shapes[0].step, sources=sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:

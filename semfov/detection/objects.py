@@ -228,26 +228,19 @@ def unlike(
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    index = order[_unlike(boxes[order], labels[order], cut[order], looks[order], iou, inside, around)]
-    return index[scores[index].argsort(descending=True, stable=True)]
-
-
-def _unlike(
-    box: Tensor, label: Tensor, cut: Tensor, number: Tensor, iou: float, inside: float, around: float | None
-) -> Tensor:
-    """Indices of the boxes that stay when each one, in order, removes later ones that are the same object."""
-    corners, labels, looks, broken = box.numpy(), label.numpy().astype(np.float64), number.numpy(), cut.numpy()
+    # Each box, in this order, removes later ones that are the same object.
+    corners, kinds, seen, broken = (each[order].numpy() for each in (boxes, labels.double(), looks, cut))
     count = len(corners)
     if around is not None:
         # Every box is there a second time, one turn further, so that boxes meet across the seam.
         turned = corners + np.array([around, 0, around, 0], corners.dtype)
-        corners, labels = np.concatenate([corners, turned]), np.tile(labels, 2)
+        corners, kinds = np.concatenate([corners, turned]), np.tile(kinds, 2)
     # Classes are moved apart, so that neighbours along x are of one class.
-    shift = labels * (2 * np.abs(corners).max(initial=0) + 1)
+    shift = kinds * (2 * np.abs(corners).max(initial=0) + 1)
     start, end = corners[:, 0] + shift, corners[:, 2] + shift
-    order = start.argsort(kind="stable")
-    one, other = neighbours(start[order], end[order])
-    one, other = order[one], order[other]
+    across = start.argsort(kind="stable")
+    one, other = neighbours(start[across], end[across])
+    one, other = across[one], across[other]
     x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
     shared = intersection(x1, y1, x2, y2, one, other)
     if around is not None:
@@ -262,8 +255,9 @@ def _unlike(
     empty = np.flatnonzero(union <= 0)
     same[empty] = (corners[first[empty]] == corners[second[empty]]).all(-1)
     part = shared / np.maximum(area, 1e-6)[second]
-    same |= (part >= np.float32(inside)) & broken[second] & (looks[first] != looks[second])
-    return torch.from_numpy(_survivors(count, first[same], second[same]))
+    same |= (part >= np.float32(inside)) & broken[second] & (seen[first] != seen[second])
+    index = order[torch.from_numpy(_survivors(count, first[same], second[same]))]
+    return index[scores[index].argsort(descending=True, stable=True)]
 
 
 def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:

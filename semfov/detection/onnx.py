@@ -14,7 +14,7 @@ from torch import Tensor
 from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
-from semfov.detection.onnx_file import check_canvas, check_elements, network_steps, read_settings, with_input_size
+from semfov.detection.onnx_file import check_canvas, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, Signature, misplaced, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.preprocessing import Preprocessing
@@ -103,7 +103,7 @@ class OnnxDetector(Detector):
         """The outputs and the maps by name, in one run of a session that has the maps as further outputs."""
         self._check_canvas(canvas)
         if self._layers is None:
-            steps = network_steps(self.session.path, self.session.image, (canvas.shape[-1], canvas.shape[-2]))
+            steps = self.session.steps((canvas.shape[-1], canvas.shape[-2]))
             inside = {step.name: step.name for step in steps if step.stride is not None}
             self._layers, self._named_layers = inside | landmarks(steps), tuple(landmarks(steps))
         wanted = self._named_layers if layers is None else layers
@@ -231,7 +231,7 @@ def load_onnx(
     }
     chosen = stored | {key: value for key, value in options.items() if value is not None}
     size = _canvas_size(session, chosen.get("input_size"))
-    outputs = probe(session, size)
+    outputs = session.probe(size)
     names = chosen.get("classes")
     if "head" not in chosen:
         # A pass tells apart heads whose shapes are alike.
@@ -299,16 +299,6 @@ def _sides(input_size: int | Sequence[int]) -> tuple[int, int]:
     whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
     check(whole, "input_size", "(width, height) in pixels", excerpt(sizes))
     return sizes[0], sizes[1]
-
-
-def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
-    """Outputs in their shapes for one canvas: zeros where the model states all shapes, else the outputs of a run."""
-    stated = {name: [n for n in shape[1:] if n is not None] for name, shape in session.outputs}
-    for name, sizes in stated.items():
-        check_elements(f"{session.path.name}: output {name!r}", sizes)
-    if not session.open_ended and all(shape and len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
-        return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
-    return session(torch.zeros(1, 3, size[1], size[0]))
 
 
 def _coco_names(count: int, file: Path) -> Sequence[str]:

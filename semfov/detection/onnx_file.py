@@ -1,30 +1,23 @@
-"""ONNX files of detectors: checks before memory is allocated, their settings, and copies with another input size."""
+"""ONNX files of detectors: their settings, and copies with another input size."""
 
 import ast
 import hashlib
 import json
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_heads import STRIDES, cells
+from semfov.detection.onnx_session import check_file
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, inside, read_text, sha256, write_bytes
+from semfov.io.files import check_regular, read_text, sha256, write_bytes
 from semfov.io.schema import excerpt, is_number, is_plain
 
-_MOST_ELEMENTS = 2**28
-"""Largest number of elements of a tensor in a model; 1 GiB as float32."""
-_MOST_METADATA = 2**20
-"""Largest number of characters of a model's metadata."""
+_MOST_BYTES = 2**20
+"""Largest number of bytes of a settings file."""
 _MOST_PIXELS = 89_478_485
 """Largest number of pixels of a canvas, the same as for pictures that are read."""
-_USUAL_SIDE = 640
-"""Side of a picture with which open sizes are tried out."""
-_WITH_GRAPHS = {"Loop", "Scan", "If"}
-"""Operations with graphs of their own, whose steps are not counted."""
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
 
 METADATA_KEY = "semfov"
@@ -45,82 +38,10 @@ _KEYS: dict[str, tuple[type, ...]] = {
 """Keys of a settings file, with the types of their values; `licence` and `source` are for people."""
 
 
-def check_file(path: Path) -> bool:
-    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
-    import onnx
-
-    check_regular(path, f"ONNX model {str(path)!r}")
-    if not path.is_file():
-        raise DataError(f"ONNX model {str(path)!r}: no such file; check the path")
-    try:
-        model = onnx.load(path, load_external_data=False)
-        stored = [*model.graph.initializer]
-        for tensor in stored:
-            for entry in tensor.external_data:
-                if entry.key == "location":
-                    check_regular(inside(path.parent, entry.value))
-        _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
-        if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
-            raise DataError(f"ONNX model {str(path)!r}: expected at most {_MOST_METADATA:,} characters of metadata")
-        slim = _without_weights(model)
-        for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
-            for place, side in enumerate(value.type.tensor_type.shape.dim):
-                if not side.dim_value:
-                    side.dim_value = _USUAL_SIDE if place > 1 else 1
-        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=True).graph
-    except DataError:
-        raise
-    except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
-        reason = " ".join(str(error).split())[-400:]
-        raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from None
-    values = [*inferred.value_info, *inferred.input, *inferred.output]
-    _check_sizes(path, ((value.name, _dims(value)) for value in values))
-    known = {
-        value.name for value in values if all(each.HasField("dim_value") for each in value.type.tensor_type.shape.dim)
-    }
-    steps = {node.op_type for node in model.graph.node}
-    made = {name for node in model.graph.node for name in node.output if name}
-    return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
-
-
-def check_elements(name: str, sizes: Iterable[int]) -> None:
-    """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
-    sizes = list(sizes)
-    if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
-        raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
-
-
 def check_canvas(name: str, size: tuple[int, int]) -> None:
     """Raise `DataError` for a canvas `(width, height)` of more than `_MOST_PIXELS` pixels."""
     if size[0] * size[1] > _MOST_PIXELS:
         raise DataError(f"{name}: expected a canvas of at most {_MOST_PIXELS:,} pixels, got {size[0]} x {size[1]}")
-
-
-def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> None:
-    for name, dims in tensors:
-        check_elements(f"ONNX model {str(path)!r}: tensor {excerpt(name)}", dims)
-
-
-def _dims(value: Any) -> list[int]:
-    """Sizes of a value; unknown sizes count as 1."""
-    return [d.dim_value if d.HasField("dim_value") else 1 for d in value.type.tensor_type.shape.dim]
-
-
-def _without_weights(model: Any) -> Any:
-    """The model without its large tensors: shapes may depend on values of small tensors only."""
-    import onnx
-
-    slim = onnx.ModelProto()
-    slim.CopyFrom(model)
-    for tensor in slim.graph.initializer:
-        if math.prod(tensor.dims) > 1024:
-            slim.graph.input.append(
-                onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims))
-            )
-    small = [tensor for tensor in slim.graph.initializer if math.prod(tensor.dims) <= 1024]
-    del slim.graph.initializer[:]
-    slim.graph.initializer.extend(small)
-    return slim
 
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -138,8 +59,8 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _read(path: Path) -> str:
     check_regular(path)
-    if path.stat().st_size > _MOST_METADATA:
-        raise DataError(f"{path}: expected at most {_MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
+    if path.stat().st_size > _MOST_BYTES:
+        raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}")
     try:
         return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -232,24 +153,3 @@ def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int]) -> None:
     for output in graph.output:
         for side in output.type.tensor_type.shape.dim[1:2]:
             side.Clear()
-
-
-def network_steps(path: Path, image: str, canvas: tuple[int, int]) -> list[NetworkStep]:
-    """The steps of a model in order, with the strides of the maps that follow from `image`, of `(width, height)`."""
-    import onnx
-
-    model = _without_weights(onnx.load(path, load_external_data=False))
-    sides = next(value for value in model.graph.input if value.name == image).type.tensor_type.shape.dim
-    for side, size in zip(sides, (1, 3, canvas[1], canvas[0]), strict=True):
-        side.dim_value = size
-    graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
-    shapes = {value.name: _dims(value) for value in [*graph.value_info, *graph.output]}
-    steps, reached = [], {image}  # stored weights are no maps
-    for node in graph.node:
-        reached.update(node.output if reached.intersection(node.input) else ())
-        for output in node.output:
-            shape = shapes.get(output, [])
-            is_map = output in reached and len(shape) == 4 and min(shape[2:]) > 1
-            stride = stride_of(canvas[0], shape[3]) if is_map else None
-            steps.append(NetworkStep(output, stride, tuple(node.input), node.op_type == "Conv"))
-    return steps

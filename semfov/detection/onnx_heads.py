@@ -110,7 +110,7 @@ def _decode_distances(
     return Candidates(torch.cat([point - reach[..., :2], point + reach[..., 2:]], -1), classes)
 
 
-def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
+def _decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
 
     Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`.
@@ -120,7 +120,7 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candi
     return Candidates(_fractions(boxes, canvas), scores[..., :-1], background=scores[..., -1])
 
 
-def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
+def _decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
     """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
 
     Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`.
@@ -398,7 +398,7 @@ def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Cand
 
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     if "pred_boxes" in outputs:
-        return decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
+        return _decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
     rows = _first(outputs)  # `(B, Q, 4 + K)`, with the scores after their sigmoid
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])
@@ -417,7 +417,7 @@ HEADS: dict[str, _DetectionHead] = {
     # some score, which would dilute that of the best one if only their shares counted.
     "nanodet-plus": _DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
     "detr": _DetectionHead(
-        lambda outputs, canvas, _: decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
+        lambda outputs, canvas, _: _decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,
         "own",
     ),

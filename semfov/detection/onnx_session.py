@@ -1,5 +1,6 @@
-"""An ONNX model in onnxruntime, called with torch tensors."""
+"""An ONNX model, checked before memory is allocated, in onnxruntime, called with torch tensors."""
 
+import math
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,8 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.detection.onnx_file import check_file
+from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.errors import DataError, InputError, check
+from semfov.io.files import check_regular, inside
+from semfov.io.schema import excerpt
 
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
@@ -22,6 +25,15 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "im_shape": lambda canvas: _repeat(canvas, [canvas.shape[-2], canvas.shape[-1]]).to(canvas.dtype),
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
 }
+
+_MOST_ELEMENTS = 2**28
+"""Largest number of elements of a tensor in a model; 1 GiB as float32."""
+_MOST_METADATA = 2**20
+"""Largest number of characters of a model's metadata."""
+_USUAL_SIDE = 640
+"""Side of a picture with which open sizes are tried out."""
+_WITH_GRAPHS = {"Loop", "Scan", "If"}
+"""Operations with graphs of their own, whose steps are not counted."""
 
 _MOST_MEMORY = 2**29
 """Bytes for the tensors of models whose sizes depend on values, all together."""
@@ -187,6 +199,107 @@ class OnnxSession:
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
         return OnnxSession(self.path, **{**self._settings, "further": further})
+
+    def probe(self, size: tuple[int, int]) -> dict[str, Tensor]:
+        """Outputs in their shapes for one canvas: zeros where the model states all, else the outputs of a run."""
+        stated = {name: [n for n in shape[1:] if n is not None] for name, shape in self.outputs}
+        for name, sizes in stated.items():
+            _check_elements(f"{self.path.name}: output {name!r}", sizes)
+        if not self.open_ended and all(shape and len(stated[name]) == len(shape) - 1 for name, shape in self.outputs):
+            return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
+        return self(torch.zeros(1, 3, size[1], size[0]))
+
+    def steps(self, canvas: tuple[int, int]) -> list[NetworkStep]:
+        """The steps of a model in order, with the strides of the maps of a canvas `(width, height)`."""
+        import onnx
+
+        model = _without_weights(onnx.load(self.path, load_external_data=False))
+        sides = next(value for value in model.graph.input if value.name == self.image).type.tensor_type.shape.dim
+        for side, size in zip(sides, (1, 3, canvas[1], canvas[0]), strict=True):
+            side.dim_value = size
+        graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+        shapes = {value.name: _dims(value) for value in [*graph.value_info, *graph.output]}
+        steps, reached = [], {self.image}  # stored weights are no maps
+        for node in graph.node:
+            reached.update(node.output if reached.intersection(node.input) else ())
+            for output in node.output:
+                shape = shapes.get(output, [])
+                is_map = output in reached and len(shape) == 4 and min(shape[2:]) > 1
+                stride = stride_of(canvas[0], shape[3]) if is_map else None
+                steps.append(NetworkStep(output, stride, tuple(node.input), node.op_type == "Conv"))
+        return steps
+
+
+def check_file(path: Path) -> bool:
+    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
+    import onnx
+
+    check_regular(path, f"ONNX model {str(path)!r}")
+    if not path.is_file():
+        raise DataError(f"ONNX model {str(path)!r}: no such file; check the path")
+    try:
+        model = onnx.load(path, load_external_data=False)
+        stored = [*model.graph.initializer]
+        for tensor in stored:
+            for entry in tensor.external_data:
+                if entry.key == "location":
+                    check_regular(inside(path.parent, entry.value))
+        _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
+        if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
+            raise DataError(f"ONNX model {str(path)!r}: expected at most {_MOST_METADATA:,} characters of metadata")
+        slim = _without_weights(model)
+        for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
+            for place, side in enumerate(value.type.tensor_type.shape.dim):
+                if not side.dim_value:
+                    side.dim_value = _USUAL_SIDE if place > 1 else 1
+        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=True).graph
+    except DataError:
+        raise
+    except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
+        reason = " ".join(str(error).split())[-400:]
+        raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from None
+    values = [*inferred.value_info, *inferred.input, *inferred.output]
+    _check_sizes(path, ((value.name, _dims(value)) for value in values))
+    known = {
+        value.name for value in values if all(each.HasField("dim_value") for each in value.type.tensor_type.shape.dim)
+    }
+    steps = {node.op_type for node in model.graph.node}
+    made = {name for node in model.graph.node for name in node.output if name}
+    return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
+
+
+def _check_elements(name: str, sizes: Iterable[int]) -> None:
+    """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
+    sizes = list(sizes)
+    if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
+        raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
+
+
+def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> None:
+    for name, dims in tensors:
+        _check_elements(f"ONNX model {str(path)!r}: tensor {excerpt(name)}", dims)
+
+
+def _dims(value: Any) -> list[int]:
+    """Sizes of a value; unknown sizes count as 1."""
+    return [d.dim_value if d.HasField("dim_value") else 1 for d in value.type.tensor_type.shape.dim]
+
+
+def _without_weights(model: Any) -> Any:
+    """The model without its large tensors: shapes may depend on values of small tensors only."""
+    import onnx
+
+    slim = onnx.ModelProto()
+    slim.CopyFrom(model)
+    for tensor in slim.graph.initializer:
+        if math.prod(tensor.dims) > 1024:
+            slim.graph.input.append(
+                onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims))
+            )
+    small = [tensor for tensor in slim.graph.initializer if math.prod(tensor.dims) <= 1024]
+    del slim.graph.initializer[:]
+    slim.graph.initializer.extend(small)
+    return slim
 
 
 @cache

@@ -23,7 +23,7 @@ from semfov.io.files import sha256
 _Raw = list[tuple[Tensor, Tensor]]
 """For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own box, and scores `(N, C)`."""
 
-PREFIX = "torchvision:"
+_PREFIX = "torchvision:"
 
 
 class TorchvisionDetector(ModuleDetector):
@@ -143,7 +143,7 @@ def load_torchvision(
     """Load a torchvision detection model by its name."""
     from torchvision import models
 
-    name = name.removeprefix(PREFIX)
+    name = name.removeprefix(_PREFIX)
     lookup(name, models.list_models(module=models.detection), "torchvision detection model")
     enum = _member(models.get_model_weights(name), weights)
     if enum is not None:
@@ -172,7 +172,7 @@ def load_torchvision(
         network,
         digest,
         classes=classes,
-        name=PREFIX + name,
+        name=_PREFIX + name,
         first=first,
         background=background,
         selection=selection,

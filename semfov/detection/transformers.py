@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
-from semfov.detection.onnx_heads import decode_detr, decode_rtdetr
+from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -90,10 +90,9 @@ class TransformersDetector(ModuleDetector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         outputs = self.model(pixel_values=self.preprocessing(self._pixels(canvas)))
-        logits, boxes = outputs.logits.to(canvas.dtype), outputs.pred_boxes.to(canvas.dtype)
-        size = (canvas.shape[-1], canvas.shape[-2])
-        candidates = decode_detr(logits, boxes, size) if self.softmax else decode_rtdetr(logits, boxes, size)
-        return self._named(candidates)
+        found = {name: getattr(outputs, name).to(canvas.dtype) for name in ("logits", "pred_boxes")}
+        head = HEADS["detr" if self.softmax else "rtdetr"]
+        return self._named(head.decode(found, (canvas.shape[-1], canvas.shape[-2]), self._count))
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """The convolutional backbone; a model of another kind has none."""

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -43,18 +43,14 @@ class Graph:
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
 
-    def add(self, op: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
+    def add(self, op: str, *inputs: str, outputs: int = 1, output: str | None = None, **attributes: Any) -> Any:
         """Add a node, and return the name of its output, or the list of names of several outputs."""
         from onnx import helper
 
         start = f"{op.lower()}_{len(self.nodes)}"
-        names = [start] if outputs == 1 else [f"{start}_{index}" for index in range(outputs)]
+        names = [output or start] if outputs == 1 else [f"{start}_{index}" for index in range(outputs)]
         self.nodes.append(helper.make_node(op, list(inputs), names, **attributes))
-        return start if outputs == 1 else names
-
-    def name_last(self, name: str) -> None:
-        """Rename the output of the last node to `name`."""
-        self.nodes[-1].output[0] = name
+        return names[0] if outputs == 1 else names
 
     def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
         """Add a constant; floating-point numbers become float32 unless they are a float64 tensor."""
@@ -170,8 +166,7 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
         raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
     graph, names = _build(network)
     for layer in layers:
-        graph.add("Identity", names[layer])
-        graph.name_last(f"layer_{layer}")
+        graph.add("Identity", names[layer], output=f"layer_{layer}")
     batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
     boxes, classes = None if size else "boxes", network.heads[0].classes
     shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
@@ -202,8 +197,7 @@ def _build(network: Darknet) -> tuple[_NetworkGraph, dict[int, str]]:
         if isinstance(layer, Head):
             heads.append(graph.decode(layer, names[index], float(network.steps[index])))
     for name, outputs in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
-        graph.add("Concat", *outputs, axis=1)
-        graph.name_last(name)
+        graph.add("Concat", *outputs, output=name, axis=1)
     return graph, names
 
 
@@ -264,16 +258,13 @@ class _OnnxTwin:
     def _session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
         key = (os.getpid(), torch.get_num_threads())
         if layers not in self._opened or self._opened[layers][0] != key:
-            self._opened[layers] = key, self._open(network, layers)
+            try:
+                session = OnnxSession(_exported(network, cache_folder() / "exported", layers), open_ended=False)
+            except DataError:  # the cache cannot be written to
+                with tempfile.TemporaryDirectory() as folder:
+                    session = OnnxSession(_exported(network, Path(folder), layers), open_ended=False)
+            self._opened[layers] = key, session
         return self._opened[layers][1]
-
-    def _open(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
-        try:
-            path = _exported(network, cache_folder() / "exported", layers)
-        except DataError:  # the cache cannot be written to
-            with tempfile.TemporaryDirectory() as folder:
-                return OnnxSession(_exported(network, Path(folder), layers), open_ended=False)
-        return OnnxSession(path, open_ended=False)
 
 
 def _network_digest(network: Darknet) -> str:
@@ -288,22 +279,14 @@ def _exported(network: Darknet, folder: Path, layers: Sequence[int] = ()) -> Pat
     """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
     source = json.dumps([_network_digest(network), _VERSION, torch.__version__, *layers])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
-    whole = _whole(folder.glob(f"{key}.*.onnx"))
-    if whole is not None:
-        return whole
+    for path in sorted(folder.glob(f"{key}.*.onnx")):
+        with suppress(OSError):
+            if sha256(path) == path.name.split(".")[1]:
+                return path
     content = network_model(network, "darknet", layers=layers).SerializeToString()
     path = folder / f"{key}.{hashlib.sha256(content).hexdigest()}.onnx"
     write_bytes(path, content)
     return path
-
-
-def _whole(paths: Iterable[Path]) -> Path | None:
-    """The first file that can be read and whose sha256 is the one in its name."""
-    for path in sorted(paths):
-        with suppress(OSError):
-            if sha256(path) == path.name.split(".")[1]:
-                return path
-    return None
 
 
 @constant

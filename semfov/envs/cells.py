@@ -20,7 +20,7 @@ from semfov.envs.scenery import Scenery
 from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks
 from semfov.episode.loop import attend
 from semfov.errors import check, check_whole
-from semfov.metrics.episodes import count_right
+from semfov.metrics.episodes import right_cells
 from semfov.paths import Scanpath
 from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, reduced_copy
@@ -216,7 +216,9 @@ class CellGazes(Gazes):
         if self.searching:
             self.result[rows] = right[torch.arange(len(rows)), self.cell[rows]].float()
         else:
-            self.result[rows] = count_right(self._all_or(rows).class_probabilities(), right) / right.any(-1).sum(-1)
+            self.result[rows] = right_cells(self._all_or(rows).class_probabilities(), right).sum(-1) / right.any(
+                -1
+            ).sum(-1)
         if not self.pictures:
             return
         detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)

@@ -28,7 +28,7 @@ from semfov.fit.settings import FitOnLooksConfig
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error
-from semfov.metrics.episodes import FloatArray, answers_of, success_rate
+from semfov.metrics.episodes import FloatArray, answers_of
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.runs.looking import Looking
@@ -309,9 +309,9 @@ def _explore_curves(
                     shifts=protocol.shifts,
                     batch=protocol.batch,
                 )
-            rates = [success_rate(counts["right"], cells) for _, counts in progress]
+            rates = [np.asarray(counts["right"]) / cells for _, counts in progress]
             curves["objects"][name].append(np.mean(rates, axis=0))
-            rates = [success_rate(counts["right_everywhere"], len(grid)) for _, counts in progress]
+            rates = [np.asarray(counts["right_everywhere"]) / len(grid) for _, counts in progress]
             curves["all"][name].append(np.mean(rates, axis=0))
     return {
         what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}

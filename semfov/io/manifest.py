@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, inside, sha256, write_text
-from semfov.io.schema import CLASSES, Anything, Array, Flag, Maybe, Number, Object, Schema, Text
+from semfov.io.schema import CLASSES, Array, Flag, Json, Maybe, Number, Object, Schema, Text
 from semfov.io.storage import check_version, checksum
 from semfov.version import __version__
 
@@ -30,7 +30,7 @@ _PART = Object(
         "sha256": Maybe(Text()),
         "used": Flag(),
         "why": Text(),
-        "settings": Object(others=Anything()),
+        "settings": Object(others=Json()),
     },
     required=("file", "sha256", "used", "why", "settings"),
 )
@@ -47,7 +47,7 @@ _SCHEMA = Schema(
                 "model": Maybe(Text()),
                 "model_file": Maybe(_PLACE),
                 "weights_file": Maybe(_PLACE),
-                "options": Object(others=Anything()),
+                "options": Object(others=Json()),
             },
             required=("name", "sha256", "options"),
         ),
@@ -57,12 +57,12 @@ _SCHEMA = Schema(
                 "reference": Number(above=0),
             },
             # The others depend on the sensor, which checks them when it is made.
-            others=Anything(),
+            others=Json(),
             required=("name", "reference"),
         ),
         "grid": Array(Number(1, 200), 2),
         "parts": Object(dict.fromkeys(PARTS, _PART)),
-        "training": Object(others=Anything()),
+        "training": Object(others=Json()),
     },
 )
 

@@ -10,25 +10,16 @@ from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
-from semfov.io.schema import Anything, Object, Schema, Text
+from semfov.io.schema import Json, Object, Schema, Text
 from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, read, write_file
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")
-_METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(others=Anything())}, Anything())
+_METADATA = Object({"detector": Object(others=Json()), "sensor": Object(others=Json())}, Json())
 """Metadata of a model, which people and `semfov.io.compatibility` read."""
 
 _ENVELOPE = Schema({}, {"version": Text(), "metadata": _METADATA})
-
-
-def _find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
-    """Path of a model: a path (with a folder or `.safetensors`) as it is, else that of the shipped model by name."""
-    path = Path(name_or_path)
-    if path.suffix == ".safetensors" or len(path.parts) > 1:
-        return path
-    names = sorted(file.stem for file in shipped.glob("*.safetensors"))
-    return shipped / f"{lookup(str(name_or_path), names, kind)}.safetensors"
 
 
 class Pretrained(StatedModule):
@@ -89,7 +80,10 @@ class Pretrained(StatedModule):
             InputError: no model of that name is shipped.
             DataError: the file is missing, damaged or of another kind.
         """
-        path = _find(name_or_path, cls.shipped, cls.title)
+        path = Path(name_or_path)
+        if path.suffix != ".safetensors" and len(path.parts) < 2:
+            names = sorted(file.stem for file in cls.shipped.glob("*.safetensors"))
+            path = cls.shipped / f"{lookup(str(name_or_path), names, cls.title)}.safetensors"
         tensors, record = read(path, cls.kind)
         try:
             own = {name: value for name, value in record.items() if name not in _COMMON}

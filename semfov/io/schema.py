@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -60,10 +59,9 @@ class Field:
         check(off <= 1e-2, name, expected, f"sums that differ from 1 by {off:.2g}")
 
 
-class Json(ABC):
-    """Base of the requirements of a JSON value."""
+class Json:
+    """Base of the requirements of a JSON value; any value meets its own."""
 
-    @abstractmethod
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         """Raise `InputError` unless a value meets the requirements; add the sizes that it determines to `sizes`."""
 
@@ -159,13 +157,6 @@ class Maybe(Json):
     def check(self, name: str, value: Any, sizes: _Sizes) -> None:
         if value is not None:
             self.of.check(name, value, sizes)
-
-
-class Anything(Json):
-    """Requirement that any JSON value meets."""
-
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        pass
 
 
 CLASSES = Array(Text(), "K", least=1, distinct=True)

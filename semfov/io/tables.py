@@ -20,14 +20,10 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def _plain(value: object) -> object:
-    if not isinstance(value, str) or len(value) < 2 or _is_number(value):
+    if not isinstance(value, str) or len(value) < 2:
         return value
-    return f"'{value}" if value.lstrip().startswith(_FORMULAS) else value
-
-
-def _is_number(text: str) -> bool:
     try:
-        float(text)
+        float(value)
     except ValueError:
-        return False
-    return True
+        return f"'{value}" if value.lstrip().startswith(_FORMULAS) else value
+    return value

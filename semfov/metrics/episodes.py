@@ -1,7 +1,5 @@
 """Measures of searches, of deciding whether a target is present, and of explorations; standard errors of means."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -56,33 +54,14 @@ def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
     return overlap.T.float() @ classes.float() > 0
 
 
-def count_right(beta: Tensor, answers: Tensor) -> Tensor:
-    """Number of cells whose most probable class is that of an overlapping object.
-
-    A cell where several classes are tied for the most probable one counts as wrong, so a cell without information does.
-
-    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B,)`.
-    """
-    return right_cells(beta, answers).sum(-1)
-
-
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
-    """The cells whose most probable class is that of an overlapping object; `count_right` counts them.
+    """The cells, `(B, X·Y)`, whose most probable class, tied with no other, is that of an overlapping object.
 
-    >>> import torch
-    >>> right_cells(torch.tensor([[[0.5, 0.7], [0.5, 0.5]]]), torch.tensor([[False, True]] * 2))
-    tensor([[ True, False]])
-
-    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)` → `(B, X·Y)`.
+    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)`.
     """
     best = beta == beta.amax(-1, keepdim=True)
     # Sums of a short dimension take a seventh of the time of `any`.
     return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
-
-
-def success_rate(right: Sequence[int], cells: int) -> FloatArray:
-    """Fraction of the cells with objects whose most probable class is correct, after each gaze shift."""
-    return np.asarray(right) / cells
 
 
 def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:

@@ -79,7 +79,11 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
         f"Σ exp(mean_log) = {largest}",
     )
 
-    capped = _reaches(rows, total, max_precision)
+    # The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
+    # exceeds A Σ exp(g) + K/2: so most rows are known to stay below the largest precision.
+    capped = 1 - total <= components / (2 * max_precision)
+    level = total.new_tensor(max_precision).digamma()
+    capped[capped.clone()] = inverse_digamma(level + rows[capped]).sum(-1) >= max_precision
     alpha = torch.empty_like(rows)
     alpha[capped] = _at_precision(rows[capped], max_precision)
     # L-BFGS needs gradients of its own, which inference mode does not record.
@@ -162,18 +166,6 @@ def _guess(y: Tensor) -> Tensor:
 
 def _trigamma(x: Tensor) -> Tensor:
     return torch.polygamma(1, x)
-
-
-def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
-    """Whether the maximum of each row has a precision of at least `precision`; → `(rows,)`.
-
-    The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
-    exceeds A Σ exp(g) + K/2.
-    """
-    reaches = 1 - total <= rows.shape[-1] / (2 * precision)
-    level = total.new_tensor(precision).digamma()
-    reaches[reaches.clone()] = inverse_digamma(level + rows[reaches]).sum(-1) >= precision
-    return reaches
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:

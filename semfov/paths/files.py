@@ -13,7 +13,7 @@ from torch import Tensor
 from semfov.decision import CloseUp, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.errors import check
-from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Schema, Text
+from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Schema, Text
 from semfov.io.storage import read, write_file
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
@@ -59,7 +59,7 @@ _SHARED = {
     "found": Flag(),
     "least": CHANCE,
     "source": Maybe(Text()),
-    "shown": Maybe(Object({"white": Anything(), "bands": Anything()})),
+    "shown": Maybe(Object({"white": Json(), "bands": Json()})),
     "ending": Maybe(Text(get_args(Ending))),
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),

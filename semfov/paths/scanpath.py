@@ -20,7 +20,7 @@ from semfov.data.windowed import LargePicture
 from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
-from semfov.io.schema import Anything, Array, Field, Json, Maybe, Number, Object, Text
+from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Text
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import LookView, RecordedLook, cell_columns
@@ -39,10 +39,10 @@ _SENSOR = {
 _SETTINGS = Object(
     {
         # Other settings, of a user's own sensor, are kept without a check.
-        "sensor": Object(_SENSOR, Anything(), ("reference",)),
-        "detector": Object({"name": Text()}, Anything(), ("name",)),
+        "sensor": Object(_SENSOR, Json(), ("reference",)),
+        "detector": Object({"name": Text()}, Json(), ("name",)),
     },
-    Anything(),
+    Json(),
     ("sensor", "detector"),
 )
 _PLACEMENT = {"size": Array(POSITIVE, 2), "scale": Array(POSITIVE, 2), "offset": Array(WHOLE, 2)}

@@ -22,6 +22,8 @@ from semfov.viz.semantic import cell_entropy
 
 Data = dict[str, Any]
 
+_MOST, _SCORES = 10, 5  # detections of a look, and classes of each, that are told
+
 
 def pillow(image: Tensor) -> Any:
     """A picture `(3, H, W)`, of bytes or in [0, 1], for Pillow."""
@@ -58,8 +60,9 @@ def episode_data(
     quality: int = 75,
 ) -> Data:
     """Collect the data of an episode for a page, as JSON values."""
-    grid = scanpath.grid
+    grid, decision = scanpath.grid, scanpath.decision
     size = grid.extent.tolist()
+    found = decision if decision is not None and decision.outcome == "found" else None
     timed = len(scanpath.seconds) > 0
     after = [*scanpath.cells.tolist()[1:], None]
     every_view: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views
@@ -78,7 +81,11 @@ def episode_data(
         "name": name,
         **_about_data(scanpath, settings),
         "summary": scanpath.describe(),
-        "outcome": _outcome_data(scanpath),
+        "outcome": {
+            "why": scanpath.why_it_ended(),
+            "cell": None if found is None else found.cell,
+            "box": None if found is None or found.box is None else [round(x, 1) for x in found.box.tolist()],
+        },
         "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
@@ -112,25 +119,13 @@ def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
     }
 
 
-def _outcome_data(scanpath: Scanpath) -> Data:
-    """Why the episode ended, and the cell and box of a target that was found."""
-    decision = scanpath.decision
-    found = decision is not None and decision.outcome == "found"
-    box = decision.box if decision is not None and found else None
-    return {
-        "why": scanpath.why_it_ended(),
-        "cell": decision.cell if decision is not None and found else None,
-        "box": None if box is None else [round(x, 1) for x in box.tolist()],
-    }
-
-
-def _detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: int = 5) -> list[Data]:
+def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     """The most confident detections of a look, each with its highest class scores and the position of its label."""
     looked, classes = scanpath.detections[fixation][0], scanpath.classes
     detections = []
-    for box, vector in zip(looked.boxes[:most], looked.scores[:most], strict=True):
+    for box, vector in zip(looked.boxes[:_MOST], looked.scores[:_MOST], strict=True):
         if float(vector[1:].max()) >= FAINTEST:
-            best = vector.topk(min(scores, len(vector)))
+            best = vector.topk(min(_SCORES, len(vector)))
             pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
             top = [[classes[index], rounded(score)] for score, index in pairs]
             label = classes[int(vector[1:].argmax()) + 1]

@@ -16,7 +16,7 @@ from semfov.data.fixations import Fixations
 from semfov.io.files import write_text
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
-from semfov.report.page import colour_steps, filled, json_script, page_path
+from semfov.report.page import colour_steps, filled, page_path
 from semfov.viz.style import COLOURS, overlay_colours
 
 _WIDTH, _QUALITY = 960, 80
@@ -25,8 +25,20 @@ _MOST_STEPS = 12
 
 
 def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
-    """What the page has of a picture, as JSON values: a prediction, and scanpaths that are drawn from it."""
-    return {"picture": _picture(prediction, scanpaths), "facts": _facts(prediction)}
+    """What the page has of a prediction: maps relative to their largest values as bytes, contours, drawn scanpaths."""
+    steps = min(max(map(len, scanpaths)), _MOST_STEPS)
+    maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
+    relative = [(each / each.max() * 255).round().byte() for each in maps]
+    picture = {
+        "name": prediction.name,
+        "size": list(prediction.size),
+        "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
+        "cells": list(prediction.cells.shape),
+        "maps": [base64.b64encode(each.numpy().tobytes()).decode() for each in relative],
+        "contours": [_contours(each, prediction.size) for each in maps],
+        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in scanpaths],
+    }
+    return {"picture": picture, "facts": _facts(prediction)}
 
 
 def write_gaze_page(path: str | PathLike[str], title: str, parts: Sequence[Data]) -> Path:
@@ -45,30 +57,13 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
     }
     contents = {
         "title": escape(title),
-        "data": json_script(data),
         "facts": "".join(
             f'<section class="facts-of" id="facts-{number}"><h2>{escape(each["picture"]["name"])}</h2>'
             f"{each['facts']}</section>"
             for number, each in enumerate(parts)
         ),
     }
-    return filled("gaze", contents)
-
-
-def _picture(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
-    """The data of a picture: maps relative to their largest values as bytes, contours and scanpaths."""
-    steps = min(max(map(len, scanpaths)), _MOST_STEPS)
-    maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
-    relative = [(each / each.max() * 255).round().byte() for each in maps]
-    return {
-        "name": prediction.name,
-        "size": list(prediction.size),
-        "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
-        "cells": list(prediction.cells.shape),
-        "maps": [base64.b64encode(each.numpy().tobytes()).decode() for each in relative],
-        "contours": [_contours(each, prediction.size) for each in maps],
-        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in scanpaths],
-    }
+    return filled("gaze", data, contents)
 
 
 _MASSES = (0.8, 0.5, 0.25)

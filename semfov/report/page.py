@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from semfov.errors import check
 from semfov.io.files import write_text
@@ -93,7 +93,6 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     about = _about_html(episodes)
     contents = {
         "title": escape(title),
-        "data": json_script(data),
         "sections": sections,
         # What the sections sum up comes before the facts about one episode.
         "about": "" if sections else about,
@@ -105,16 +104,19 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         ),
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
-    return filled("page", contents)
+    return filled("page", data, contents)
 
 
-def filled(name: str, contents: dict[str, str]) -> str:
-    """The page of a template: head, controls, foot and script of all pages, its own, and contents of placeholders."""
+def filled(name: str, data: Data, contents: dict[str, str]) -> str:
+    """The page of a template: head, controls, foot and script of all pages, its own, data, and contents by place."""
 
     def text(*files: str) -> str:
         return "".join((_FOLDER / file).read_text(encoding="utf-8") for file in files)
 
     parts = {"style": text("page.css"), "steps": text("steps.html"), "program": text("steps.js", f"{name}.js")}
+    script = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    # The data are inside an element, which no text in them may close.
+    parts["data"] = script.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
     parts |= contents
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     template = text("head.html", f"{name}.html", "foot.html")
@@ -150,22 +152,15 @@ def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
     return {**about, "article": f"large-{number}", "looks": looks}
 
 
-def json_script(data: Any) -> str:
-    r"""JSON text that is safe inside a script element.
-
-    >>> json_script({"class": "</script>"})
-    '{"class":"\\u003c/script\\u003e"}'
-    """
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+_STEPS = 33  # of a colour map
 
 
-def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
+def colour_steps(colours: str | Colormap, opacity: float = 1.0) -> list[list[float]]:
     """Red, green and blue from 0 to 255 and opacity from 0 to 1 of a colour map of matplotlib, at equal steps."""
     from matplotlib import colormaps
 
     colours = colormaps[colours] if isinstance(colours, str) else colours
-    shades = [colours(step / (steps - 1)) for step in range(steps)]
+    shades = [colours(step / (_STEPS - 1)) for step in range(_STEPS)]
     return [
         [*(round(255 * float(value)) for value in shade[:3]), round(float(shade[3]) * opacity, 3)] for shade in shades
     ]

@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.data.scene import Scenes
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.metrics.episodes import count_right
+from semfov.metrics.episodes import right_cells
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
@@ -78,7 +78,7 @@ def counts_of(probabilities: Tensor, answers: Tensor) -> dict[str, Tensor]:
     """Numbers of right cells of maps `(B, X·Y, K+1)`, each `(B,)`."""
     everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
     return {
-        "right": count_right(probabilities, answers),
-        "right_without_background": count_right(probabilities[..., 1:], answers[:, 1:]),
-        "right_everywhere": count_right(probabilities, everywhere),
+        "right": right_cells(probabilities, answers).sum(-1),
+        "right_without_background": right_cells(probabilities[..., 1:], answers[:, 1:]).sum(-1),
+        "right_everywhere": right_cells(probabilities, everywhere).sum(-1),
     }

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions, is_batch
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
@@ -73,7 +73,7 @@ def foveate(
     torch.Size([3, 48, 64])
     """
     gaze = as_points(gaze)
-    if not (isinstance(image, Bands) or is_batch(image)):
+    if not (isinstance(image, Bands) or (isinstance(image, Tensor | np.ndarray) and image.ndim > 3)):
         points = gaze[None] if gaze.ndim == 2 else gaze
         bands = laplacian_pyramid(as_images(image), levels, convention)
         return foveate(bands, points, sigma=sigma, growth=growth)[0]

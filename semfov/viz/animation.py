@@ -24,14 +24,14 @@ from semfov.viz.drawing import photograph_of
 from semfov.viz.scanpath import LookFigure, views_of
 from semfov.viz.style import STYLE
 
-Frame = NDArray[np.uint8]
+_Frame = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Film:
     """Frames that a notebook shows one after the other; frames `(H, W, 3)`."""
 
-    frames: list[Frame]
+    frames: list[_Frame]
     seconds: float = 1.0
     hold: float = 2.0
     title: str = ""
@@ -114,7 +114,7 @@ def animate(
     return film if path is None else film.save(path)[0]
 
 
-def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
+def render(figures: Iterable[Any], dpi: int = 90) -> list[_Frame]:
     """Draw matplotlib figures and return their pixels `(H, W, 3)`; each is drawn before the next is requested."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -127,7 +127,7 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
     return frames
 
 
-def _write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:
+def _write_gif(frames: Sequence[_Frame], file: Any, seconds: float, hold: float) -> None:
     """Write frames as a GIF with a common palette of 256 colours."""
     first, *others = _in_one_palette(frames)
     times = [int(1000 * seconds)] * len(frames)
@@ -135,7 +135,7 @@ def _write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) 
     first.save(file, format="GIF", save_all=True, append_images=others, duration=times, loop=0)
 
 
-def _in_one_palette(frames: Sequence[Frame], most: int = 6) -> list[Any]:
+def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[Any]:
     """Frames as Pillow images with a common palette of 256 colours, which is made from `most` of them.
 
     With a palette for each frame, static parts of the film would flicker.
@@ -153,7 +153,7 @@ def _in_one_palette(frames: Sequence[Frame], most: int = 6) -> list[Any]:
     return [Image.fromarray(frame).quantize(palette=palette) for frame in frames]
 
 
-def _save_mp4(ffmpeg: str, frames: Sequence[Frame], path: Path, seconds: float, hold: float) -> Path:
+def _save_mp4(ffmpeg: str, frames: Sequence[_Frame], path: Path, seconds: float, hold: float) -> Path:
     height, width = frames[0].shape[:2]
     stay = 1 + round(hold / seconds)
     pixels = b"".join(frame.tobytes() for frame in [*frames[:-1], *[frames[-1]] * stay])

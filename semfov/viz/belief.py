@@ -14,9 +14,9 @@ from semfov.viz.drawing import (
     check_fixation,
     check_foveal,
     choose_fixations,
+    draw_cells,
     draw_cross,
     draw_image,
-    draw_overlay,
     draw_scale,
 )
 from semfov.viz.style import PROBABILITY, make_figure, root, styled
@@ -162,7 +162,7 @@ def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | Non
     posterior = class_posterior(scanpath, target)[fixation]
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
-    drawn = draw_overlay(axes, scanpath.grid, posterior)
+    drawn = draw_cells(axes, scanpath.grid, posterior)
     draw_cross(axes, scanpath.fixations[fixation])
     axes.set_title(f"p({_name(scanpath, target)}) up to {float(posterior.max()):.2f}", parse_math=False)
     return drawn

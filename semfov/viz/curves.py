@@ -65,16 +65,11 @@ def plot_curves(
     return figure
 
 
-def highlighted(curves: _Curves, most: int = len(COLOURS)) -> list[str]:
+def highlighted(curves: _Curves) -> list[str]:
     """The curves that a legend names: the highest on average, and random gaze as the reference."""
     order = sorted(curves, key=lambda name: (not name.startswith("random"), -float(np.nanmean(curves[name]))))
-    chosen = order[:most]
+    chosen = order[: len(COLOURS)]
     return [name for name in curves if name in chosen]
-
-
-def others_named(count: int) -> str:
-    """The legend's single entry for all curves that it does not name."""
-    return f"{count} other{'s' if count != 1 else ''}"
 
 
 def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequence[str] | None = None) -> None:
@@ -84,7 +79,7 @@ def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequ
     named = list(curves) if named is None else named
     rest = [name for name in curves if name not in named]
     for number, name in enumerate(rest):
-        label = others_named(len(rest)) if number == 0 else None
+        label = f"{len(rest)} other{'s' if len(rest) != 1 else ''}" if number == 0 else None
         axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=_REST, linewidth=0.8, label=label, zorder=1)
     for order, name in enumerate(named):
         curve, style = curves[name], line_style(order, len(named))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 CONFIDENT = 0.1
 """Detections of lower confidence are not drawn."""
 
-LABEL = 6.5
-"""Font size of the labels of boxes."""
+_Tag = tuple[LabelBox, str, str]
+"""A box, the text of its label, and its colour."""
+
+_LABEL, _SMALL = 6.5, 5.0
+"""Font sizes of the labels of boxes, of few and of many."""
 
 
 def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor:
@@ -78,17 +81,13 @@ def picture_array(image: Tensor, *, grey: bool = False) -> Any:
 
 
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
-    """Draw a value of every cell `(X·Y,)` as a colour."""
+    """Draw a value of every cell `(X·Y,)` as a colour; without a style a probability over a picture, clear at 0."""
     width, height = grid.extent.tolist()
+    style = style or {"cmap": overlay_colours(), "vmin": 0, "vmax": 1}
     table = values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
     drawn = axes.imshow(table, extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style)
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     return drawn
-
-
-def draw_overlay(axes: Axes, grid: Grid, probabilities: Tensor) -> AxesImage:
-    """Draw a probability of every cell `(X·Y,)` over a picture, on a scale from 0, which is transparent, to 1."""
-    return draw_cells(axes, grid, probabilities, cmap=overlay_colours(), vmin=0, vmax=1)
 
 
 def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
@@ -145,47 +144,40 @@ def draw_look(
     obstacles: Sequence[LabelBox] = (),
 ) -> list[Artist]:
     """Draw detections, each labelled with its best class other than background; frame `(width, height)`."""
-    tags: list[Tag] = []
+    tags: list[_Tag] = []
     drawn: list[Artist] = []
     for box, label, score in zip(
         detections.boxes[0], detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True
     ):
         colour = TARGET if label == target else OTHER
         x1, y1, x2, y2 = box.tolist()
-        tags.append(Tag((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
+        tags.append(((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
         drawn += draw_boxes(axes, box[None], colour)
     return [*drawn, *draw_tags(axes, tags, frame, obstacles)]
 
 
-class Tag(NamedTuple):
-    """The label of a box in a figure."""
-
-    box: LabelBox
-    text: str
-    colour: str
-
-
 def draw_tags(
-    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], points: float = LABEL
+    axes: Axes, tags: Sequence[_Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], *, many: bool = False
 ) -> list[Artist]:
     """Write the labels of boxes, so that none covers another; the figure must be laid out; frame `(width, height)`."""
-    sizes = [text_size(axes, tag.text, points) for tag in tags]
-    places = place_labels([tag.box for tag in tags], sizes, frame, obstacles)
+    points = _SMALL if many else _LABEL
+    sizes = [text_size(axes, text, points) for _, text, _ in tags]
+    places = place_labels([box for box, _, _ in tags], sizes, frame, obstacles)
     inset = per_point(axes)
     return [
         axes.text(
             left + inset,
             top + inset,
-            tag.text,
-            color="white" if lightness(tag.colour) < 0.5 else "black",
+            text,
+            color="white" if lightness(colour) < 0.5 else "black",
             fontsize=points,
             va="top",
             clip_on=True,
             parse_math=False,
             zorder=4,
-            bbox={"facecolor": tag.colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
+            bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
         )
-        for tag, (left, top, _, _) in zip(tags, places, strict=True)
+        for (_, text, colour), (left, top, _, _) in zip(tags, places, strict=True)
     ]
 
 

@@ -83,7 +83,20 @@ def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = 
 
 def video_suffix() -> str:
     """Suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
-    return next(suffix for suffix, codec in VIDEO_CODECS.items() if suffix == ".avi" or _writes(suffix, codec))
+    import tempfile
+
+    import cv2
+
+    *others, last = VIDEO_CODECS
+    for suffix in others:
+        with tempfile.TemporaryDirectory() as folder:
+            code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[suffix])
+            writer = cv2.VideoWriter(f"{folder}/try{suffix}", code, 10, (64, 64))
+            opened = bool(writer.isOpened())
+            writer.release()
+        if opened:
+            return suffix
+    return last
 
 
 @contextmanager
@@ -118,16 +131,3 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
             if writer is not None:
                 writer.release()
             named.unlink(missing_ok=True)
-
-
-def _writes(suffix: str, codec: str) -> bool:
-    """Whether OpenCV has this encoder."""
-    import tempfile
-
-    import cv2
-
-    with tempfile.TemporaryDirectory() as folder:
-        writer = cv2.VideoWriter(f"{folder}/try{suffix}", cv2.VideoWriter.fourcc(*codec), 10, (64, 64))
-        opened = bool(writer.isOpened())
-        writer.release()
-    return opened

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semfov.data.fixations.record import FixationValues
 from semfov.paths import Record
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import LabelBox, place_numbers
@@ -82,7 +82,7 @@ class GazePath:
     def __init__(
         self,
         axes: Axes,
-        fixations: FixationValues,
+        fixations: NDArray[np.float64],
         frame: tuple[float, float],
         *,
         found: bool,

@@ -18,18 +18,16 @@ from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
-    LABEL,
-    Tag,
     check_fixation,
     check_foveal,
     choose_fixations,
     confident_detections,
     draw_boxes,
+    draw_cells,
     draw_cross,
     draw_grid,
     draw_image,
     draw_look,
-    draw_overlay,
     draw_scale,
     draw_tags,
     per_point,
@@ -51,7 +49,6 @@ _LegendEntry = tuple[str, str, str]
 
 _NAMED = 15  # largest number of objects whose labels name their class where only one class was searched for
 _LABELLED = 60  # largest number of objects that have labels
-_SMALL = 5.0  # font size of the labels of many objects
 
 
 def _draw_objects(
@@ -71,7 +68,7 @@ def _draw_objects(
     width, height = record.size
     refuted = [look.box for look in record.refuted if look.of_look <= last]
     drawn = [artist for box in refuted for artist in draw_boxes(axes, box[None], FOUND, ":", 1.6)]
-    tags: list[Tag] = []
+    tags: list[tuple[LabelBox, str, str]] = []
     many = len(rows) > _NAMED
     single = many and record.target is not None
     # The most confident objects are drawn last, over the others.
@@ -82,9 +79,9 @@ def _draw_objects(
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             drawn += draw_boxes(axes, Tensor([box]), colour, "--" if lower[row["object"]] else "-", line)
-            tags.append(Tag(box, text, colour))
+            tags.append((box, text, colour))
     if tagged:
-        drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, _SMALL if many else LABEL)
+        drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, many=many)
     return drawn
 
 
@@ -412,7 +409,7 @@ class LookFigure:
         if believed is not None:
             (belief_axes,), (grid, chances) = others, believed
             draw_image(belief_axes, image, grid, grey=True)
-            self.belief = draw_overlay(belief_axes, grid, chances)
+            self.belief = draw_cells(belief_axes, grid, chances)
             if self.named:
                 draw_grid(belief_axes, grid)
             draw_scale(belief_axes, self.belief, "probability")

@@ -18,7 +18,6 @@ from semfov.viz.drawing import (
     draw_cross,
     draw_grid,
     draw_image,
-    draw_overlay,
     draw_scale,
     text_size,
 )
@@ -93,7 +92,7 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     """Draw the probability of the most probable object of every cell, from 0 to 1, over a photograph."""
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
-    drawn = draw_overlay(axes, scanpath.grid, scanpath.probabilities[fixation, :, 1:].amax(-1))
+    drawn = draw_cells(axes, scanpath.grid, scanpath.probabilities[fixation, :, 1:].amax(-1))
     draw_grid(axes, scanpath.grid)
     draw_cross(axes, scanpath.fixations[fixation])
     axes.set_title(f"semantic map after fixation {fixation}")

@@ -5,6 +5,8 @@ import hashlib
 import json
 import logging
 import pickle
+import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import torch
 from PIL import Image
 
 from semfov import CocoScenes, DataError, read_image
-from semfov.data.coco import _other_form, _Packed, read_annotations
+from semfov.data.coco import _Packed, read_annotations, warn_of_form
 from tests.refusals import refused, unusable
 
 CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
@@ -300,7 +302,8 @@ def test_development_photographs(shared):
 )
 def test_boxes_in_another_form_are_told(boxes, seems):
     limits = torch.tensor([100, 80, 100, 80]).expand(len(boxes), 4)
-    assert _other_form(torch.tensor(boxes, dtype=torch.float64).reshape(-1, 4), limits) == seems
+    with nullcontext() if seems is None else pytest.warns(UserWarning, match=re.escape(f"look like {seems}")):
+        warn_of_form(torch.tensor(boxes, dtype=torch.float64).reshape(-1, 4), limits, "boxes.json")
 
 
 def test_a_warning_says_that_boxes_are_corners(make_coco):

@@ -87,8 +87,8 @@ def test_decoders_are_differentiable_and_compile():
     assert check(lambda x: numbers(heads._decode_yolox(x, (16, 16), (8, 16))), raw)
     assert check(lambda x: numbers(heads._decode_yolov5(x)), raw)
     assert check(lambda x: numbers(heads.decode_yolov8(x)), raw)
-    assert check(lambda x, y: numbers(heads.decode_detr(x, y, (16, 8))), (raw, boxes))
-    assert check(lambda x, y: numbers(heads.decode_rtdetr(x, y, (16, 8))), (raw, boxes))
+    assert check(lambda x, y: numbers(heads._decode_detr(x, y, (16, 8))), (raw, boxes))
+    assert check(lambda x, y: numbers(heads._decode_rtdetr(x, y, (16, 8))), (raw, boxes))
     distances = noise(1, 5, 12).requires_grad_()
     assert check(lambda x, y: numbers(heads._decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
     raw = noise(1, 84, 8)
@@ -99,7 +99,7 @@ def test_decoders_are_differentiable_and_compile():
 def test_wrong_shapes_are_refused_by_name():
     refused("84 rows, one for each cell of a 64 x 64 canvas", heads._decode_yolox, noise(1, 83, 8), (64, 64))
     refused("bins", heads._decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
-    refused("boxes", heads.decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
+    refused("boxes", heads._decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
 
 def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None, **metadata):

@@ -1,27 +1,22 @@
 """Metrics of explorations: the right answers for a cell, and when a belief is right about it."""
 
-import numpy as np
 import torch
 
 from semfov import Grid
 from semfov.data import Annotation
-from semfov.metrics.episodes import answers_of, count_right, success_rate
+from semfov.metrics.episodes import answers_of, right_cells
 
 
 def test_a_cell_is_right_if_an_object_of_its_single_most_probable_class_overlaps_it():
     # Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too.
     answers = torch.tensor([[False, True, False]] * 4)
     beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
-    assert count_right(beta, answers).tolist() == [1]
+    assert right_cells(beta, answers).sum(-1).tolist() == [1]
     # Without the background column, classes slightly less probable than background are right, too.
-    assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
+    assert right_cells(beta[..., 1:], answers[:, 1:]).sum(-1).tolist() == [3]
     answers = torch.tensor([[False, True], [False, True], [True, True]])
     beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
-    assert count_right(beta, answers).tolist() == [2]
-
-
-def test_success_rate_by_hand():
-    np.testing.assert_allclose(success_rate([0, 1, 3], 4), [0, 0.25, 0.75])
+    assert right_cells(beta, answers).sum(-1).tolist() == [2]
 
 
 def test_answers_are_the_classes_of_overlapping_objects():

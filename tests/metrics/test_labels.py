@@ -9,7 +9,7 @@ from eval.bootstrap import Bootstrap
 from eval.chance import errors_by_chance
 from eval.presence import hits_at, roc
 from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
-from semfov.metrics.episodes import area_under_roc, count_right, cumulative_performance, standard_error
+from semfov.metrics.episodes import area_under_roc, cumulative_performance, right_cells, standard_error
 from semfov.metrics.scanpath import (
     auc,
     cell_labels,
@@ -61,7 +61,7 @@ def test_outcomes_of_any_type(kind):
     assert (figures.accuracy, figures.brier) == pytest.approx((2 / 3, (0.02 + 0.08 + 0.98) / 3))
     beta = torch.tensor([[[0.5, 0.7], [0.9, 0.1], [0.2, 0.5]]])
     if "list" not in kind and kind != "tuple":
-        assert count_right(beta, TYPES[kind]([[0, 1]] * 3)).tolist() == [2]
+        assert right_cells(beta, TYPES[kind]([[0, 1]] * 3)).sum(-1).tolist() == [2]
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -105,7 +105,7 @@ def test_labels_of_any_type(kind):
         (lambda: sequence_score(torch.rand(2, 2), [0.0]), r"ours: expected labels in a row, got shape \(2, 2\)"),
         (lambda: edit_distance([[1, 2]], [[1, 2]]), "labels: expected names or numbers, got a list of shape"),
         (lambda: mean_performance([float("nan"), 1], [1, 2], 2), "found: expected numbers, got NaN"),
-        (lambda: count_right(torch.rand(1, 1, 2), torch.tensor([[2, 0]])), "answers: expected true and false"),
+        (lambda: right_cells(torch.rand(1, 1, 2), torch.tensor([[2, 0]])), "answers: expected true and false"),
     ],
 )  # fmt: skip
 def test_what_is_neither_is_refused(call, named):

@@ -24,7 +24,7 @@ from semfov.metrics.scanpath import (
     sequence_score,
     tfp_auc,
 )
-from semfov.metrics.scanpath.sequence import fitted_clusters, labels_by
+from semfov.metrics.scanpath.sequence import fitted_clusters
 
 _Array = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ class People:
     def _words(self, name: str, searches: Sequence[Fixations]) -> list[list[int]]:
         if name not in self.clusters:
             self.clusters[name] = fitted_clusters(self.points[name], self.bandwidth)
-        labels = labels_by(self.clusters[name], np.concatenate([each.points for each in searches]))
+        labels = self.clusters[name].predict(np.concatenate([each.points for each in searches]))
         ends = np.cumsum([len(each) for each in searches]).tolist()
         return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
 

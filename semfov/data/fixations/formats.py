@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from semfov.data.fixations.record import Fixations, ObjectBox, by_picture
+from semfov.data.fixations.record import Fixations, by_picture
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check
 from semfov.io.files import check_regular, read_text, write_text
-from semfov.io.schema import Anything, Array, Json, Maybe, Number, Object, Text
+from semfov.io.schema import Array, Json, Maybe, Number, Object, Text
 
 _PIXELS = Array(Number(low=-1e6, high=1e6), least=1)
 _MILLISECONDS = Array(Number(low=0, high=1e9))
@@ -25,7 +25,7 @@ _BOX = Maybe(Array(Number(low=-1e6, high=1e6), 4))
 _COCOSEARCH = Array(
     Object(
         {"name": Text(), "task": Text(), "X": _PIXELS, "Y": _PIXELS, "T": _MILLISECONDS, "bbox": _BOX},
-        others=Anything(),
+        others=Json(),
         required=("name", "X", "Y"),
     )
 )
@@ -45,7 +45,7 @@ _RUARTE = Object(
             "target_object": Text(),
             "subject": Text(),
         },
-        others=Anything(),
+        others=Json(),
         required=("X", "Y", "image_height", "image_width"),
     )
 )
@@ -133,7 +133,7 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
         if each.found is not None:
             trial["fixOnTarget"] = each.found
         trials.append(trial)
-    _write(path, trials)
+    write_text(path, json.dumps(trials) + "\n")
 
 
 def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) -> list[Fixations]:
@@ -197,7 +197,7 @@ def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> Non
             if each.durations is not None:
                 person["duration_ms"] = each.durations.tolist()
             pictures[picture].append(person)
-    _write(path, pictures)
+    write_text(path, json.dumps(pictures) + "\n")
 
 
 def read_ruarte(
@@ -305,7 +305,7 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
         if each.found is not None:
             trial["target_found"] = each.found
         trials[each.picture] = trial
-    _write(path, trials)
+    write_text(path, json.dumps(trials) + "\n")
 
 
 def coco_name(name: str) -> str:
@@ -344,10 +344,6 @@ def _read(path: Path, kind: Json) -> Any:
     return value
 
 
-def _write(path: str | PathLike[str], value: Any) -> None:
-    write_text(path, json.dumps(value) + "\n")
-
-
 def _record(
     path: Path, name: str, trial: Mapping[str, Any], keys: tuple[str, str, str] = ("X", "Y", "T"), **fields: Any
 ) -> Fixations:
@@ -362,5 +358,5 @@ def _record(
     return Fixations(points=np.array([*zip(x, y, strict=True)], dtype=np.float64), durations=durations, **fields)
 
 
-def _box(x1: float, y1: float, x2: float, y2: float) -> ObjectBox:
+def _box(x1: float, y1: float, x2: float, y2: float) -> tuple[float, float, float, float]:
     return float(x1), float(y1), float(x2), float(y2)

@@ -9,11 +9,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.data.fixations.columns import of_source
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import OURS, is_export, read_export, read_table
+from semfov.data.fixations.table import table_reader
 from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import check_regular, read_text
 
@@ -79,10 +78,7 @@ def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | No
         return read_eyelink
     if kind == ".json":
         return _json_reader(source)
-    _, header, _ = of_source(source)
-    ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in header}
-    ours = ours or not {*(columns or ())} <= {*OURS}
-    return read_export if is_export(header) and not ours else read_table
+    return table_reader(source, columns)
 
 
 _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')

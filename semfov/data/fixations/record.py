@@ -14,7 +14,7 @@ from torch import Tensor
 
 from semfov.errors import InputError, check
 
-FixationValues = NDArray[np.float64]
+_Values = NDArray[np.float64]
 _Size = tuple[int, int]
 
 
@@ -52,7 +52,7 @@ class Letterbox:
         across, down = (whole - self.scale * part for whole, part in zip(self.screen, self.picture, strict=True))
         return across / 2, down / 2
 
-    def to_picture(self, points: FixationValues) -> FixationValues:
+    def to_picture(self, points: _Values) -> _Values:
         """Convert points from the screen to the picture.
 
         Args:
@@ -63,7 +63,7 @@ class Letterbox:
         """
         return np.asarray((points + 0.5 - self.offset) / self.scale - 0.5)
 
-    def to_screen(self, points: FixationValues) -> FixationValues:
+    def to_screen(self, points: _Values) -> _Values:
         """Convert points from the picture to the screen.
 
         Args:
@@ -141,12 +141,12 @@ def _named(values: Any) -> str:
     return type(values).__name__ if kind is None else f"{type(values).__name__} of {kind}"
 
 
-def _box(corners: FixationValues) -> tuple[float, float, float, float]:
+def _box(corners: _Values) -> tuple[float, float, float, float]:
     x1, y1, x2, y2 = corners.reshape(-1).tolist()
     return x1, y1, x2, y2
 
 
-ObjectBox = tuple[float, float, float, float]
+_ObjectBox = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +171,11 @@ class Fixations:
 
     picture: str
     subject: str
-    points: FixationValues
+    points: _Values
     size: tuple[int, int]
-    durations: FixationValues | None = None
+    durations: _Values | None = None
     target: str | None = None
-    box: ObjectBox | None = None
+    box: _ObjectBox | None = None
     found: bool | None = None
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from semfov.data.fixations.columns import of_source
-from semfov.data.fixations.record import Fixations, ObjectBox
+from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import write_text
@@ -197,7 +197,7 @@ def _record(
     edges = [_maybe(where, place, line, name) for name in ("x1", "y1", "x2", "y2")]
     if None in edges and any(edge is not None for edge in edges):
         raise DataError(f"{where}: {place}: expected all of x1, y1, x2 and y2, or none, got some")
-    box: ObjectBox | None = None
+    box: tuple[float, float, float, float] | None = None
     if None not in edges:
         corners = _placed(np.array(edges, dtype=np.float64).reshape(2, 2), frame, units, origin, edges=True)
         if origin in ("bottom left", "centre, y up"):
@@ -344,7 +344,7 @@ _EXPORTS = (
             ("image", "imagename", "picture"), ("recordingsessionlabel", "datafile"), ("trialindex", "triallabel")),
 )  # fmt: skip
 
-OURS = ("picture", "subject", "target", "trial")
+_OURS = ("picture", "subject", "target", "trial")
 _GONE = ("", ".", "nan", "none", "null", "na")  # lost, or not a number
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
 """Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
@@ -400,7 +400,7 @@ def read_export(
     >>> record.subject, record.points.tolist(), record.durations.tolist()
     ('ann', [[639.5, 179.5]], [240.0])
     """
-    named = _named_columns(columns, OURS)
+    named = _named_columns(columns, _OURS)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     where, header, rows = of_source(source)
     by_key = {_key(name): name for name in reversed(header)}
@@ -422,7 +422,7 @@ def read_export(
             continue
         line |= {name: given for name, given in default.items() if given is not None}
         line["subject"] = line["subject"] or (Path(where).stem if len(header) and "." in where else "1")
-        who = tuple(line[name] for name in OURS)
+        who = tuple(line[name] for name in _OURS)
         viewing, before = viewing + (who != before), who
         line["trial"] = f"{line['trial']} {viewing}"
         key = line.pop("number") or None
@@ -453,11 +453,14 @@ def _of_one_eye(lines: Sequence[tuple[str, dict[str, str]]], eye: str | None) ->
     return [line for line, side, drop in zip(lines, sides, dropped, strict=True) if not (side and drop)]
 
 
-def is_export(header: Sequence[str]) -> bool:
-    """Whether these are the columns of a table that `read_export` reads."""
+def table_reader(source: Any, columns: Mapping[str, str] | None) -> Callable[..., list[Fixations]]:
+    """The reader of a table, by the names of its columns; `columns` as for `read_table`."""
+    header = of_source(source)[1]
+    if {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or not {*(columns or ())} <= {*_OURS}:
+        return read_table
     by_key = {_key(name): name for name in header}
     _split_location(by_key, [])
-    return any(_fits(each, by_key) for each in _EXPORTS)
+    return read_export if any(_fits(each, by_key) for each in _EXPORTS) else read_table
 
 
 def _key(name: str) -> str:

@@ -5,7 +5,13 @@ Definitions differ between groups, and each function names the group whose defin
 sequences need `pip install semfov[human]`.
 """
 
-from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
+from semfov.metrics.scanpath.alignment import (
+    MultiMatch,
+    dynamic_time_warping,
+    multimatch,
+    scanmatch,
+    time_delay_embedding,
+)
 from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
 from semfov.metrics.scanpath.maps import (
     auc,
@@ -20,7 +26,6 @@ from semfov.metrics.scanpath.maps import (
     nss,
     similarity,
 )
-from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
 from semfov.metrics.scanpath.performance import (
     found_at,
     mean_performance,

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations.reading import read_fixations
-from semfov.data.fixations.record import Fixations, FixationValues
+from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import check_viewed, warn_outside
 from semfov.errors import check
-from semfov.metrics.scanpath.alignment import dynamic_time_warping, scanmatch, time_delay_embedding
+from semfov.metrics.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
-from semfov.metrics.scanpath.multimatch import multimatch
 from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
 from semfov.paths import Record
@@ -25,7 +24,8 @@ from semfov.paths.gaze import GazePrediction
 _CELLS = 8
 _LONGEST = 64
 
-_Measure = Callable[[FixationValues, Sequence[FixationValues]], float]
+_Points = NDArray[np.float64]
+_Measure = Callable[[_Points, Sequence[_Points]], float]
 
 
 class BesidePeople(NamedTuple):
@@ -131,30 +131,30 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
 def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
     """Measures of points against those of several others, by name."""
 
-    def inside(points: FixationValues) -> FixationValues:
+    def inside(points: _Points) -> _Points:
         return points[Fixations("", "", points, size).inside]
 
-    def words(points: FixationValues) -> list[int]:
+    def words(points: _Points) -> list[int]:
         return [int(cell) for cell in cell_labels(inside(points), _CELLS, _CELLS, size)]
 
-    def paired(score: Callable[[FixationValues, FixationValues], float]) -> _Measure:
+    def paired(score: Callable[[_Points, _Points], float]) -> _Measure:
         return lambda points, others: _mean([score(points, other) for other in others])
 
     def matched(dimension: str) -> _Measure:
         return paired(lambda one, other: float(getattr(multimatch(one, other, size), dimension)))
 
-    def placed(score: Callable[[Any, Any], float], of: Callable[[FixationValues], Any] = inside) -> _Measure:
-        def pair(one: FixationValues, other: FixationValues) -> float:
+    def placed(score: Callable[[Any, Any], float], of: Callable[[_Points], Any] = inside) -> _Measure:
+        def pair(one: _Points, other: _Points) -> float:
             a, b = of(one), of(other)
             return score(a, b) if len(a) and len(b) else float("nan")
 
         return paired(pair)
 
-    def moved(score: Callable[[FixationValues, FixationValues], float], number: int, unit: float) -> _Measure:
+    def moved(score: Callable[[_Points, _Points], float], number: int, unit: float) -> _Measure:
         return lambda points, others: score(saccades([points])[number], saccades(others)[number]) / unit
 
     def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
-        def whole(points: FixationValues, others: Sequence[FixationValues]) -> float:
+        def whole(points: _Points, others: Sequence[_Points]) -> float:
             columns, rows = (max(1, round(side * _LONGEST / max(size))) for side in size)
             density = _people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
             x, y = ((inside(points) + 0.5) * (np.array([columns, rows]) / np.array(size)) - 0.5).T
@@ -184,7 +184,7 @@ def _mean(values: Sequence[float]) -> float:
 _BLUR = 0.03
 
 
-def _people_density(points: FixationValues, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
+def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
     """A map of `(rows, columns)`, a Gaussian of 3 % of its longer side around each point; points `(n, 2)`."""
     rows, columns = (np.arange(side) for side in shape)
     x, y = ((points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5).T

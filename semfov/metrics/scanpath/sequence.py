@@ -62,7 +62,8 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
     >>> bool(labels[0] == labels[1])
     False
     """
-    return labels_by(fitted_clusters(others, bandwidth), points)
+    clusters = fitted_clusters(others, bandwidth)
+    return np.asarray(clusters.predict(as_path(points, "points")), dtype=np.int64)
 
 
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
@@ -81,16 +82,6 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
         # The warning says that no two fixations share a bin. All of them are seeds then, which does no harm.
         warnings.filterwarnings("ignore", message="Binning data failed")
         return shift.fit(points)
-
-
-def labels_by(clusters: Any, points: ArrayLike) -> _Labels:
-    """Label fixations by fitted clusters; points `(n, 2)` → `(n,)`.
-
-    >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
-    >>> bool(labels[0] == labels[1] != labels[2])
-    True
-    """
-    return np.asarray(clusters.predict(as_path(points, "points")), dtype=np.int64)
 
 
 def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> float:
