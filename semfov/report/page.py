@@ -12,6 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from semfov.detection.objects import box_text
 from semfov.errors import check
 from semfov.io.files import write_text
 from semfov.report.episode import Data
@@ -276,7 +277,7 @@ def _look(data: Data, number: int, place: str) -> str:
             f"{order}</text>"
         )
         tags.append(f'<g class="{kind}">{_rect(each["tag"], "tag")}{text}</g>')
-        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(each["place"])])
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", box_text(each["place"])])
     value = "none: the first look" if look["value"] is None else f"{look['value']:.2g}"
     where = {
         "Window": f"x {x1} to {x2}, y {y1} to {y2} ({x2 - x1} × {y2 - y1} px)",
@@ -296,7 +297,7 @@ def _look(data: Data, number: int, place: str) -> str:
     facts_html = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
     table = "<p>No detections.</p>"
     if len(rows) > 1:
-        table = table_html(rows, f"Detections of look {number}, with boxes (x1, y1, x2, y2) in picture pixels")
+        table = table_html(rows, f"Detections of look {number}, with boxes x1,y1–x2,y2 in picture pixels")
     left = look["count"] - len(look["detections"])
     label = f"The window of look {number} with {look['count']} detection{'s' if look['count'] != 1 else ''}"
     return (
@@ -320,7 +321,7 @@ def _objects(data: Data, place: str) -> str:
         cells = [escape(each["label"]), f"{each['score']:.2f}"]
         cells += [f"{each['pan']:z.0f}°, {each['tilt']:z.0f}°"] if data["turns"] else []
         cells += [str(each["look"]), *(["yes" if each["confirmed"] else "no"] if data["confirmable"] else [])]
-        cells.append(_corners(each["box"]))
+        cells.append(box_text(each["box"]))
         rows.append(
             f'<tr data-object="{order}" data-look="{each["look"]}"><th scope="row">'
             f'<button type="button" class="pick">{order}</button></th><td>{_crop(data, each, place)}</td>'
@@ -331,7 +332,7 @@ def _objects(data: Data, place: str) -> str:
         f'<th scope="col"><button type="button" class="sort">{head}</button></th>' if head else "<td></td>"
         for head in heads
     )
-    label = "Objects with boxes (x1, y1, x2, y2) in picture pixels and the sharpest look"
+    label = "Objects with boxes x1,y1–x2,y2 in picture pixels and the sharpest look"
     table = f"<thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody>"
     lower = ", ".join(str(order) for order, each in enumerate(data["listed_by_score"], 1) if each)
     why = f"<p>Less probable, listed by the score in the whole picture: {lower}.</p>" if lower else ""
@@ -359,10 +360,6 @@ def _left_out(count: int, what: str) -> str:
     if not count:
         return ""
     return f"<p>{count} less confident {what}{'s are' if count != 1 else ' is'} left out.</p>"
-
-
-def _corners(box: Sequence[float]) -> str:
-    return ", ".join(f"{n:.0f}" for n in box)
 
 
 def _image(uri: str, size: tuple[int, int], name: str) -> str:
