@@ -44,11 +44,15 @@ def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
 
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Bytes `(3, h, w)` resampled to a size `(h', w')` with the antialiased bilinear filter, `(1, 3, h', w')`."""
+    height, width = pixels.shape[1:]
     # torch takes twice as long where the rows of a window are not adjacent in memory.
-    canvas = pixels.permute(1, 2, 0).contiguous()[None].permute(0, 3, 1, 2)
-    if canvas.shape[-2] > size[0]:
-        # torch shortens rows first. Columns first takes two thirds of the time, because that step is the faster one.
-        canvas = F.interpolate(canvas, (size[0], canvas.shape[-1]), mode="bilinear", antialias=True)
+    canvas = pixels.permute(1, 2, 0).contiguous()
+    if height > size[0]:
+        # torch shortens rows first. Columns first takes half of the time: that step is the faster one, and still faster
+        # if four bytes are a pixel.
+        lines = canvas.view(1, height, -1, 3 if width % 4 else 4).permute(0, 3, 1, 2)
+        canvas = F.interpolate(lines, (size[0], lines.shape[-1]), mode="bilinear", antialias=True).permute(0, 2, 3, 1)
+    canvas = canvas.reshape(1, -1, width, 3).permute(0, 3, 1, 2)
     return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
 
 

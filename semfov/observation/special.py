@@ -37,7 +37,8 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
     above = x - c
     lift = above / (x + shift)
     if shift == 1:
-        whole, slopes = lift * (1 / c), _evaluate(_interpolated(c), lift)
+        slopes = _evaluate(_interpolated(c), lift)
+        whole = lift * (1 / c)
     else:
         rise, slope, series = _polynomials(c)
         rest = _evaluate(rise, lift) * lift
@@ -45,7 +46,7 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
         whole = torch.addcmul(rest, product, lift, value=shift / c)
         slopes = torch.addcdiv(_evaluate(series, lift), _evaluate(slope, lift), product, value=-1)
     # Near x = 0, where c/x dominates, rounding could make this the logarithm of 0.
-    whole = whole.clamp(min=torch.finfo(x.dtype).eps - 1).log1p()
+    whole = whole.clamp(min=torch.finfo(x.dtype).eps - 1).log1p_()
     value = torch.addcdiv(torch.addcmul(whole, slopes, lift), above, x, value=-1).add_(above)
     return value if c == 0.5 else value.add_((above / (c + shift)).log1p(), alpha=0.5 - c)
 
