@@ -131,16 +131,6 @@ class ModelFolder:
             )
         return FovealObservationModel.from_pretrained(file)
 
-    def semantic(self) -> Semantic:
-        """The observer that fuses scores of all classes; tempered and calibrated, if that was better when fitted."""
-        components = len(self.manifest.classes) + 1
-        if not self.used("tempering"):
-            return Semantic(components)
-        settings = self.manifest.parts["tempering"].settings
-        model = self._models.get("observation") if settings["scores"] == "calibrated" else None
-        assert model is None or isinstance(model, FovealObservationModel)
-        return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
-
     def arguments(self, *, detector: str | PathLike[str] | None = None, **options: Any) -> dict[str, Any]:
         """Arguments of `semfov.ActivePerception`, of the models that are used; takes the arguments of `load_detector`.
 
@@ -148,8 +138,17 @@ class ModelFolder:
         """
         eye, models, sensor = self.eye(detector=detector, **options), self._models, self.manifest.sensor
         evidence, learned = models.get("evidence"), models.get("map")
-        searching = Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()
-        explore: tuple[Observer, Policy] = Semantic(len(self.manifest.classes) + 1), Policy("random")
+        components = len(self.manifest.classes) + 1
+        searching: Observer = Semantic(components)
+        if isinstance(evidence, TargetEvidence):
+            searching = Target(evidence)
+        elif self.used("tempering"):  # and calibration, where they were better when fitted
+            settings = self.manifest.parts["tempering"].settings
+            model = models.get("observation") if settings["scores"] == "calibrated" else None
+            assert model is None or isinstance(model, FovealObservationModel)
+            footprint, tempering = settings["footprint"], settings["exponent"]
+            searching = Semantic(components, model, footprint=footprint, tempering=tempering)
+        explore: tuple[Observer, Policy] = Semantic(components), Policy("random")
         if isinstance(learned, MapEvidence):
             explore = LearnedMap(learned), Policy("closer-look", fovea=self._sensor.width(sensor) / sensor["reference"])
         return {

@@ -27,26 +27,18 @@ from semfov.zoom import GlimpseEvidence
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
-_FIT = "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
-
-_SHIPPED_SIGMA = 100.0
-"""Width σ of the fovea that learned models are shipped for, in pixels of an image whose longer side is 640."""
-
-_SHIPPED_GROWTHS = (1.0, 2.0)
-"""Growths of the fovea that learned models are shipped for."""
-
 
 def recommended_arguments(
     name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
 ) -> dict[str, Any]:
     """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
-    if growth not in _SHIPPED_GROWTHS:
-        growths = " and ".join(f"{value:g}" for value in _SHIPPED_GROWTHS)
-        raise InputError(f"growth: models are shipped for {growths}, got {growth}; {_FIT}")
-    if sigma != _SHIPPED_SIGMA:
-        raise InputError(
-            f"sigma: models are shipped for {_SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
-        )
+    fit = (
+        "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
+    )
+    if growth not in (1.0, 2.0):
+        raise InputError(f"growth: models are shipped for 1 and 2, got {growth}; {fit}")
+    if sigma != 100.0:
+        raise InputError(f"sigma: models are shipped for 100 pixels on an image of 640 pixels, got {sigma}; {fit}")
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(Foveation(sigma, growth=growth), detector)

@@ -140,15 +140,13 @@ class Episode(ABC, Generic[_Record]):
         check(size == first, "frame", expected, f"{size[0]} × {size[1]}")
 
 
-_BY = {"fovea": "a fovea", "windows": "windows", "head": "a head that turns"}
-
-
 def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
     """Raise `InputError` for arguments that suit another kind of look."""
+    by = {"fovea": "a fovea", "windows": "windows", "head": "a head that turns"}[kind]
     for name, value in arguments.items():
         if value is not None and kind != suits:
             raise InputError(
-                f"{name}: expected none for a picture that is looked at by {_BY[kind]}, got {value}; use {instead}, or "
+                f"{name}: expected none for a picture that is looked at by {by}, got {value}; use {instead}, or "
                 f"how={suits!r}"
             )
 

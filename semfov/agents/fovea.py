@@ -44,9 +44,6 @@ _WORTH = 0.1
 """Default least gain of a look in an exploration by a learned map: the expected increase in the number of correctly
 classified cells for which the exploration continues."""
 
-_MOST_SHIFTS = 10_000
-"""Largest number of gaze shifts that can be asked for."""
-
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
 _MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
 
@@ -410,9 +407,10 @@ class FoveaEpisode(Episode[Scanpath]):
 
 def _shifts(shifts: int | None, usual: int, limits: EpisodeLimits) -> int:
     """The largest number of gaze shifts: as given, else the usual one, or with a limit of passes none."""
+    most = 10_000
     if shifts is None:
-        shifts = usual if limits.passes is None else _MOST_SHIFTS
-    check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
+        shifts = usual if limits.passes is None else most
+    check_whole(shifts, "shifts", 0, most)
     return shifts
 
 

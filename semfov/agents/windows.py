@@ -18,12 +18,12 @@ from semfov.data.windowed import LargePicture
 from semfov.decision import Decision, check_thresholds
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector, loader_options
-from semfov.detection.objects import LEAST, Objects
+from semfov.detection.objects import LEAST
 from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath
 from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.blank import blank_cells, not_blank
+from semfov.zoom.blank import blank_cells
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, candidates, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions
@@ -31,7 +31,6 @@ from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects, without_replaced
 from semfov.zoom.slices import ranked, usual_slices
 
@@ -315,7 +314,7 @@ class WindowEpisode(Episode[ZoomPath]):
             belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
             self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
         elif self.evidence is None or (self._slicing and not self.searches):
-            order = ranked(not_blank(usual_slices(glances.lattice), glances.blank()), sought)
+            order = ranked(usual_slices(glances.lattice, glances.blank()), sought)
             self._turns = look_by_look(
                 glances,
                 order,
@@ -469,7 +468,17 @@ class WindowEpisode(Episode[ZoomPath]):
         closer = () if self._decisions is None else self._decisions.looks
         places = {look.number: place for place, look in enumerate(self._looks)}
         current = without_replaced(glances, lattice) if fading else glances
-        objects, unseen = self._objects(current, lattice, latest=fading)
+        sought, unseen = self.targets or self.target, None
+        if self.certainty is None:
+            objects = merge(current, sought)
+        else:
+            belief = None if self.searches else self.belief
+            # A belief about objects of any class says nothing about those of several.
+            remaining = (0.0, 0.0) if belief is None or self.targets else belief.remaining()
+            further = [look.value for look in self._looks[1:] if not look.closely and isfinite(look.value)]
+            objects, unseen = probable_objects(
+                current, lattice, sought, self.certainty, remaining=remaining, promised=sum(further), latest=fading
+            )
         return {
             "lattice": lattice,
             "classes": self.classes,
@@ -485,21 +494,6 @@ class WindowEpisode(Episode[ZoomPath]):
             "least": self.least,
             "closer": tuple(replace(look, number=places[look.number]) for look in closer if look.number in places),
         }
-
-    def _objects(
-        self, glances: Sequence[Glance], lattice: Lattice, *, latest: bool
-    ) -> tuple[Objects, tuple[float, float] | None]:
-        """The objects of some looks, and the number of those that no look has shown, with its variance."""
-        target = self.targets or self.target
-        if self.certainty is None:
-            return merge(glances, target), None
-        belief = None if self.searches else self.belief
-        # A belief about objects of any class says nothing about those of several.
-        remaining = (0.0, 0.0) if belief is None or self.targets else belief.remaining()
-        further = [look.value for look in self._looks[1:] if not look.closely and isfinite(look.value)]
-        return probable_objects(
-            glances, lattice, target, self.certainty, remaining=remaining, promised=sum(further), latest=latest
-        )
 
     @cached_property
     def _photograph(self) -> Tensor | None:

@@ -107,7 +107,7 @@ class Verifier(Generic[LookType]):
         self.verdicts = [
             old
             for old in self.verdicts
-            if self._recent(old)
+            if old.age <= self.places.forgetting.span
             or (old.look.cell != look.cell and float(box_iou(old.look.box[None], look.box[None])) < SAME)
         ]
         self.verdicts.append(_Verdict(look))
@@ -134,7 +134,7 @@ class Verifier(Generic[LookType]):
     @property
     def over(self) -> bool:
         """Whether no look of the search is worth a pass, or all closer looks were made."""
-        return self.places.left < self.thresholds.give_up or self._made >= self.most
+        return self.places.left < self.thresholds.give_up or len(self._recent) >= self.most
 
     def outcome(self) -> int:
         """Decide whether the search ends."""
@@ -161,35 +161,35 @@ class Verifier(Generic[LookType]):
     def presence(self) -> float:
         """Probability that the picture holds the target: after the closer looks, or that without them."""
         without = self.places.presence
-        recent = [each for each in self.verdicts if self._recent(each)]
-        if self.places.by_worth:
-            recent = sorted(recent, key=self._chance)[-1:]
+        recent = sorted(self._recent, key=self._chance)[-1:] if self.places.by_worth else self._recent
         return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
 
     @property
     def best(self) -> CloseUp:
         """The closer look with the largest probability of the place; there must be one."""
-        return max(zip(self._chances, self.looks, strict=True), key=lambda pair: pair[0])[1]
+        return max(self.verdicts, key=self._chance).look
 
     def _choose(self, *, last: bool) -> None:
         """Choose the place that is to be looked at closely."""
         self._last = last
-        recent = [chance for chance, each in zip(self._chances, self.verdicts, strict=True) if self._recent(each)]
-        sure = self._verified(recent, over=False) > 0
+        recent = self._recent
+        sure = self._verified([self._chance(each) for each in recent], over=False) > 0
         last = last or self.places.left < self.thresholds.give_up
-        self.candidate = None if self._made >= self.most or sure else self.places.due(self.thresholds.place, last=last)
+        enough = len(recent) >= self.most or sure
+        self.candidate = None if enough else self.places.due(self.thresholds.place, last=last)
 
     def _verified(self, chances: Sequence[float], *, over: bool) -> int:
         """The outcome by the probabilities of some places (`verified`)."""
         if self.places.by_worth and not over:
             return 0
-        outcome = verified(chances, self.presence, self.thresholds.confirm, over=over or self._made >= MOST_CLOSER)
+        enough = len(self._recent) >= MOST_CLOSER
+        outcome = verified(chances, self.presence, self.thresholds.confirm, over=over or enough)
         return outcome if over or OUTCOMES[outcome] == "found" else 0
 
     @property
-    def _made(self) -> int:
-        """Number of recent closer looks."""
-        return sum(self._recent(each) for each in self.verdicts)
+    def _recent(self) -> list[_Verdict]:
+        """The closer looks of which at least half of the evidence is left."""
+        return [verdict for verdict in self.verdicts if verdict.age <= self.places.forgetting.span]
 
     @property
     def _chances(self) -> list[float]:
@@ -202,10 +202,6 @@ class Verifier(Generic[LookType]):
         if keep**verdict.age == 1:
             return look.place
         return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
-
-    def _recent(self, verdict: _Verdict) -> bool:
-        """Whether at least half of the evidence of a closer look is left."""
-        return verdict.age <= self.places.forgetting.span
 
     def _faded(self, before: float, now: float, age: float) -> float:
         """A probability that fades towards that of the belief."""

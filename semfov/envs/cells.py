@@ -183,7 +183,9 @@ class CellGazes(Gazes):
             return Trace(grid, classes, cue, beside, steps=self._steps).scanpath()
 
     @torch.inference_mode()
-    def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+    def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+        """Start episodes in the rows `(n,)`, each with its first look."""
+        super().begin(rows, episodes)
         scenes = [episode.scene for episode in episodes]
         if self.searching:
             self.targets[rows] = torch.tensor([episode.cue for episode in episodes])

@@ -81,14 +81,12 @@ class Gazes(ABC):
         """Check the action of a single episode; returns a batch of one."""
 
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Start episodes in the rows `(n,)`, each with its first look."""
+        """Start episodes in the rows `(n,)`; a kind of gazes sets the targets, makes the first looks and rates them."""
         every = self._begun or len(rows) == len(self.episodes)
         check(every, "rows", f"all {len(self.episodes)} rows at the first start", rows.tolist())
         for row, episode in zip(rows.tolist(), episodes, strict=True):
             self.episodes[row] = episode
-        self.shift[rows] = 0
-        self._enter(rows, episodes)
-        self._begun = True
+        self.shift[rows], self._begun = 0, True
 
     def move(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Move the gaze of the rows `(n,)`, and look; reward, terminated and truncated, each `(n,)`."""
@@ -157,10 +155,6 @@ class Gazes(ABC):
     @abstractmethod
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the first episode, RGB `(H, W, 3)`."""
-
-    @abstractmethod
-    def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Set the targets, make the first looks of new episodes, and rate them."""
 
     @abstractmethod
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:

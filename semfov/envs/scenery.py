@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
@@ -134,15 +134,17 @@ class Scenery(_Surroundings):
 
 
 class _SceneLooking(PolicyLooking):
-    """Looks at the scenes of an environment."""
+    """Looks at the scenes of an environment, or at mosaics of them, with so many `tiles` in a row and a column."""
 
-    def __init__(self, config: RunConfig, task: Task, choose: Callable[[Callable[[], Scenes]], Scenes]) -> None:
-        self.task, self._choose = task, choose
+    def __init__(self, config: RunConfig, task: Task, scenes: _Source, mosaics: int, tiles: tuple[int, int]) -> None:
+        self.task, self._chosen, self._mosaics, self._tiles = task, scenes, mosaics, tiles
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
-        """The given scenes."""
-        return self._choose(super().open_scenes)
+        """The given scenes, or those of the settings."""
+        given, seed = self._chosen, self.config.data.scene_seed
+        scenes = super().open_scenes() if given is None or isinstance(given, str | Path) else given
+        return Mosaics(scenes, *self._tiles, count=self._mosaics, seed=seed) if self._mosaics else scenes
 
 
 def open_scenery(
@@ -222,24 +224,12 @@ def open_scenery(
             store=store,
         )
     check(isinstance(config, RunConfig), "config", "settings of an evaluation", type(config).__name__)
-    config = replace(config, policies=config.policies[:1])
-    size = config.data.scene_seed
-
-    def choose(named: Callable[[], Scenes]) -> Scenes:
-        chosen = named() if scenes is None or isinstance(scenes, str | Path) else scenes
-        if mosaics:
-            chosen = Mosaics(chosen, *tiles, count=mosaics, seed=size)
-        return chosen
-
-    looking = _SceneLooking(config, task, choose)
+    looking = _SceneLooking(replace(config, policies=config.policies[:1]), task, scenes, mosaics, tiles)
     classes, names = looking.scenes.classes, looking.eye.detector.classes
     check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
     scenery = Scenery(looking, targets)
     scenery.opened = partial(open_scenery, **arguments)
     return scenery
-
-
-_TRIES = 1000
 
 
 class ZoomScenery(_Surroundings):
@@ -278,7 +268,7 @@ class ZoomScenery(_Surroundings):
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
         """Draw a picture and a target."""
-        for _ in range(_TRIES):
+        for _ in range(1000):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
             if task != "search":
                 if not self.annotated or len(self.pictures.annotation(picture).boxes):

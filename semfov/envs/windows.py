@@ -117,7 +117,9 @@ class WindowGaze(Gazes):
         small = interpolate(image, size, mode="bilinear", antialias=True)[0]
         return render([plot_scanpath(self.looking.record(), small)])[0]
 
-    def _enter(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
+    def begin(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
+        """Start an episode with a look at the whole picture."""
+        super().begin(rows, episodes)
         (episode,) = episodes
         self.targets[rows] = episode.target
         self.glances = self.scenery.glances(episode.scene)

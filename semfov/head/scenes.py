@@ -27,12 +27,6 @@ FIELDS = (60.0,)
 _VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
 
-_PROPORTION = 0.1
-"""Width by height of a panorama may differ by this from 2."""
-
-_DEGREE = 640 / 60
-"""Default number of pixels of a flat picture per degree."""
-
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
     """Raise `InputError` unless fields of view are ascending angles below 180 degrees."""
@@ -215,7 +209,7 @@ class Panorama(Sphere):
         if not isinstance(image, tuple):
             pixels = as_image(image, color=color)
             width, height = image = pixels.shape[-1], pixels.shape[-2]
-            if abs(width / height - 2) > _PROPORTION:
+            if abs(width / height - 2) > 0.1:
                 warnings.warn(
                     f"image: expected a panorama of 360 by 180 degrees, which is twice as wide as high, got {width} × "
                     f"{height} px; its views are distorted, and how='head' turns a head in front of a flat picture",
@@ -244,16 +238,15 @@ class Plane(_Scene):
         self,
         picture: tuple[int, int],
         size: tuple[int, int],
-        *,
-        fields: tuple[float, ...] = FIELDS,
-        speeds: Speeds | None = None,
-        degree: float | None = None,
-        cell: float = 6.0,
+        fields: tuple[float, ...],
+        speeds: Speeds | None,
+        degree: float | None,
+        cell: float,
     ) -> None:
         self.fields = check_fields(fields)
         self.picture = width, height = picture
         if degree is None:
-            degree = min(_DEGREE, min(width, height * size[0] / size[1]) / max(fields))
+            degree = min(640 / 60, min(width, height * size[0] / size[1]) / max(fields))
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
         self.size, self.cell, self.degree = size, cell, degree
@@ -375,7 +368,7 @@ class Flat(Plane):
         if not isinstance(picture, tuple):
             self.opened = self._drawn = open_large(picture, color=color)
             picture = self.opened.size
-        super().__init__(picture, size, fields=fields, speeds=speeds, degree=degree, cell=cell)
+        super().__init__(picture, size, fields, speeds, degree, cell)
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """The content of the window, resampled to the size of a view."""

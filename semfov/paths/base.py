@@ -298,9 +298,7 @@ class Record(Conversion):
 
     @classmethod
     @abstractmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         """Make the other attributes from the tensors and JSON values of a file."""
 
 

@@ -35,9 +35,6 @@ _Table = Literal["looks", "objects"]
 COLUMNS = ("object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look")
 """Columns of the table of objects."""
 
-_PIXELS = "pixels of the picture: x to the right, y down"
-"""What the coordinates of a GeoJSON file are whose picture has no georeference."""
-
 _WORDS = {
     **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
     "box": "record.decision.box, or its objects, record.objects.boxes",
@@ -361,7 +358,9 @@ class Conversion(Outcome):
         names = "object", "class", "score", "confirmed", "look"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",
-            "coordinates": _PIXELS if place is None else "longitude and latitude, WGS 84",
+            "coordinates": "longitude and latitude, WGS 84"
+            if place is not None
+            else "pixels of the picture: x to the right, y down",
             "features": [
                 {
                     "type": "Feature",

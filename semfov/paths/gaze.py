@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 _REACH = 0.05
 """Distance, in longer sides of the picture, within which probability belongs to a peak."""
 
-_LONGEST = 100
-"""Largest number of fixations of a drawn scanpath."""
-
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
 
@@ -221,7 +218,7 @@ class GazePrediction:
         mean, spread = model.start.cpu().float()
         start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
         start = torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
-        most = min(_LONGEST, math.ceil(seconds * 1000 / 60) + 1)
+        most = min(100, math.ceil(seconds * 1000 / 60) + 1)  # fixations of a scanpath
         spans = model.duration.cpu().float()
         spans = torch.cat([spans, spans[-1:].expand(max(most - len(spans), 0), -1)])[:most]
         times = (spans[:, 0] + spans[:, 1] * torch.randn(people, most, generator=generator)).exp()

@@ -13,9 +13,6 @@ from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular
 
-_KEYS = 34735
-"""TIFF tag of the directory of GeoKeys, which every GeoTIFF has (OGC GeoTIFF 1.1, section 7.1.2)."""
-
 
 def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
     """The map from pixels of a GeoTIFF, or of another raster, to longitude and latitude; → `(N, 2)`."""
@@ -70,6 +67,6 @@ def _is_referenced(source: str) -> bool:
             tags = ImageFileDirectory_v2(head + file.read(8) if head[2:3] == b"+" or head[3:4] == b"+" else head)
             file.seek(tags.next)
             tags.load(file)
-            return _KEYS in tags
+            return 34735 in tags  # the directory of GeoKeys, which every GeoTIFF has (OGC GeoTIFF 1.1, section 7.1.2)
     except (OSError, SyntaxError, struct.error) as error:
         raise DataError(f"{source}: expected a readable TIFF, got: {error}") from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,9 +28,6 @@ from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region,
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
 from semfov.sensor.sphere import Boxes, panorama_directions
-
-_BORDER = 2.0
-"""A box this near to a border of its view, in pixels of the view, counts as cut by it."""
 
 _WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
     "panorama": (Panorama, ("picture", "size", "cell", "reach")),
@@ -119,7 +116,7 @@ class HeadPath(Record):
             boxes, field = detections.boxes[0], float(self.pose(number)[2])
             point = self.views.view_grid.centres[self.actions[number] % self.views.cells]
             distances.append(distances_to(boxes, point) * field / width)
-            border = boxes.new_tensor([_BORDER, _BORDER, width - _BORDER, height - _BORDER])
+            border = boxes.new_tensor([2.0, 2.0, width - 2.0, height - 2.0])  # a box this near to it counts as cut
             cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
         return merge_fixations([look.detections for look in self], distances, self.closer, cut=cut, around=self.around)
 
@@ -279,9 +276,7 @@ class HeadPath(Record):
         return tensors, {"world": _settings(views.world), **record}
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         settings = record["world"]
         made, names = _WORLDS[settings["kind"]]
         for name in names:

@@ -115,9 +115,7 @@ class _CellRecord(Record):
         return tensors, {**record, "seconds": [dict(each) for each in self.seconds]}
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         looks, seconds, decision = len(shared["detections"]), record["seconds"], shared["decision"]
         columns, rows = record["grid"]
         grid = Grid(columns, rows, tuple(record["size"]))
@@ -300,9 +298,7 @@ class Scanpath(_CellRecord):
         return tensors, record
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         made = super()._fields(tensors, record, shared)
         cells, most, values = len(made["grid"]), int(tensors["cells"].max()), tensors["values"].shape[-1]
         check(values == cells, "values", f"one for each of {cells} cells", values)
@@ -368,13 +364,7 @@ _FOVEA = Format(
         "probability": Field(("cells",), mixed=True, low=0, high=1 + 1e-3),
         "visited": Field(("cells",), dtype=torch.bool),
     },
-    {
-        "number": WHOLE,
-        **_GRID,
-        "cell": WHOLE,
-        "next_cell": WHOLE,
-        "seconds": Array(Object({}, Number(low=0)), 1),
-    },
+    {"number": WHOLE, **_GRID, "cell": WHOLE, "next_cell": WHOLE, "seconds": Array(Object({}, Number(low=0)), 1)},
 )
 """Format of the files of moments of a fovea."""
 
@@ -443,9 +433,7 @@ class FoveaMoment(_CellRecord, Moment):
         return [f"frame {self.number}, at (column, row): ({column}, {row})"]
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         check(len(shared["detections"]) == 1, "lengths", "one look", len(shared["detections"]))
         made = super()._fields(tensors, record, shared)
         cells, visited = len(made["grid"]), len(tensors["visited"])

@@ -269,9 +269,7 @@ class ZoomPath(Record):
         return tensors, {"lattice": lattice, "windows": windows, **numbers}
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
         boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
         objects = Objects(boxes, scores, labels, passes)
@@ -347,9 +345,7 @@ class WindowMoment(ZoomPath, Moment):
         return tensors, {**record, "number": self.number, "next_window": _window_values(self.next_window)}
 
     @classmethod
-    def _fields(
-        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         fields = super()._fields(tensors, record, shared)
         return {
             **fields,

@@ -1,7 +1,7 @@
 """The log-polar sensor: cortical images, whose receptors lie further apart with eccentricity, and their projections."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, exp, hypot, inf, log1p, log2, pi, sqrt
 from typing import Any
 
@@ -218,8 +218,7 @@ class LogPolar(Sensor):
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
-        own = self.retina
-        retina = _Retina(own.fovea, own.spacing, own.pooling, (across, down))
+        retina = replace(self.retina, scale=(across, down))
         return gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina
 
     def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:

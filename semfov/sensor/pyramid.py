@@ -1,7 +1,6 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Literal, get_args
 
 import torch
@@ -64,7 +63,10 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
 def _reduce(image: Tensor, convention: Convention) -> Tensor:
     """`pyrdown` without the checks."""
     if _runs_in_kornia(image, convention):
-        return _kornia().pyrdown(image.contiguous())
+        # Imported when first needed: Kornia takes a quarter of a second.
+        from kornia.geometry import transform
+
+        return transform.pyrdown(image.contiguous())
     wide = widened(image)
     height, width = image.shape[-2:]
     return separable(wide, *_reducing(height, width, convention, wide.dtype, image.device)).to(image.dtype)
@@ -101,7 +103,9 @@ def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "korni
 def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
     """`pyrup` without the checks."""
     if _runs_in_kornia(image, convention, size):
-        return _kornia().pyrup(image.contiguous())
+        from kornia.geometry import transform
+
+        return transform.pyrup(image.contiguous())
     before, after, wide = (image.shape[-2], image.shape[-1]), (size[0], size[1]), widened(image)
     return separable(wide, *_expanding(before, after, convention, wide.dtype, image.device)).to(image.dtype)
 
@@ -175,13 +179,6 @@ def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int]
     if channels == 1 or torch.are_deterministic_algorithms_enabled():
         return False
     return min(height, width) > 2 if size is None else min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
-
-
-def _kornia() -> ModuleType:
-    """Kornia's geometry, imported when first needed because the import takes a quarter of a second."""
-    import kornia.geometry.transform
-
-    return kornia.geometry.transform
 
 
 def _check(image: Tensor, convention: Convention, levels: int | None = None) -> None:

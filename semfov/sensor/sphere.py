@@ -158,14 +158,14 @@ class Regions(Boxes):
         low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
         return self.camera.directions(low + at * (high - low) - 0.5)
 
-    def panorama_boxes(self, size: tuple[int, int], count: int = 257) -> Tensor:
+    def panorama_boxes(self, size: tuple[int, int]) -> Tensor:
         """Compute the smallest boxes around the regions in an equirectangular panorama, `(M, 4)`.
 
-        The edges of a region are curves in the panorama; their extremes are taken among `count` points of each edge. A
+        The edges of a region are curves in the panorama; their extremes are taken among 257 points of each edge. A
         box that crosses the seam begins inside the panorama and ends beyond its right border. A box that holds a pole
         is as wide as the panorama.
         """
-        points = panorama_points(self.outlines(count), size)
+        points = panorama_points(self.outlines(257), size)
         x, y = points.unbind(-1)
         width = float(size[0])
         # Neighbouring points of an outline are less than half a turn apart.

@@ -5,10 +5,4 @@ from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
-__all__ = [
-    "GlimpseEvidence",
-    "Lattice",
-    "WindowEye",
-    "WindowView",
-    "merge",
-]
+__all__ = ["GlimpseEvidence", "Lattice", "WindowEye", "WindowView", "merge"]

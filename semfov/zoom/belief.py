@@ -38,10 +38,6 @@ def _extent(marked: NDArray[np.bool_]) -> _Box:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-_UNKNOWN = -4.0
-"""Log odds that are used where no earlier look gave any."""
-
-
 class _Table(NamedTuple):
     """The windows of a level that lie in a look; shape `(down, across)`, places `(down * across,)`."""
 
@@ -216,7 +212,7 @@ class _WindowOdds:
         coarsest = look.gist.level == 0
         for level, table in () if coarsest else look.tables.items():
             coarser = self._odds[level].take(table.places)
-            coarser[coarser == -np.inf] = _UNKNOWN
+            coarser[coarser == -np.inf] = -4.0  # where no earlier look gave any
             look.stale[table.rows] |= coarser != look.before[table.rows]
             look.before[table.rows] = coarser
         rows = look.stale.nonzero()[0]
@@ -239,9 +235,6 @@ class _WindowOdds:
 
 _SLIVER = 0.25
 """Share of a window: where less is not blank, little counts as little, and the edge of a scan takes no look."""
-
-_CLEAR = 0.1
-"""Number of objects from which on a cell clearly promises one."""
 
 
 class Rates(Protocol):
@@ -338,7 +331,7 @@ class ZoomBelief:
         self._odds: _WindowOdds | None = None
 
     @cached_property
-    def _there(self) -> Tensor:
+    def there(self) -> Tensor:
         """Share of each cell where there is something to see, asked for after the overview, `(rows, columns)`."""
         blank = self._blank()
         return torch.ones(self.lattice.rows, self.lattice.columns) if blank is None else 1 - blank.float()
@@ -346,7 +339,7 @@ class ZoomBelief:
     @cached_property
     def left(self) -> Tensor:
         """Share of each cell that is left to see, `(rows, columns)`."""
-        return self._there.clone()
+        return self.there.clone()
 
     @property
     def evidence(self) -> GlimpseEvidence:
@@ -432,7 +425,7 @@ class ZoomBelief:
         if not levels:
             return 0.0, 0.0
         expected = np.maximum.reduce([self.expected(level) for level in levels])
-        clear = float(expected[expected >= _CLEAR].sum())
+        clear = float(expected[expected >= 0.1].sum())  # of cells that clearly promise an object
         return clear, float(expected.sum()) - clear
 
     def expected(self, level: int, at: _Place = _EVERYWHERE) -> Cells:
@@ -451,15 +444,10 @@ class ZoomBelief:
     def unseen(self, level: int) -> Cells:
         """Share of each window of a level that no look has shown at that level or closer, `(down, across)`."""
         if level not in self._areas:
-            there, ones = self._there.numpy(), np.ones(self.lattice.span(level), np.float32)
+            there, ones = self.there.numpy(), np.ones(self.lattice.span(level), np.float32)
             whole = min(len(ones), self.lattice.rows) * min(len(ones), self.lattice.columns)
             self._areas[level] = _WindowSums(ones, there.shape, there.__getitem__).update().clip(_SLIVER * whole)
         return self._sum(level, 0) / self._areas[level]
-
-    @property
-    def left_share(self) -> float:
-        """Share of the picture that is left to see, of what is not blank."""
-        return float(self.left.sum() / self._there.sum().clamp(1))
 
     def _sum(self, level: int, octaves: int) -> Cells:
         """Sums over the windows of a level; → `(down, across)`."""

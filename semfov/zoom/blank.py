@@ -1,14 +1,11 @@
 """The ground of a picture where there is nothing to see: without data, or in the one colour of a blank border."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.windowed import LargePicture
-from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 
 _Spans = list[tuple[int, int]]
@@ -42,14 +39,6 @@ def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
     if picture.nothing is not None:
         blank |= _of_colour(pixels, picture.nothing, down, across)
     return torch.from_numpy(blank) if blank.any() else None
-
-
-def not_blank(windows: Sequence[Window], blank: Tensor | None) -> list[Window]:
-    """The windows that show more than blank cells; all of them where all are blank."""
-    if blank is None:
-        return [*windows]
-    seen = [each for each in windows if not blank[each.cells[1] : each.cells[3], each.cells[0] : each.cells[2]].all()]
-    return seen or [*windows]
 
 
 def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], down: _Spans, across: _Spans) -> NDArray[np.bool_]:

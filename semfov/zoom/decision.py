@@ -83,7 +83,8 @@ class SearchFacts:
         # Number of looks of the last level that are expected to show the target. Windows start at every cell: this is
         # the mean over all ways to lay them side by side.
         showing = float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
-        left = [math.log(showing + 1e-3) / 4, self.belief.left_share]
+        share = float(self.belief.left.sum() / self.belief.there.sum().clamp(1))
+        left = [math.log(showing + 1e-3) / 4, share]
         counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
         return torch.cat([hints, torch.tensor([*left, *counts])])
 

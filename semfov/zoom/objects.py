@@ -87,11 +87,7 @@ def merge(
 
 
 def merge_with_facts(
-    glances: Sequence[Glance],
-    lattice: Lattice,
-    target: int | Sequence[int] | None = None,
-    *,
-    latest: bool = False,
+    glances: Sequence[Glance], lattice: Lattice, target: int | Sequence[int] | None = None, *, latest: bool = False
 ) -> tuple[Objects, Tensor]:
     """Merge the detections of several looks as `merge` does, and list the facts about each object.
 

@@ -3,17 +3,12 @@
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from semfov.zoom.episode import Order
 from semfov.zoom.glances import Glance, Window, around
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
-
-_PART = 0.6
-"""Side of a slice of a photograph, in longer sides of the photograph."""
-
-_OVERLAP = 0.2
-"""Share of a slice by which neighbours overlap."""
 
 
 def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
@@ -28,17 +23,22 @@ def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
     return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
 
 
-def usual_slices(lattice: Lattice) -> list[Window]:
+def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
     """Slices as people cut them: half as long again as the canvas shows at the largest magnification.
 
     In a picture that is not four times as long as the canvas they have the largest magnification itself. A photograph
-    has four, each 0.6 as long as its longer side.
+    has four, each 0.6 as long as its longer side. Neighbours overlap by a fifth. Those that show `blank` cells
+    `(rows, columns)` alone are left out, unless all do.
     """
     if lattice.levels == 1:
-        side = max(1, round(_PART * max(lattice.size)))
+        side = max(1, round(0.6 * max(lattice.size)))
     else:
         side = round((1.5 if lattice.levels > 2 else 1.0) * min(lattice.canvas) / lattice.magnifications[-1])
-    return slices(lattice, side, max(1, int(side * (1 - _OVERLAP))))
+    windows = slices(lattice, side, max(1, int(side * (1 - 0.2))))
+    if blank is None:
+        return windows
+    shown = [blank[y1:y2, x1:x2] for x1, y1, x2, y2 in (each.cells for each in windows)]
+    return [each for each, part in zip(windows, shown, strict=True) if not part.all()] or windows
 
 
 def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:

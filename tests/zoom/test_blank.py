@@ -8,7 +8,7 @@ import torch
 from semfov.data.large import open_large
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.blank import blank_cells, not_blank
+from semfov.zoom.blank import blank_cells
 from semfov.zoom.slices import usual_slices
 from tests.data.test_large import pixels
 
@@ -65,13 +65,13 @@ def test_one_colour_inside_a_picture_is_something_unless_it_is_no_data(tmp_path)
 def test_slices_of_blank_ground_are_left_out():
     array, blank = scan()
     lattice = Lattice.over((900, 600), CANVAS)
-    seen = not_blank(usual_slices(lattice), blank_cells(open_large(array), lattice))
+    seen = usual_slices(lattice, blank_cells(open_large(array), lattice))
     assert 0 < len(seen) < len(usual_slices(lattice))
     for window in usual_slices(lattice):
         x1, y1, x2, y2 = map(int, window.within)
         assert (window in seen) or blank[y1 + 16 : y2 - 16, x1 + 16 : x2 - 16].all()
     nothing = torch.ones(lattice.rows, lattice.columns, dtype=torch.bool)
-    assert not_blank(usual_slices(lattice), nothing) == usual_slices(lattice)
+    assert usual_slices(lattice, nothing) == usual_slices(lattice)
 
 
 def test_what_is_left_to_see_of_a_window_is_of_what_is_not_blank():
@@ -80,7 +80,7 @@ def test_what_is_left_to_see_of_a_window_is_of_what_is_not_blank():
     lattice = Lattice.over((900, 600), CANVAS)
     cells = blank_cells(open_large(array), lattice)
     belief = ZoomBelief(lattice, GlimpseEvidence(3, 8), 1, lambda: cells)
-    assert belief.left_share == 1
+    assert torch.equal(belief.left, belief.there)
     for level in range(1, lattice.levels):
         span = lattice.span(level)
         unseen = belief.unseen(level)

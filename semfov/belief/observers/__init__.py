@@ -9,12 +9,4 @@ from semfov.belief.observers.learned_map import LearnedMap
 from semfov.belief.observers.semantic import CellMemory, Semantic
 from semfov.belief.observers.target import Target
 
-__all__ = [
-    "AnyOf",
-    "LearnedMap",
-    "Look",
-    "CellMemory",
-    "Observer",
-    "Semantic",
-    "Target",
-]
+__all__ = ["AnyOf", "LearnedMap", "Look", "CellMemory", "Observer", "Semantic", "Target"]

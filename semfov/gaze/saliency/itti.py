@@ -1,6 +1,5 @@
 """The saliency model of Itti, Koch and Niebur: centre-surround differences of colour, intensity and orientation."""
 
-from collections.abc import Sequence
 from math import pi
 
 import torch
@@ -38,7 +37,7 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 
 @constant
-def _gabor_kernels(orientations: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
     r"""Even and odd Gabor filters without response to a uniform image, as weights of a convolution `(2n, 1, 9, 9)`.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
@@ -50,19 +49,19 @@ def _gabor_kernels(orientations: tuple[float, ...], dtype: torch.dtype, device: 
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
     y, x = place[:, None], place[None, :]
     envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
-    angles = torch.tensor(list(orientations), dtype=torch.float64) * (pi / 180)
+    angles = torch.tensor(_ORIENTATIONS, dtype=torch.float64) * (pi / 180)
     wave = 2 * pi / _PERIOD * (x * angles.cos()[:, None, None] + y * angles.sin()[:, None, None])
     kernels = torch.stack([wave.cos(), -wave.sin()], 1).flatten(0, 1) * envelope
     kernels = kernels - kernels.mean((-2, -1), keepdim=True)
     return (kernels / kernels.abs().sum((-2, -1), keepdim=True)).to(device, dtype)[:, None]
 
 
-def _orientation_energy(intensity: Tensor, orientations: Sequence[float] = _ORIENTATIONS) -> Tensor:
+def _orientation_energy(intensity: Tensor) -> Tensor:
     """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
 
     Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
     """
-    kernels = _gabor_kernels(tuple(orientations), intensity.dtype, intensity.device)
+    kernels = _gabor_kernels(intensity.dtype, intensity.device)
     reach = _TAPS // 2
     answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels)
     return answers.abs().unflatten(1, (-1, 2)).sum(2)
