@@ -48,7 +48,14 @@ class Candidates:
         return self._mapped(Tensor.float) if coarse else self
 
     def to(self, device: torch.device) -> "Candidates":
-        """Move the boxes and scores to a device."""
+        """Move the boxes and scores to a device.
+
+        Args:
+            device: the device.
+
+        Returns:
+            The same where they are there, else copies.
+        """
         return self if self.boxes.device == device else self._mapped(lambda tensor: tensor.to(device))
 
     def take(self, image: int, index: Tensor) -> "Candidates":
