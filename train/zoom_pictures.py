@@ -50,7 +50,7 @@ class FitZoomConfig(FitMosaicsConfig):
 class PicturesFit(MosaicFit):
     """A fit on mosaics and on pictures of other kinds."""
 
-    composed = ("kinds", "each", "judged_each", *MosaicFit.composed)
+    composed = ("kinds", "each", "judged_each")
 
     def __init__(self, config: FitZoomConfig) -> None:
         super().__init__(config)

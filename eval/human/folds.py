@@ -36,12 +36,8 @@ class StudiedFold(Fold):
         only: int | None = None,
         judges: Groups | None = None,
     ) -> None:
-        super().__init__(groups, number, count, settings)
-        self._given, self._only, self._judges = maps, only, judges
-
-    @property
-    def judged(self) -> Sequence[Viewed]:
-        return super().judged if self._judges is None else self._judges()
+        super().__init__(groups, number, count, settings, judges)
+        self._given, self._only = maps, only
 
     @property
     def what(self) -> dict[str, object]:

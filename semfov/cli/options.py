@@ -9,7 +9,6 @@ from semfov.agents.picture import How
 from semfov.data.tone import White
 from semfov.errors import InputError
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
-from semfov.runs.workers import Where
 from semfov.sensor.named import SensorName
 
 Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
@@ -110,11 +109,6 @@ class PictureOptions(AgentOptions):
     looks: bool = False
     workers: Workers = 1
     scheduler: str | None = None
-
-    @property
-    def where(self) -> Where:
-        """Where several pictures are looked at."""
-        return self.workers if self.scheduler is None else self.scheduler
 
 
 @dataclass(frozen=True)

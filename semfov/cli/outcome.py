@@ -197,6 +197,7 @@ def picture_outcome(
     usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
     drawings = usual if options.draw is None else options.draw
     text = _outcome_text(record, source.name, seconds)
+    boxes = None if source.scene is None else source.scene.boxes
     episode = None
     kind = None if options.out is None else kind_of(options.out)
     row = _result_row(record, source.name, seconds, kind, source.file, truth)
@@ -204,8 +205,8 @@ def picture_outcome(
         name = Path(source.name).name
         # Others have no more pixels than the record keeps.
         shown = opened if record.how == "windows" else None
-        episode = record.page_data(shown, name=name, settings=settings, boxes=source.boxes)
-    figures = _draw_episode(record, source.boxes, drawings)
+        episode = record.page_data(shown, name=name, settings=settings, boxes=boxes)
+    figures = _draw_episode(record, boxes, drawings)
     files = {}
     if options.labels is not None:
         files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()

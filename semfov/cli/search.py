@@ -51,7 +51,7 @@ from semfov.report import write_page
 from semfov.report.page import page_path
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
-from semfov.runs.workers import run_tasks
+from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
 
 
@@ -295,7 +295,8 @@ def _outcomes(
     if not job.several:
         yield 0, job.outcome(0)
         return
-    left, where = [number for number in range(len(job.sources)) if number not in before], job.options.where
+    left, options = [number for number in range(len(job.sources)) if number not in before], job.options
+    where: Where = options.workers if options.scheduler is None else options.scheduler
     if left and where != 1 and (where is None or isinstance(where, int)):
         # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
         start = time.process_time()
@@ -317,10 +318,10 @@ def _outcomes(
 
 def _start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
     """A random first cell off the target of an embedded scene; None for other pictures."""
-    if source.scene is None or source.boxes is None:
+    if source.scene is None or source.scene.boxes is None:
         return None
     grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))
-    free = (~grid.footprint(source.boxes).any(0)).nonzero()[:, 0]
+    free = (~grid.footprint(source.scene.boxes).any(0)).nonzero()[:, 0]
     generator = torch.Generator().manual_seed(seed)
     return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
 
@@ -509,19 +510,15 @@ def _meant(options: SearchOptions, classes: Sequence[str]) -> dict[str, float]:
         return {classes[class_index(target, classes, "target") - 1]: 1.0}
     except InputError as error:
         if options.embeddings is None:
-            raise InputError(f"{error}{_other_ways(target, classes, str(error))}") from None
+            # What else a target that is no class can be.
+            way = "; a description needs --embeddings, a file of word vectors" * ("did you mean" not in str(error))
+            with suppress(InputError):
+                if len([class_index(name.strip(), classes) for name in target.split(",")]) > 1:
+                    way = "; a search is for one class, and `semfov find` takes several"
+            raise InputError(f"{error}{way}") from None
     vectors = WordVectors.read(options.embeddings, [target, *classes])
     weights = spread(target, classes, vectors)
     print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in weights.items())}")
     if vectors.missing:
         print(f"  words without a vector in {options.embeddings}: {', '.join(vectors.missing)}")
     return weights
-
-
-def _other_ways(target: str, classes: Sequence[str], refused: str) -> str:
-    """What else a target that is no class can be, after the message that refuses it."""
-    names = target.split(",")
-    with suppress(InputError):
-        if len([class_index(name.strip(), classes) for name in names]) > 1:
-            return "; a search is for one class, and `semfov find` takes several"
-    return "" if "did you mean" in refused else "; a description needs --embeddings, a file of word vectors"

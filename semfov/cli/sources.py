@@ -9,8 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from torch import Tensor
-
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import GazeOptions, PictureOptions, white_of
 from semfov.data.large import open_large, picture_size
@@ -27,11 +25,6 @@ class PictureSource(NamedTuple):
     scene: Picture | None = None
     place: Path = Path("embedded-scene")
     shown: Mapping[str, Any] = MappingProxyType({})
-
-    @property
-    def boxes(self) -> Tensor | None:
-        """True boxes of the target in an embedded scene."""
-        return None if self.scene is None else self.scene.boxes
 
     def opened(self, how: How) -> PictureLike:
         """The picture, with the values and bands that are to be shown, or for a head the scene that it is one of."""

@@ -189,19 +189,6 @@ def _detector_report(config: FitDetectorConfig, run: Looking, results: dict[str,
     return "\n".join(lines)
 
 
-def _next_commands(config: FitDetectorConfig, run: Looking) -> str:
-    """Return example commands that use the model folder."""
-    out = fspath(config.out)
-    target = max(_class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]
-    quoted = f'"{target}"' if " " in target else target
-    return "\n".join(
-        [
-            f"  semfov search PHOTO.jpg --target {quoted} --models {out}",
-            f"  semfov find PHOTOS --target {quoted} --models {out} --out found.csv",
-        ]
-    )
-
-
 def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = _with_classes(config.named())
@@ -249,7 +236,10 @@ def fit_folder(config: FitDetectorConfig) -> None:
     figures = [figure for fitted in results.values() for figure in fitted.figures]
     models = [fitted.part.file for fitted in results.values() if fitted.part.file]
     print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
-    print(f"\nnext:\n{_next_commands(config, run)}")
+    target = max(counts.items(), key=lambda pair: pair[1])[0]
+    target = f'"{target}"' if " " in target else target
+    options = f"--target {target} --models {fspath(config.out)}"
+    print(f"\nnext:\n  semfov search PHOTO.jpg {options}\n  semfov find PHOTOS {options} --out found.csv")
 
 
 def _fit_gaze(config: FitDetectorConfig) -> None:

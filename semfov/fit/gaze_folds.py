@@ -20,6 +20,9 @@ from semfov.runs.scene_run import digest_of
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
 
+_Groups = Callable[[], Sequence[Viewed]]
+"""Gives the pictures, by data set and size."""
+
 CENTRE = "centre bias"
 ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
 """Rows by the terms of their models, without and with the scanpath."""
@@ -41,18 +44,16 @@ class Fold:
     The pictures are looked at when they are needed.
     """
 
-    def __init__(self, groups: Callable[[], Sequence[Viewed]], number: int, count: int, settings: GazeFit) -> None:
+    def __init__(
+        self, groups: _Groups, number: int, count: int, settings: GazeFit, judges: _Groups | None = None
+    ) -> None:
         self._groups, self.number, self.count, self.settings = groups, number, count, settings
+        self._judges = judges or groups  # the same pictures, with the fixations that are predicted
 
     @property
     def groups(self) -> Sequence[Viewed]:
         """The pictures, by data set and size."""
         return self._groups()
-
-    @property
-    def judged(self) -> Sequence[Viewed]:
-        """The same pictures, with the fixations that are predicted."""
-        return self.groups
 
     @property
     def what(self) -> dict[str, object]:
@@ -92,7 +93,7 @@ class Fold:
     def scores(self, model: FixationDensity) -> Scores:
         """Scores on the held-out pictures with and without each term, and of the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, (_, some) in zip(self.groups, self.judged, self._split, strict=True):
+        for group, seen, (_, some) in zip(self.groups, self._judges(), self._split, strict=True):
             known = self.maps(model, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
             found = {CENTRE: score(bias, seen, flat_maps(group, some), some, conditional=False)[0]}

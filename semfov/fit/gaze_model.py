@@ -88,22 +88,18 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     return model, scored
 
 
-def _summary_of(metrics: Tensor, baseline: Tensor) -> Mapping[str, float]:
-    """Means over pictures of NSS, AUC and information gain over a baseline, `(P, 3)` each."""
-    gain = metrics[:, 2] - baseline[:, 2]
-    return {"NSS": float(metrics[:, 0].mean()), "AUC": float(metrics[:, 1].mean()), "gain": float(gain.mean())}
-
-
 def summaries(scored: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
-    """Means over the held-out pictures, by number of the data set and row."""
-    return {
-        str(source + 1): {
-            row: {**_summary_of(scored[row, source], scored[CENTRE, source]), "pictures": len(scored[row, source])}
-            for row in (CENTRE, *ROWS[False], *ROWS[True])
-            if (row, source) in scored
-        }
-        for source in sorted({source for _, source in scored})
-    }
+    """Means over the held-out pictures, by number of the data set and row, of NSS, AUC and information gain."""
+    found: dict[str, dict[str, Mapping[str, float]]] = {}
+    for source in sorted({source for _, source in scored}):
+        rows = found[str(source + 1)] = {}
+        for row in (CENTRE, *ROWS[False], *ROWS[True]):
+            if (row, source) in scored:
+                metrics = scored[row, source]
+                gain = float((metrics[:, 2] - scored[CENTRE, source][:, 2]).mean())
+                means = {"NSS": float(metrics[:, 0].mean()), "AUC": float(metrics[:, 1].mean()), "gain": gain}
+                rows[row] = {**means, "pictures": len(metrics)}
+    return found
 
 
 def gaze_report(scored: Scores) -> str:

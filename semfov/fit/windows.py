@@ -291,8 +291,8 @@ class MosaicFit:
 
     kinds: tuple[str, ...] = ()
     """Kinds of pictures to fit on beside the mosaics."""
-    composed: tuple[str, ...] = ("tile", "seed")
-    """Settings that all pictures depend on."""
+    composed: tuple[str, ...] = ()
+    """Settings of these pictures, on which all parts but the survey depend."""
 
     def __init__(self, config: FitMosaicsConfig, eye: WindowEye | None = None) -> None:
         if eye is None:
@@ -430,4 +430,6 @@ class MosaicFit:
 
     def note(self, model: GlimpseEvidence, part: str) -> None:
         """Note in the model the settings that a part depends on."""
-        model.metadata[part] = {name: getattr(self.config, name) for name in (*_DEPENDS_ON[part], *self.composed)}
+        composed = () if part == "survey" else self.composed
+        names = (*_DEPENDS_ON[part], *composed, "tile", "seed")
+        model.metadata[part] = {name: getattr(self.config, name) for name in names}

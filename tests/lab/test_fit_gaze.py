@@ -20,7 +20,7 @@ from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
 from semfov.fit.gaze_folds import CENTRE, FoldStore, _folds
-from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, _summary_of
+from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, summaries
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
     MapSource,
@@ -57,6 +57,11 @@ def people(seed, place, count=6):
     return [Fixations(f"{seed}.png", str(number), each, (80, 60), times) for number, each in enumerate(points)]
 
 
+def summary_of(metrics, baseline):
+    """Means of the scores of one model over pictures, and its gain over a baseline."""
+    return summaries({("all terms", 0): metrics, (CENTRE, 0): baseline})["1"]["all terms"]
+
+
 def viewed(shown):
     """Pictures `(image, people)` as the fit has them."""
     source = features_of(Shown("colours", ("none",), (80, 60), stride=4).eval())
@@ -79,11 +84,11 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)
     (baseline,) = score(base, group, [torch.zeros_like(each) for each in maps], held, conditional=False)
-    scores = _summary_of(score(model, group, maps, held, conditional=False)[0], baseline)
+    scores = summary_of(score(model, group, maps, held, conditional=False)[0], baseline)
     assert scores["gain"] > 1.5
     assert scores["NSS"] > 3
     fit_oculomotor(model, [group], [maps_of(model, group, fitted)], [fitted], fit, rate=0.1)
-    after = _summary_of(score(model, group, maps, held, conditional=True)[0], baseline)
+    after = summary_of(score(model, group, maps, held, conditional=True)[0], baseline)
     assert after["gain"] > scores["gain"] - 0.05
     _describe_viewing(model, [group])
     assert float(model.duration[0, 0]) == pytest.approx(math.log(200), abs=1e-5)
@@ -145,7 +150,7 @@ def test_people_are_predicted_by_the_others(group):
     fit = GazeFit(saccade_epochs=1)
     fold = StudiedFold(lambda: [group], 0, 4, fit, maps="other people")
     scored = fold.scores(fold.fit())
-    assert _summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
+    assert summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
     alone = viewed_by(group, {"0"})
     assert float(others_of(alone, 5, torch.zeros(39, 52)).std()) < 1e-6
 
