@@ -23,6 +23,7 @@ from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST
 from semfov.episode import Stopwatch
 from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
@@ -30,7 +31,6 @@ from semfov.runs.scene_run import SceneRun
 from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.window_looking import (
-    LEAST_CONFIDENCE,
     TileSize,
     WindowLooking,
     WindowLookingConfig,
@@ -257,7 +257,7 @@ class ZoomRun(WindowLooking, SceneRun):
     def _first_hits(self, index: int, glances: Glances) -> list[ResultRecord]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, glances.lattice)
-        presence = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST_CONFIDENCE
+        presence = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST
         closest = min(window.level for window in cut)
         limit = len(cut) + 1
         records: list[ResultRecord] = []
@@ -277,7 +277,7 @@ class ZoomRun(WindowLooking, SceneRun):
                 passes, hit = 0, False
                 for glance in (turn.glance for turn in islice(turns, limit)):
                     passes += 1
-                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= LEAST_CONFIDENCE
+                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= LEAST
                     if hit:
                         break
                 records.append(

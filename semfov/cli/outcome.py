@@ -147,12 +147,7 @@ class PictureOutcome:
 
 
 def _result_row(
-    record: Record,
-    name: str,
-    seconds: float,
-    kind: str | None,
-    file: Path | None = None,
-    truth: Truth | None = None,
+    record: Record, name: str, seconds: float, kind: str | None, file: Path | None = None, truth: Truth | None = None
 ) -> dict[str, Any]:
     """Make the entry of a picture in a file of results."""
     picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}

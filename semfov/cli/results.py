@@ -55,25 +55,18 @@ class ResultsFile:
     def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO, truth: Truth | None = None) -> None:
         self.path, self.kind, self.searched, self.truth = path, kind, searched, truth
         self._rows: dict[int, dict[str, Any]] = {}
-        self._skipped: dict[int, dict[str, str]] = {}
         self._due = 0.0
         self._stream = stream if path == STDOUT else None
         if kind == ".jsonl" and self._stream is None:
             write_text(path, "")
 
     def add(self, number: int, row: dict[str, Any]) -> None:
-        """Add a picture."""
+        """Add a picture, or one that could not be read, with its `error`."""
         self._rows[number] = row
         if self.kind == ".jsonl":
             self._line(row["picture"])
         elif time.monotonic() >= self._due:
             self.write()
-
-    def skip(self, number: int, name: str, reason: str) -> None:
-        """Add a picture that could not be read, and the reason."""
-        self._skipped[number] = {"picture": name, "error": reason}
-        if self.kind == ".jsonl":
-            self._line(self._skipped[number])
 
     def write(self) -> None:
         """Write the file, atomically."""
@@ -87,7 +80,7 @@ class ResultsFile:
     def precision(self) -> str:
         """AP and AP50 of the objects against the annotations, in words."""
         assert self.truth is not None
-        rows = [*self._rows.values()]
+        rows = [row for row in self._rows.values() if "error" not in row["picture"]]
         categories = {each["id"] for row in rows for each in row["categories"]}
         results, images = [part for row in rows for part in row["parts"]], [row["image_id"] for row in rows]
         ap, ap50 = self.truth.precision(results, images, [*categories])
@@ -104,11 +97,10 @@ class ResultsFile:
             file.write(line)
 
     def _text(self) -> str:
-        rows = [self._rows[number] for number in sorted(self._rows)]
+        every = [self._rows[number] for number in sorted(self._rows)]
+        rows, skipped = ([row for row in every if ("error" in row["picture"]) == wrong] for wrong in (False, True))
         pictures = [row["picture"] for row in rows]
-        whole: dict[str, Any] = {
-            "pictures": pictures, "skipped": [self._skipped[number] for number in sorted(self._skipped)]
-        }  # fmt: skip
+        whole: dict[str, Any] = {"pictures": pictures, "skipped": [row["picture"] for row in skipped]}
         if self.kind == ".csv":
             table = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
             turned = ("pan", "tilt") if any("pan" in row for row in table) else ()

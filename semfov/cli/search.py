@@ -210,7 +210,7 @@ class _PictureFiles:
         """Note a picture that could not be read, and the reason."""
         self.rows[number] = {"picture": self.job.sources[number].name, "error": reason}
         if self.results is not None:
-            self.results.skip(number, self.rows[number]["picture"], reason)
+            self.results.add(number, {"picture": self.rows[number]})
 
     def finish(self, *, complete: bool) -> None:
         """Write the results and the page of all pictures so far, and list what was written."""

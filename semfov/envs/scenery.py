@@ -21,6 +21,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.pictures import Pictures
 from semfov.data.scene import Annotation, Scenes
 from semfov.data.sources import PHOTOGRAPHS
+from semfov.detection.objects import LEAST
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_whole
 from semfov.gaze.acquisition.base import Task
@@ -37,7 +38,7 @@ from semfov.runs.config import (
 from semfov.runs.exploration_protocol import explorations_of
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.search_protocol import Trial, episodes_of
-from semfov.runs.window_looking import LEAST_CONFIDENCE, WindowLooking, WindowLookingConfig, found_in
+from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
 from semfov.zoom.glances import Glance, overview
 from semfov.zoom.lattice import Lattice
@@ -282,7 +283,7 @@ class ZoomScenery(_Surroundings):
     def found(self, looks: Sequence[Glance], scene: int, target: int) -> bool:
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
-            return any(float(glance.show[target - 1]) >= LEAST_CONFIDENCE for glance in looks)
+            return any(float(glance.show[target - 1]) >= LEAST for glance in looks)
         every = self.pictures.annotation(scene)
         there = every.labels == target
         objects = Annotation(every.boxes[there], every.labels[there], every.crowd[there], every.size)
@@ -291,7 +292,7 @@ class ZoomScenery(_Surroundings):
     def share(self, looks: Sequence[Glance], scene: int) -> float:
         """Fraction of the objects that looks have found."""
         if not self.annotated:
-            return float(len(merge(looks, None, score=LEAST_CONFIDENCE)))
+            return float(len(merge(looks, None, score=LEAST)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
 

@@ -280,26 +280,17 @@ def choose_thresholds(config: Any, anywhere: Tensor, place: Tensor, left: Tensor
 
 def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
     """Report the evaluation and the thresholds as Markdown."""
-    head = [
-        "looks",
-        "gaze on target, %",
-        "NLL of cells",
-        "ECE of cells",
-        "ECE, fixated",
-        "area under ROC",
-        "ECE, presence",
-    ]
-    rows = [
-        [
-            str(int(row["looks"])),
-            f"{100 * row['found']:.1f}",
-            *(
-                f"{row[name]:.4f}"
-                for name in ("cells_nll", "cells_ece", "visited_ece", "presence_area", "presence_ece")
-            ),
-        ]
-        for row in judged
-    ]
+    measures = {
+        "NLL of cells": "cells_nll",
+        "ECE of cells": "cells_ece",
+        "ECE, fixated": "visited_ece",
+        "area under ROC": "presence_area",
+        "ECE, presence": "presence_ece",
+    }
+    rows = [["looks", "gaze on target, %", *measures]]
+    for row in judged:
+        figures = (f"{row[name]:.4f}" for name in measures.values())
+        rows.append([str(int(row["looks"])), f"{100 * row['found']:.1f}", *figures])
     return "\n".join(
         [
             f"Trained on {trained} pairs of photograph and class, and evaluated on {held_out} pairs from held-out "
@@ -308,7 +299,7 @@ def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, tra
             "error (ECE) of the probability of the target in each cell; the ECE for fixated cells alone; and how well "
             "the probability of presence separates present from absent classes.",
             "",
-            *table([head, *rows]),
+            *table(rows),
             "",
             f"Thresholds: the target counts as found if the probability of its presence is at least "
             f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "

@@ -249,26 +249,19 @@ def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
 
 def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
     """Report the evaluation as Markdown."""
-    head = [
-        "looks",
-        "cells right, %",
-        "with objects, %",
-        "without background, %",
-        "NLL",
-        "ECE",
-        "ECE, background",
-        "expected gain, cells",
-        "gain, cells",
-    ]
-    rows = [
-        [
-            str(int(row["looks"])),
-            *(f"{100 * row[name]:.1f}" for name in ("all", "objects", "objects_without_background")),
-            *(f"{row[name]:.4f}" for name in ("nll", "ece", "ece_background")),
-            *(f"{row[name]:.2f}" for name in ("expected", "brought")),
-        ]
-        for row in judged
-    ]
+    shares = {
+        "cells right, %": "all",
+        "with objects, %": "objects",
+        "without background, %": "objects_without_background",
+    }
+    measures = {"NLL": "nll", "ECE": "ece", "ECE, background": "ece_background"}
+    gains = {"expected gain, cells": "expected", "gain, cells": "brought"}
+    rows = [["looks", *shares, *measures, *gains]]
+    for row in judged:
+        figures = [f"{100 * row[name]:.1f}" for name in shares.values()]
+        figures += [f"{row[name]:.4f}" for name in measures.values()]
+        figures += [f"{row[name]:.2f}" for name in gains.values()]
+        rows.append([str(int(row["looks"])), *figures])
     return "\n".join(
         [
             f"Trained on {trained} photographs and evaluated on {held_out} held-out photographs, in explorations with "
@@ -278,7 +271,7 @@ def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> 
             "(ECE) of the probabilities of the example's classes and of background. The last two columns show how many "
             "more cells were expected to be right after the last look, and how many more were right.",
             "",
-            *table([head, *rows]),
+            *table(rows),
             "",
         ]
     )
@@ -301,13 +294,7 @@ def _explore_curves(
         for name, way in ways.items():
             with torch.inference_mode():
                 progress = run_explorations(
-                    episodes,
-                    way,
-                    looks,
-                    answers,
-                    noise,
-                    shifts=protocol.shifts,
-                    batch=protocol.batch,
+                    episodes, way, looks, answers, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             rates = [np.asarray(counts["right"]) / cells for _, counts in progress]
             curves["objects"][name].append(np.mean(rates, axis=0))

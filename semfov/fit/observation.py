@@ -44,11 +44,7 @@ def level_edges(sensor: SensorConfig, levels: int = 8, width: float = 50.0) -> l
 
 
 def fit_published(
-    eye: Eye | WindowEye,
-    scenes: Scenes,
-    statistics: DirichletStatistics,
-    edges: Sequence[float],
-    **options: Any,
+    eye: Eye | WindowEye, scenes: Scenes, statistics: DirichletStatistics, edges: Sequence[float], **options: Any
 ) -> FovealObservationModel:
     """Fit Dirichlet distributions to the scores of each class and level (`FovealObservationModel.fit`).
 

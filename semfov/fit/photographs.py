@@ -13,13 +13,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import (
-    choose_confirm,
-    examine,
-    fit,
-    verification_report,
-    verify,
-)
+from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
 from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread, left_out, logistic_regression
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track

@@ -24,13 +24,7 @@ from semfov.fit.descent import descend
 from semfov.fit.evidence import choose_thresholds
 from semfov.fit.outputs import training_of
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import (
-    choose_confirm,
-    examine,
-    fit,
-    verification_report,
-    verify,
-)
+from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
 from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_evidence import (
     SurveyExample,

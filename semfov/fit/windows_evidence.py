@@ -41,20 +41,22 @@ class ZoomExample(NamedTuple):
     least: float = LEAST
 
 
-def _closer_windows(
-    example: ZoomExample, looked_at: _WindowResult
-) -> Iterator[tuple[_WindowResult, int, tuple[int, ...]]]:
-    """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them."""
-    look = looked_at.gist
-    assert look is not None
-    high, wide = look.scores.shape[:2]
-    for closer in example.looks:
+_Cells = tuple[int, int, int, int]
+"""First column and row, and those after the last."""
+
+
+def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _WindowResult, int, _Cells]]:
+    """The closer looks of a mosaic inside a look, by number, as far as it predicts them, and its cells that they show.
+
+    An overview predicts all: their windows may reach beyond the picture.
+    """
+    high, wide = (n * look.scale for n in look.scores.shape[:2])
+    for place, closer in enumerate(example.looks):
         steps = closer.window.level - look.level
-        corners = zip(closer.window.cells, look.first * 2, strict=True)
-        x1, y1, x2, y2 = ((cell - first) // look.scale for cell, first in corners)
+        x1, y1, x2, y2 = (cell - first for cell, first in zip(closer.window.cells, look.first * 2, strict=True))
         inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-        if closer.window.within is None and 1 <= steps <= STEPS and (inside or look.level == 0):
-            yield closer, steps, (x1, y1, x2, y2)
+        if 1 <= steps <= STEPS and (inside or look.level == 0):
+            yield place, closer, steps, (x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale))
 
 
 def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
@@ -100,24 +102,13 @@ def pair_windows(examples: list[ZoomExample]) -> Windows:
     rows: list[tuple[Tensor, Tensor, int, Tensor, int, bool, int]] = []
     for number, example in enumerate(examples):
         first: dict[int, int] = {}
-        for looked_at in example.looks:
-            look = looked_at.gist
-            if look is None:
-                continue
-            high, wide = (n * look.scale for n in look.scores.shape[:2])
-            for place, closer in enumerate(example.looks):
-                steps = closer.window.level - look.level
-                x1, y1, x2, y2 = closer.window.cells
-                x1, y1, x2, y2 = x1 - look.first[0], y1 - look.first[1], x2 - look.first[0], y2 - look.first[1]
-                inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-                if not 1 <= steps <= STEPS or not (inside or look.level == 0):
-                    continue
-                box = x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale)
+        for look in (each.gist for each in example.looks if each.gist is not None):
+            for place, closer, steps, box in _closer_windows(example, look):
                 pooled, summary = pool(look.scores, box)
                 before = -1 if look.level == 0 else first.get(place, -1)
                 if look.level == 0:
                     first[place] = len(rows)
-                if look.level > 0 and before < 0:
+                elif before < 0:
                     continue
                 slot = closer.window.within is not None
                 rows.append((pooled, summary, steps, closer.show >= example.least, before, slot, number))
@@ -185,13 +176,13 @@ def _rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     overview, *others = looks
     assert overview.gist is not None
     logs = model.rates(overview.gist, targets)
-    losses = [_likelihood_loss(model, example, overview, logs, targets, overview.found)]
+    losses = [_likelihood_loss(model, example, overview.gist, logs, targets, overview.found)]
     for closer in random.sample(others, min(2, len(others))):
         assert closer.gist is not None
         before = _rates_before(overview.gist, logs.detach(), closer.gist)
         earlier = overview.found | closer.found
         closer_logs = model.rates(closer.gist, targets, before)
-        losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, earlier))
+        losses.append(_likelihood_loss(model, example, closer.gist, closer_logs, targets, earlier))
     return torch.stack(losses).mean()
 
 
@@ -213,7 +204,7 @@ def _rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
 def _likelihood_loss(
     model: GlimpseEvidence,
     example: ZoomExample,
-    looked_at: _WindowResult,
+    look: Gist,
     logs: Tensor,
     targets: Tensor,
     earlier: Tensor,
@@ -221,7 +212,9 @@ def _likelihood_loss(
     """Compute the mean negative log likelihood over the closer windows inside a look."""
     rates = logs.exp()
     terms = []
-    for closer, steps, (x1, y1, x2, y2) in _closer_windows(example, looked_at):
+    for _, closer, steps, (x1, y1, x2, y2) in _closer_windows(example, look):
+        if closer.window.within is not None:  # only windows of the lattice
+            continue
         weight = model.taper(x2 - x1)
         part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
         expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
@@ -241,9 +234,10 @@ class _LookCounts(NamedTuple):
     def of(cls, example: ZoomExample, looked: _WindowResult, earlier: Tensor) -> "_LookCounts":
         """Compare a look with all closer looks inside it; earlier `(M,)`."""
         by_size = defaultdict(list)
-        for closer, steps, (x1, y1, x2, _) in _closer_windows(example, looked):
-            by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
         assert looked.gist is not None
+        for _, closer, steps, (x1, y1, x2, _) in _closer_windows(example, looked.gist):
+            if closer.window.within is None:
+                by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
         counts = {key: torch.tensor(rows).unbind(-1) for key, rows in by_size.items()}
         return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
 

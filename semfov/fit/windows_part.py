@@ -16,9 +16,7 @@ from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
 from semfov.fit.windows import MosaicFit
-from semfov.fit.windows_evidence import (
-    judge_windows,
-)
+from semfov.fit.windows_evidence import judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.manifest import Part
 from semfov.metrics.episodes import FloatArray

@@ -17,12 +17,7 @@ from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 TARGET_EVIDENCE = "target-evidence"
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-_WORDS = {
-    "scores": Scores,
-    "footprint": Footprint,
-    "memory": CellMemory,
-    "saliency": SaliencyModel,
-}
+_WORDS = {"scores": Scores, "footprint": Footprint, "memory": CellMemory, "saliency": SaliencyModel}
 """Settings with a fixed set of values."""
 
 _ALIASES = ("recommended", "published")

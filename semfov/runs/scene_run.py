@@ -94,13 +94,7 @@ def finish(run: SceneRun, title: str) -> None:
             older,
         )
     done = run_tasks(
-        _outcomes_of,
-        todo,
-        where=run.config.where,
-        make=type(run),
-        settings=(run.config,),
-        title=title,
-        unit="scene",
+        _outcomes_of, todo, where=run.config.where, make=type(run), settings=(run.config,), title=title, unit="scene"
     )
     try:
         with closing(done):

@@ -35,12 +35,7 @@ _Outcome = tuple[list[int], int]
 
 
 def episodes_of(
-    scenes: Scenes,
-    index: int,
-    columns: int,
-    rows: int,
-    protocol: ProtocolConfig,
-    targets: Sequence[int] | None = None,
+    scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig, targets: Sequence[int] | None = None
 ) -> list[Trial]:
     """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
 
@@ -142,13 +137,7 @@ def tie_noise(scenes: Scenes, episode: Trial, cells: int, protocol: ProtocolConf
 
 
 def run_episodes(
-    episodes: Sequence[Trial],
-    strategy: Strategy,
-    looks: StoredLooks,
-    noise: Tensor,
-    *,
-    shifts: int,
-    batch: int,
+    episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, *, shifts: int, batch: int
 ) -> list[_Outcome]:
     """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
 

@@ -25,9 +25,6 @@ from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.objects import merge
 
-LEAST_CONFIDENCE = 0.3
-"""Smallest score with which a look confirms a class."""
-
 TileSize = Annotated[int, Range(16, 16_384)]
 """Side of a part of a picture in pixels."""
 
