@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Uniform
@@ -120,10 +120,11 @@ def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -
 def _make_strategy(
     policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: _Models, fovea: float
 ) -> Strategy:
-    """Build the observer and the policy that settings describe, with the models that they need (`_load_models`)."""
+    """Build the observer and the policy that settings describe."""
     if policy.policy == TARGET_EVIDENCE:
-        assert models.evidence is not None
-        return Strategy(Target(models.evidence), Policy("non-predictive"))
+        return Strategy(
+            Target(_required(models.evidence, "policy", "learned target evidence")), Policy("non-predictive")
+        )
     calibrated = policy.scores == "calibrated"
     function = FUNCTIONS[policy.policy]
     model = models.map if function.needs_map else models.observation
@@ -131,14 +132,19 @@ def _make_strategy(
     own = {name: common[name] for name in common.keys() & function.takes}
     chosen = Policy(function, model, samples=policy.samples, calibrated=calibrated, **own)
     if _by_evidence(policy, task):
-        assert models.evidence is not None
-        return Strategy(Target(models.evidence), chosen)
+        return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
-        assert models.map is not None
-        return Strategy(LearnedMap(models.map), chosen)
+        return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
     names = ("footprint", "tempering", "memory", "misses")
     common_or_own = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in names}
-    common_or_own["misses"] = models.observation if common_or_own["misses"] else None
-    observation = models.observation if calibrated else None
+    if common_or_own.pop("misses"):
+        common_or_own["misses"] = _required(models.observation, "misses", "an observation model")
+    observation = _required(models.observation, "scores", "an observation model") if calibrated else None
     observer = Semantic(components, observation, prior=belief.prior, fusion=belief.fusion, **common_or_own)
     return Strategy(observer, chosen)
+
+
+def _required(model: _T | None, argument: str, expected: str) -> _T:
+    if model is None:
+        raise InputError(f"{argument}: expected {expected}, got none")
+    return model
