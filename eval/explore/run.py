@@ -23,10 +23,10 @@ from semfov.runs.exploration_protocol import (
     Exploration,
     counts_of,
     explorations_of,
-    explore_noise,
     run_explorations,
 )
 from semfov.runs.results import ResultRecord
+from semfov.runs.seeds import noise_for
 
 FUSED, PAINTED = "one unfoveated pass, fused", "one unfoveated pass, boxes"
 
@@ -104,8 +104,8 @@ class ExploreRun(ComparedLooking):
             return records, watch.seconds
         looks = StoredLooks(self.detections(index), grid)
         watch.lap("look")
-        episodes = explorations_of(self.scenes, index, len(grid), protocol)
-        noise = torch.stack([explore_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
+        episodes, scene = explorations_of(self.scenes, index, len(grid), protocol), self.scenes.ids[index]
+        noise = torch.stack([noise_for(protocol, len(grid), scene, None, each.repetition) for each in episodes])
         for name in self.policies:
             candidate = self.candidate(name, index)
             watch.lap("saliency")

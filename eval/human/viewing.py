@@ -26,7 +26,7 @@ from semfov.detection.load import load_detector
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
 from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
@@ -94,14 +94,14 @@ def compare_viewing(config: ViewingConfig) -> None:
         groups, store = cache(partial(look, config, opened)), FoldStore(config.out, {**opened.what, "data": data})
         own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
         folds = [Fold(groups, number, config.folds, own) for number in numbers]
-        rows[name] = joined([store.scores(name, fold) for fold in _bar(folds, name)])
+        rows[name] = store.scores(name, _bar(folds, name))
         if name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
             alone = replace(fit, saccade_epochs=0)
             if len(config.fixations) > 1:
                 lone = [StudiedFold(groups, number, config.folds, alone, only=0) for number in numbers]
-                scores = [store.scores(f"{name} first data set", fold) for fold in _bar(lone, "first data set")]
-                splits[f"{name}: the first data set alone"] = joined(scores)
+                scores = store.scores(f"{name} first data set", _bar(lone, "first data set"))
+                splits[f"{name}: the first data set alone"] = scores
             splits[f"{name}: half of the people, scored by the others"] = _by_people(
                 store, name, groups, alone, config.folds
             )
@@ -114,7 +114,7 @@ def compare_viewing(config: ViewingConfig) -> None:
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
         folds = [StudiedFold(plain, number, config.folds, fit, maps=maps) for number in numbers]
-        rows[name] = joined([store.scores(name, fold) for fold in _bar(folds, name)])
+        rows[name] = store.scores(name, _bar(folds, name))
     tables = {
         "viewing": viewing_table(rows),
         "viewing terms": terms_table(rows),
@@ -179,7 +179,7 @@ def _by_people(store: FoldStore, name: str, groups: Groups, fit: GazeFit, count:
         StudiedFold(cache(partial(half, number)), number, count, fit, judges=partial(half, number + 1))
         for number in range(count)
     ]
-    return joined([store.scores(file, fold) for fold in _bar(folds, file)])
+    return store.scores(file, _bar(folds, file))
 
 
 def _in_order(subject: str) -> tuple[int, str]:

@@ -13,7 +13,8 @@ from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Trial, episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, episodes_of, run_episodes
+from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Whole
 
 
@@ -61,8 +62,9 @@ class SearchRun(ComparedLooking):
         watch.lap("look")
         if not episodes:
             return records, watch.seconds
+        scene = self.scenes.ids[index]
         looks = StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
-        noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
+        noise = torch.stack([noise_for(protocol, len(grid), scene, each.target, each.repetition) for each in episodes])
         for name in self.policies:
             candidate = self.candidate(name, index)
             watch.lap("saliency")

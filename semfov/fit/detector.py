@@ -335,7 +335,7 @@ def _manifest_of(folder: _FolderFit) -> Manifest:
 
 
 _FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit, WindowsFit)
-"""The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
+"""The fits of `semfov.io.manifest.PARTS`."""
 
 
 class _FolderFit:
@@ -343,7 +343,7 @@ class _FolderFit:
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.inputs = PartInputs(config, run)
-        self.fits = {each.name: each(self.inputs) for each in _FITS}
+        self.fits = {name: fit(self.inputs) for name, fit in zip(PARTS, _FITS, strict=True)}
 
     def fit(self, name: str) -> PartResult:
         """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""

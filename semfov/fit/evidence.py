@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,8 +42,8 @@ from semfov.runs.search_protocol import (
     episodes_of,
     run_episodes,
     search_steps,
-    tie_noise,
 )
+from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import table
 from semfov.strategy import Strategy
@@ -321,10 +321,14 @@ def _search_curves(
             continue
         grid = run.grid(index)
         looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
-        noise = torch.stack([tie_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        noise = [
+            noise_for(protocol, len(grid), run.scenes.ids[index], each.target, each.repetition) for each in episodes
+        ]
         for name, way in ways.items():
             with torch.inference_mode():
-                outcomes = run_episodes(episodes, way, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
+                outcomes = run_episodes(
+                    episodes, way, looks, torch.stack(noise), shifts=protocol.shifts, batch=protocol.batch
+                )
             shifts = np.array([found_at for _, found_at in outcomes])
             curves[name].append(cumulative_performance(shifts, protocol.shifts))
     return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
@@ -384,7 +388,6 @@ def _decisions(
 class EvidenceFit(PartFit):
     """Train the target evidence, and choose its thresholds."""
 
-    name: ClassVar[str] = "evidence"
     settings: FitSearchConfig
 
     def __init__(self, inputs: PartInputs) -> None:
@@ -468,4 +471,4 @@ class EvidenceFit(PartFit):
             ]
         )
         save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
-        return PartResult(self.write(fit.model, gain.better, why), report, ["search.png"])
+        return PartResult(self.write("evidence", fit.model, gain.better, why), report, ["search.png"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -136,15 +136,19 @@ class FoldStore:
         model.save(path)
         return model
 
-    def scores(self, name: str, fold: Fold) -> Scores:
-        """The scores of a fold, read or computed."""
+    def scores(self, name: str, folds: Iterable[Fold]) -> Scores:
+        """The scores of folds as one, read or computed."""
+        parts: dict[tuple[str, int], list[Tensor]] = {}
+        for fold in folds:
 
-        def computed() -> dict[str, Tensor]:
-            scores = fold.scores(self.model(name, fold))
-            return {f"{row}/{source}": each for (row, source), each in scores.items()}
+            def computed(fold: Fold = fold) -> dict[str, Tensor]:
+                scores = fold.scores(self.model(name, fold))
+                return {f"{row}/{source}": each for (row, source), each in scores.items()}
 
-        kept = self.kept(*_place(name, fold), computed)
-        return {(row, int(source)): kept[f"{row}/{source}"] for row, source in (key.rsplit("/", 1) for key in kept)}
+            for key, each in self.kept(*_place(name, fold), computed).items():
+                row, _, source = key.rpartition("/")
+                parts.setdefault((row, int(source)), []).append(each)
+        return {key: torch.cat(each) for key, each in parts.items()}
 
     def kept(
         self, name: str, what: Mapping[str, object], compute: Callable[[], dict[str, Tensor]]
@@ -161,8 +165,3 @@ class FoldStore:
 def _place(name: str, fold: Fold) -> tuple[str, dict[str, object]]:
     """The name of a fold's files, and what they depend on."""
     return f"{name} fold {fold.number + 1} of {fold.count}", {"name": name, **fold.what}
-
-
-def joined(scored: Sequence[Scores]) -> Scores:
-    """The scores of several folds as one."""
-    return {key: torch.cat([fold[key] for fold in scored]) for key in (scored[0] if scored else {})}

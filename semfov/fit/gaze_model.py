@@ -13,7 +13,7 @@ from torch import Tensor
 from semfov.detection.detector import Detector
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, fitted_density
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores, joined
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
 from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.runs.settings import Whole
@@ -78,7 +78,7 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     check(fewest >= least, f"{config.within}fixations", expected, fewest)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
     folds = [Fold(lambda: groups, number, config.folds, config.fit) for number in range(config.folds)]
-    scored = joined([kept.scores(detector.name, fold) for fold in folds])
+    scored = kept.scores(detector.name, folds)
     model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
     _describe_viewing(model, groups)
     scanpaths = sum(len(some) for group in groups for some in group.people)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -30,10 +30,10 @@ from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, answers_of
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.exploration_protocol import explorations_of, explore_noise, run_explorations
+from semfov.runs.exploration_protocol import explorations_of, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.seeds import generator_for
+from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.tables import table
 from semfov.strategy import Strategy
@@ -289,7 +289,9 @@ def _explore_curves(
             continue
         looks = StoredLooks(run.detections(index), grid)
         episodes = explorations_of(run.scenes, index, len(grid), protocol)
-        noise = torch.stack([explore_noise(run.scenes, episode, len(grid), protocol) for episode in episodes])
+        noise = torch.stack(
+            [noise_for(protocol, len(grid), run.scenes.ids[index], None, each.repetition) for each in episodes]
+        )
         cells = int(answers.any(-1).sum())
         for name, way in ways.items():
             with torch.inference_mode():
@@ -309,7 +311,6 @@ def _explore_curves(
 class MapFit(PartFit):
     """Train the map of all classes."""
 
-    name: ClassVar[str] = "map"
     settings: FitMapConfig
 
     def __init__(self, inputs: PartInputs) -> None:
@@ -367,5 +368,5 @@ class MapFit(PartFit):
             "background.\n"
         )
         save_figure(curves_figure(objects, "exploration"), self.config.out / "explore.png")
-        part = self.write(fit.model, gain.better and not loss.better, why)
+        part = self.write("map", fit.model, gain.better and not loss.better, why)
         return PartResult(part, "\n".join([head, *sections, fit.report]), ["explore.png"])

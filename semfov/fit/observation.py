@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -89,8 +89,6 @@ def count_misses(
 class ObservationFit(PartFit):
     """Fit the observation model with its miss rates."""
 
-    name: ClassVar[str] = "observation"
-
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
         self.settings = {name: getattr(self.config, name) for name in ("fixations", "holdout", "seed")}
@@ -139,4 +137,4 @@ class ObservationFit(PartFit):
             f"detections, evaluated on {len(judged)} detections in {len(photographs)} held-out photographs.",
             rows,
         )
-        return PartResult(self.write(model, gain.better, why), report, ["reliability.png"])
+        return PartResult(self.write("observation", model, gain.better, why), report, ["reliability.png"])

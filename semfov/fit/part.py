@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
@@ -98,7 +98,6 @@ class PartInputs:
 class PartFit(ABC):
     """Base of the fits of all parts: each fits its part, compares it with the agent without it, and writes it."""
 
-    name: ClassVar[str]
     settings: Any
     """The settings of the part, by name or as a dataclass. The part is fitted again if they change."""
     tasks: dict[str, float]
@@ -111,8 +110,8 @@ class PartFit(ABC):
     def fit(self) -> PartResult:
         """Fit the part."""
 
-    def write(self, model: FolderModel, used: bool, why: str) -> Part:
-        """Write the model of the part and return its entry in the manifest."""
-        file = f"{self.name}.safetensors"
+    def write(self, name: str, model: FolderModel, used: bool, why: str) -> Part:
+        """Write the model of a part and return its entry in the manifest."""
+        file = f"{name}.safetensors"
         model.save(self.config.out / file)
         return Part(file, sha256(self.config.out / file), used, why)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -100,8 +100,6 @@ def hit_rate(
 
 class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
-
-    name: ClassVar[str] = "tempering"
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)

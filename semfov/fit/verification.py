@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -354,7 +354,6 @@ class VerificationFit(PartFit):
     A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`_SHIPPED`).
     """
 
-    name: ClassVar[str] = "verification"
     settings: VerificationConfig
 
     def __init__(self, inputs: PartInputs) -> None:
@@ -401,7 +400,7 @@ class VerificationFit(PartFit):
             "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
         return PartResult(
-            self.write(model, gain.better, why),
+            self.write("verification", model, gain.better, why),
             text + verification_report(model, folds, closer, searches, f"{len(photographs)} photographs")[0],
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,8 +54,6 @@ class _LeftOut:
 
 class WindowsFit(PartFit):
     """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
-
-    name: ClassVar[str] = "windows"
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
@@ -142,7 +140,7 @@ class WindowsFit(PartFit):
             "the order of the sums of the overview's raw scores, as the agent does without this part.",
             rows,
         )
-        return PartResult(self.write(model, gain.better, why), "\n".join([text, figures]))
+        return PartResult(self.write("windows", model, gain.better, why), "\n".join([text, figures]))
 
 
 def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:

@@ -11,7 +11,7 @@ from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.episodes import right_cells
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.seeds import generator_for, noise_for
+from semfov.runs.seeds import generator_for
 from semfov.strategy import Strategy
 
 
@@ -29,11 +29,6 @@ def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolCo
     rounds = -(-protocol.starts // cells)
     order = torch.cat([torch.randperm(cells, generator=generator) for _ in range(rounds)])
     return [Exploration(index, number, start) for number, start in enumerate(order[: protocol.starts].tolist())]
-
-
-def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: ProtocolConfig) -> Tensor:
-    """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
-    return noise_for(protocol, cells, scenes.ids[episode.scene], "exploration", episode.repetition)
 
 
 def run_explorations(

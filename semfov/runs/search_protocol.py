@@ -131,11 +131,6 @@ def choose_searches(
     ]
 
 
-def tie_noise(scenes: Scenes, episode: Trial, cells: int, protocol: ProtocolConfig) -> Tensor:
-    """Random numbers that choose among cells of equal value, `(shifts+1, X·Y)`; the same for every policy."""
-    return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
-
-
 def run_episodes(
     episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, *, shifts: int, batch: int
 ) -> list[_Outcome]:

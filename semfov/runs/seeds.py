@@ -15,8 +15,12 @@ def generator_for(*what: object) -> torch.Generator:
 
 
 def noise_for(protocol: ProtocolConfig, cells: int, *episode: object) -> Tensor:
-    """Random numbers `(shifts+1, X·Y)` that break the ties of the episode identified by `episode`."""
+    """Random numbers `(shifts+1, X·Y)` that break the ties of an episode, the same for every policy.
+
+    A scene, a target (None: an exploration) and a repetition identify it.
+    """
+    what = ("exploration" if each is None else each for each in episode)
     shape = protocol.shifts + 1, cells
     if protocol.ties == "first":
         return torch.linspace(1, 0, cells).expand(shape)
-    return torch.rand(shape, generator=generator_for("ties", protocol.seed, *episode))
+    return torch.rand(shape, generator=generator_for("ties", protocol.seed, *what))

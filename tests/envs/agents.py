@@ -8,8 +8,8 @@ import torch
 from semfov.envs import EpisodeEnv, GazeVectorEnv
 from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.runs.exploration_protocol import explore_noise
-from semfov.runs.search_protocol import Trial, tie_noise
+from semfov.runs.search_protocol import Trial
+from semfov.runs.seeds import noise_for
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit
 
@@ -44,8 +44,9 @@ class PolicyAgent:
         targets = gazes.targets[row] if isinstance(episode, Trial) else None
         visited = gazes.memory.visited[row]
         values = policy(targets, grid)(gazes.memory.belief[row], visited)
-        draw = tie_noise if isinstance(episode, Trial) else explore_noise
-        noise = draw(scenery.pictures, episode, len(grid), scenery.protocol)
+        target = episode.target if isinstance(episode, Trial) else None
+        scene = scenery.pictures.ids[episode.scene]
+        noise = noise_for(scenery.protocol, len(grid), scene, target, episode.repetition)
         # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.
         noise = noise[min(int(gazes.shift[row]), scenery.shifts)]
         return Greedy(drawn_from(noise[None, None]))(0, torch.tensor([0]), values, visited, grid.centres)[1]

@@ -161,11 +161,11 @@ def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monke
     fit = GazeFit(epochs=2, units=4, saccade_epochs=0)
     store = FoldStore(tmp_path, {"data": "drawn"})
     fold = StudiedFold(lambda: [half], 1, 4, fit, judges=lambda: [others])
-    first = store.scores("halves", fold)
+    first = store.scores("halves", [fold])
     assert set(first) == {(CENTRE, 0), ("map", 0), ("map and centre bias", 0)}
     monkeypatch.setattr("semfov.fit.gaze_folds.fitted_density", None)
     monkeypatch.setattr("semfov.fit.gaze_folds.score", None)
-    again = store.scores("halves", fold)
+    again = store.scores("halves", [fold])
     assert all(torch.equal(first[key], again[key]) for key in first)
 
 

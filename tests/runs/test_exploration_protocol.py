@@ -13,7 +13,8 @@ from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.exploration_protocol import Exploration, explorations_of, explore_noise, run_explorations
+from semfov.runs.exploration_protocol import explorations_of, run_explorations
+from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from tests.small import FixedLook, kaplan
 
@@ -53,7 +54,9 @@ def explored(explorer, *, starts, shifts, batch=100, index=0, looks=None):
     """Explorations of a scene: the episodes, the random numbers and the outcomes."""
     protocol = ProtocolConfig(starts=starts, shifts=shifts)
     episodes = explorations_of(Scenes(), index, 12, protocol)
-    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    noise = torch.stack(
+        [noise_for(protocol, 12, Scenes().ids[episode.scene], None, episode.repetition) for episode in episodes]
+    )
     looks = StoredLooks(NOTHING, GRID) if looks is None else looks
     options = {"shifts": shifts, "batch": batch}
     return episodes, noise, run_explorations(episodes, explorer, looks, ANSWERS, noise, **options)
@@ -154,6 +157,5 @@ def test_starts_and_tie_breaking_noise_depend_on_the_seed():
     one, other = ProtocolConfig(starts=6), ProtocolConfig(starts=6, seed=1)
     assert explorations_of(Scenes(), 0, 100, one) != explorations_of(Scenes(), 0, 100, other)
     assert explorations_of(Scenes(), 0, 100, one) == explorations_of(Scenes(), 0, 100, one)
-    episode = Exploration(0, 2, 5)
-    assert torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, one))
-    assert not torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, other))
+    assert torch.equal(noise_for(one, 9, 7, None, 0), noise_for(one, 9, 7, None, 0))
+    assert not torch.equal(noise_for(one, 9, 7, None, 0), noise_for(other, 9, 7, None, 0))

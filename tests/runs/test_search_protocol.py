@@ -13,7 +13,8 @@ from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.episodes import cumulative_performance
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.search_protocol import episodes_of, run_episodes, tie_noise
+from semfov.runs.search_protocol import episodes_of, run_episodes
+from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from tests.small import FixedLook
 
@@ -57,6 +58,11 @@ def look():
 
 GRID = Grid(5, 5, (100, 100))
 NOTHING = Detections.empty(25, 3)
+
+
+def tie_noise(scenes, episode, cells, protocol):
+    """Random numbers of an episode."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
 
 
 def stored(episodes):

@@ -20,7 +20,8 @@ from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Trial, run_episodes, tie_noise
+from semfov.runs.search_protocol import Trial, run_episodes
+from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Range, Settings
 
 
@@ -107,7 +108,7 @@ class PeopleSearchRun(ComparedLooking):
         (target,) = self.scenes.targets(index)
         episode = Trial(index, target, target, 0, start, goal, True)
         looks = StoredLooks(detections, grid, torch.tensor([target]))
-        noise = tie_noise(self.scenes, episode, len(grid), protocol)[None]
+        noise = noise_for(protocol, len(grid), self.scenes.ids[index], target, 0)[None]
         records: list[ResultRecord] = []
         for policy in self.policies:
             candidate = self.candidate(policy, index)
