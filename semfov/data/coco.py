@@ -32,9 +32,8 @@ _BEYOND = 0.2
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     """Read and check a COCO instances file.
 
-    Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
-    `height`. Every category needs `id` and `name`. Every annotation needs `id`, `image_id`, `category_id` and `bbox` =
-    `[x, y, width, height]`, and may have `iscrowd`. Other keys are ignored.
+    Ids are integers or strings. Images need `id`, `file_name`, `width` and `height`, categories `id` and `name`,
+    annotations `id`, `image_id`, `category_id` and `bbox` = `[x, y, width, height]`; these may have `iscrowd`.
     """
     name = f"annotations {Path(path)}"
     raw = _read(path, name)
@@ -144,10 +143,7 @@ _log = logging.getLogger(__name__)
 
 
 def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
-    """Read an image file in the orientation in which it was annotated; size `(width, height)` → `(3, height, width)`.
-
-    Shapes: size `(width, height)` → `(3, height, width)`.
-    """
+    """Read an image file in the orientation in which it was annotated, of `(width, height)`; → `(3, height, width)`."""
     image = read_image(path)
     if image.shape[-2:] == size[::-1]:
         return image

@@ -84,11 +84,7 @@ def as_images(
     color: Color = "rgb",
     white: White | None = None,
 ) -> Tensor:
-    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`; → `(B, 3, H, W)`.
-
-    >>> as_images(torch.rand(2, 3, 8, 9)).shape
-    torch.Size([2, 3, 8, 9])
-    """
+    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`; → `(B, 3, H, W)`."""
     pixels = as_pixels(images, argument=argument, color=color, white=white)
     device = pixels.device if like is None else like.device
     if pixels.is_floating_point():
@@ -180,11 +176,7 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
 
 
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
-    """Convert points to a tensor; tensors stay as they are, other numbers become float64; → `(..., 2)`.
-
-    >>> as_points((320, 240))
-    tensor([320., 240.], dtype=torch.float64)
-    """
+    """Convert points to a tensor; tensors stay as they are, other numbers become float64; → `(..., 2)`."""
     if isinstance(points, Tensor):
         return points
     try:

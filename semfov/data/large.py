@@ -306,10 +306,7 @@ class _RasterPicture(LargePicture):
 
 
 class _ArrayPicture(LargePicture):
-    """A picture in an array, which may be a `numpy.memmap`; only the pixels of the windows are read; array `(H, W, 3)`.
-
-    Shapes: array `(H, W, 3)`.
-    """
+    """A picture in an array `(H, W, 3)`, which may be a `numpy.memmap`: only the pixels of windows are read."""
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
         fits = array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
@@ -343,14 +340,11 @@ class _MemoryPicture(_ArrayPicture):
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
-    """Open a picture of any common type (`semfov.as_image`) for reading window by window.
+    """Open a picture of any common type (`semfov.as_image`) for reading by windows; `white` scales numbers to bytes.
 
     Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, and by rasterio if that is installed and
     they have overviews or are of a kind that `tifffile` leaves; else as other photographs. Rasters `.vrt` and `.jp2`
-    need rasterio. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the windows of a
-    `numpy.memmap` are read.
-
-    With `white`, numbers of any type are scaled to bytes: a thermal picture, reflectances, 12 bits in 16.
+    need rasterio. Arrays of bytes `(H, W, 3)` and `(H, W)`, such as a `numpy.memmap`, are not copied.
     """
     check_white(white)
     if bands is not None:
@@ -447,11 +441,7 @@ _ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which 
 
 
 def _sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
-    """Windows all over a picture in which its values are looked at, row by row.
-
-    >>> next(_sample_windows((1000, 500)))
-    (100, 50, 164, 114)
-    """
+    """Windows all over a picture in which its values are looked at, row by row."""
     width, height = size
     for row in range(_ACROSS):
         for column in range(_ACROSS):

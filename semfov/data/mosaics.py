@@ -26,9 +26,8 @@ class _Tile(NamedTuple):
 class Mosaics(ComposedScenes):
     """Mosaics of `columns` × `rows` photographs; tile `(width, height)`.
 
-    Each photograph is resized to fit its slot, and keeps its proportions. The rest of the slot is grey. Mosaic `i`
-    depends only on the seed, on `i` and on the photographs. No photograph is in a mosaic twice, unless there are fewer
-    photographs than slots.
+    Each photograph is resized to fit its slot, whose rest is grey. Mosaic `i` depends only on the seed, on `i` and on
+    the photographs, of which none is in it twice unless there are fewer than slots.
     """
 
     def __init__(

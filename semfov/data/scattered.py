@@ -40,10 +40,8 @@ class _Cutout(NamedTuple):
 class Scattered(ComposedScenes):
     """Pictures with few objects on a ground: single objects of one to three classes, or whole photographs.
 
-    The ground is made of patches of photographs without objects, each mirrored again and again, which pass into one
-    another; one of five grounds is plain. Objects stand alone in their photographs, and are about equally large in a
-    picture: between `sides` on the longer side. They stand in groups. Picture `i` depends only on the seed, on `i` and
-    on the photographs.
+    The ground is made of mirrored patches of photographs without objects, which pass into one another; one of five is
+    plain. Objects of a picture stand in groups and are about equally large: between `sides` on the longer side.
     """
 
     def __init__(

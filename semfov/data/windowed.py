@@ -31,11 +31,7 @@ _OVERSAMPLING = 1.5
 
 
 def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
-    """Largest factor by which a window may be reduced that is resampled afterwards.
-
-    >>> [reduction_for(ratio) for ratio in (0, 2.9, 3, 9, 12.3)]
-    [1, 1, 2, 4, 8]
-    """
+    """Largest factor by which a window may be reduced that is resampled afterwards."""
     reduction = 1
     while ratio >= 2 * oversampling * reduction:
         reduction *= 2
@@ -99,13 +95,10 @@ class LargePicture(ABC):
         return reduction if reduction >= self._first else 1
 
     def read(self, box: _Box, reduction: int = 1) -> Tensor:
-        """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
+        """Read a window, `(3, h, w)`; coarse ones of pictures of more than 16 million pixels from reduced copies.
 
-        The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels (25
-        MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture, and
-        at most 134 MB: copies of pictures of more than 537 million pixels begin at a coarser one.
-
-        Shapes: → `(3, h, w)`.
+        The copies are made when one is first needed, of strips of 8 million pixels (25 MB). They are kept, and take a
+        twelfth of the memory of the picture, and at most 134 MB.
         """
         self._inside(box)
         coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE

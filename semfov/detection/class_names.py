@@ -39,13 +39,7 @@ class UnnamedClasses(InputError):
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Find the names that stand for a class; a whole number is a name, too.
-
-    >>> named_outputs(["__background__", "cat", "N/A", "dog"])
-    (('cat', 'dog'), (1, 3))
-    >>> named_outputs(["background", 7, "n/a"])
-    (('7',), (1,))
-    """
+    """Find the names that stand for a class, and their places; a whole number is a name, too."""
     wrong = [name for name in classes if isinstance(name, bool) or not isinstance(name, str | int | None)]
     remedy = "; YAML reads no, off, yes and on so: put names in quotes, or give classes="
     check(not wrong, "classes", "names", f"{wrong[:3]}{remedy}")

@@ -15,10 +15,8 @@ def merge_crops(
 ) -> Detections:
     """Merge the detections in the crops of each fixation; windows `(F·L, 4)`, size `(width, height)`.
 
-    A crop shows its inside more sharply than every wider crop. So a box that lies in a finer crop, without being cut by
-    its border, is left out of the wider ones, whether the finer crop has a box there or not. Of the others, two boxes
-    of one object are merged by the rule for the windows of large pictures (`semfov.detection.objects`): a whole box is
-    kept rather than a cut one, and otherwise the one in the finer crop.
+    A box that lies in a finer crop, without being cut by its border, is left out of the wider ones, which are less
+    sharp there. Of the others, two boxes of one object are merged as in windows (`semfov.detection.objects`).
     """
     merged = []
     for first in range(0, len(detections.mask), crops):

@@ -289,14 +289,7 @@ def _activation(section: Section, default: str) -> str:
 
 
 class Darknet(nn.Module):
-    """A network from the sections of a cfg, with random weights; `read_weights` loads trained weights.
-
-    Supported layers are convolutional, maxpool, upsample, route, shortcut, yolo, and dropout, which does nothing.
-
-    Shape:
-        - input: `(B, C, H, W)`
-        - output: for each head with A anchors and K classes a map `(B, A (5 + K), H', W')`
-    """
+    """A network from the sections of a cfg, with random weights: `(B, C, H, W)` → `(B, A (5 + K), H', W')` a head."""
 
     def __init__(self, sections: Sequence[Section]) -> None:
         super().__init__()

@@ -61,11 +61,7 @@ class Section(NamedTuple):
 
 
 def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
-    r"""Parse the text of a cfg.
-
-    Lines are `[kind]`, `key=value`, comments (`#` or `;`) or blank. Where a key is repeated in a section, the first
-    value counts, as in Darknet.
-    """
+    """Parse the text of a cfg; where a key is repeated in a section, the first value counts, as in Darknet."""
     sections: list[Section] = []
     options: dict[str, str] = {}
     for number, raw in enumerate(text.splitlines(), start=1):
@@ -144,10 +140,7 @@ def _yolov3_spp(classes: int = 80) -> list[Section]:
 
 
 def _yolov3_tiny(classes: int = 80) -> list[Section]:
-    """YOLOv3-tiny: seven convolutions with max pools in between, heads at strides 32 and 16, at 416 x 416.
-
-    The second head has the anchors 1, 2, 3. Some cfgs have 0, 1, 2, but the published weights fit 1, 2, 3.
-    """
+    """YOLOv3-tiny: seven convolutions with max pools, heads at strides 32 and 16; the weights fit anchors 1, 2, 3."""
     backbone = []
     for filters in (16, 32, 64, 128, 256):
         backbone += [_convolution(filters, 3), _section("maxpool", size=2, stride=2)]

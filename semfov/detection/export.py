@@ -18,11 +18,10 @@ from semfov.io.files import write_bytes
 
 
 def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:
-    """Write a Darknet detector as an ONNX model.
+    """Write a Darknet detector as an ONNX model, with class names, input size and padding in its metadata.
 
-    The model takes `images` `(B, 3, H, W)`, RGB in [0, 1]. It returns all boxes of all heads, before any selection:
-    `boxes` `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`. Class
-    names, input size and padding are in its metadata.
+    From `images` `(B, 3, H, W)`, RGB in [0, 1], it computes all boxes of all heads before any selection: `boxes`
+    `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`.
     """
     if not isinstance(detector, YoloV3):
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")

@@ -105,11 +105,7 @@ class Objects:
 
 
 def box_text(box: Sequence[float]) -> str:
-    """Corners of a box in whole pixels.
-
-    >>> box_text((380.2, 190.0, 443.9, 276.4))
-    '380,190–444,276'
-    """
+    """Corners of a box in whole pixels."""
     x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
     return f"{x1},{y1}–{x2},{y2}"
 
@@ -290,10 +286,7 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
 
 
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
-    """Greedy suppression: the boxes that stay when each of them removes the worse boxes that it is paired with.
-
-    Shapes: better `(P,)`, worse `(P,)`.
-    """
+    """Greedy suppression: the boxes that stay when each removes the worse boxes that it is paired with; both `(P,)`."""
     doubtful, gone = np.zeros((2, count), np.bool_)
     doubtful[worse] = True
     # A box that is never the worse one stays. Only the pairs that this leaves open depend on each other.

@@ -45,11 +45,7 @@ def check_canvas(name: str, size: tuple[int, int]) -> None:
 
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Read the settings of a model.
-
-    Settings in `model.json` in the folder of `model.onnx` override settings in the model's metadata. The metadata of
-    models that semfov or Ultralytics (class names, input size) have exported are understood.
-    """
+    """Settings in a model's metadata, by semfov or Ultralytics, overridden by those in `model.json` beside it."""
     beside = path.with_suffix(".json")
     inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
     outside = _parse(_read(beside), str(beside)) if beside.exists() else {}

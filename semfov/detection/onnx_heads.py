@@ -55,10 +55,7 @@ def decode_yolov8(columns: Tensor) -> Candidates:
 
 
 def _decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
-    """Decode rows `x1 y1 x2 y2 score class` that a network has selected itself (YOLOv10): all other scores are 0.
-
-    Shapes: rows `(B, N, 6)`.
-    """
+    """Decode rows `x1 y1 x2 y2 score class`, `(B, N, 6)`, that a network has selected itself: other scores are 0."""
     if classes is None:
         raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
     check_shape(rows, "rows", None, None, 6)
@@ -111,20 +108,14 @@ def _decode_distances(
 
 
 def _decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
-
-    Shapes: logits `(B, Q, K + 1)`, boxes `(B, Q, 4)`.
-    """
+    """Decode DETR (Carion et al. 2020), with a softmax over the classes and "no object"; logits `(B, Q, K + 1)`."""
     check_shape(logits, "logits", None, None, None)
     scores = logits.softmax(-1)
     return Candidates(_fractions(boxes, canvas), scores[..., :-1], background=scores[..., -1])
 
 
 def _decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
-
-    Shapes: logits `(B, Q, K)`, boxes `(B, Q, 4)`.
-    """
+    """Decode DETRs trained with focal loss (RT-DETR): a sigmoid a class, without "no object"; logits `(B, Q, K)`."""
     check_shape(logits, "logits", None, None, None)
     return Candidates(_fractions(boxes, canvas), logits.sigmoid())
 

@@ -60,12 +60,7 @@ def _with_outputs(path: Path, names: Iterable[str]) -> bytes:
 
 
 class OnnxSession:
-    """An inference session of one ONNX file.
-
-    Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
-
-    Shapes: . `further` names tensors inside the model that are outputs too; `open_ended`.
-    """
+    """An inference session of one ONNX file; idle threads do not spin, which would slow down torch's next operation."""
 
     def __init__(
         self,
@@ -143,10 +138,7 @@ class OnnxSession:
         return images[0].name, _sizes(images[0].shape), _FLOATS[images[0].type], extra
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
-        """Run the model on images, without gradients; a model with a fixed batch size runs several times if needed.
-
-        Shapes: image `(B, 3, H, W)`.
-        """
+        """Run the model on images `(B, 3, H, W)`, without gradients, in parts where its batch size is fixed."""
         batch, fixed = image.shape[0], self.shape[0]
         check(batch > 0, "image", "at least one image", batch)
         size = batch if fixed is None else fixed

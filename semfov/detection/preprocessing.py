@@ -50,10 +50,7 @@ class Preprocessing:
         return torch.stack([plane - shift if shift else plane for plane, shift in zip(planes, shifts, strict=True)], 1)
 
     def of_bytes(self, canvas: Tensor) -> Tensor:
-        """Convert a canvas of bytes to the input of the network: `self(canvas / 255)`, in one pass over memory.
-
-        Shapes: canvas `(B, 3, H, W)`.
-        """
+        """Convert a canvas of bytes `(B, 3, H, W)` to the input: `self(canvas / 255)`, in one pass over memory."""
         check_bytes(canvas)
         image = torch.empty(canvas.shape, device=canvas.device)
         for plane, source, mean, std in zip(image.unbind(1), self._order, self.mean, self.std, strict=True):

@@ -29,11 +29,8 @@ _PREFIX = "torchvision:"
 class TorchvisionDetector(ModuleDetector):
     """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
 
-    The canvas is the image, resized by the model's own transform. The model's padding, its normalisation and the
-    non-maximum suppression of its proposals are part of the network. Its thresholds and its final suppression are left
-    out.
-
-    Faster R-CNN predicts a separate box for every class of a proposal; the box of the best class is used.
+    The canvas is the image, resized by the model's own transform. The model's thresholds and its final suppression are
+    left out. Faster R-CNN predicts a box for every class of a proposal; that of the best class is used.
     """
 
     def __init__(
@@ -269,8 +266,7 @@ def _dense(model: Any, images: Any) -> tuple[dict[str, Tensor], list[Tensor], li
 def _level_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
     """RetinaNet (Lin et al. 2017) and FCOS (Tian et al. 2019): of every level the anchors with the best class.
 
-    Scores are a sigmoid for each class, of FCOS `√(σ(class) σ(centreness))`. There are `topk_candidates` of each level;
-    the model's own are among these.
+    Scores are a sigmoid for each class, of FCOS `√(σ(class) σ(centreness))`.
     """
     outputs, anchors, pixels = _dense(model, images)
     scores, centred = outputs["cls_logits"].sigmoid(), "bbox_ctrness" in outputs

@@ -109,11 +109,7 @@ class TransformersDetector(ModuleDetector):
 
 
 def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, int]:
-    """The size of an image processor as a mapping, which older settings give as a number or `(height, width)`.
-
-    >>> _size({"size": 800, "max_size": 1333}, {}), _size({"size": [480, 640]}, {})
-    ({'shortest_edge': 800, 'longest_edge': 1333}, {'height': 480, 'width': 640})
-    """
+    """The size of an image processor as a mapping, which older settings give as a number or `(height, width)`."""
     given = usual if settings.get("size") in (None, {}) else settings["size"]
     if isinstance(given, int):
         given = {"shortest_edge": given, "longest_edge": settings.get("max_size")}

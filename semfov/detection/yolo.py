@@ -156,10 +156,7 @@ class _NetworkGraph(Graph):
 
 
 def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()) -> Any:
-    """The `onnx.ModelProto` of a network, for one image of `(width, height)` or for any batch and any size (None).
-
-    The maps of `layers` are further outputs, `layer_0`, `layer_1`, ….
-    """
+    """The `onnx.ModelProto` of a network for one image `(width, height)`, or any; `layer_0`, … are outputs, too."""
     try:
         from onnx import TensorProto, helper
     except ImportError as error:
@@ -204,8 +201,8 @@ def _build(network: Darknet) -> tuple[_NetworkGraph, dict[int, str]]:
 class _OnnxTwin:
     """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
 
-    The ONNX model is made when it is first needed (`_exported`). A session has as many threads as torch has at that
-    time. Every process opens its own session, because the threads of a pool do not survive a fork.
+    A session has as many threads as torch has when it is opened. Every process opens its own, because the threads of a
+    pool do not survive a fork.
     """
 
     def __init__(self, digest: str) -> None:
@@ -337,16 +334,12 @@ _RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
 class YoloV3(Detector):
-    """A Darknet network with YOLOv3 heads as a `Detector`; input_size `(width, height)`.
+    """A Darknet network with YOLOv3 heads as a `Detector`; input_size `(width, height)`; it is differentiable.
 
-    Boxes and scores are differentiable with respect to the image. A canvas of another dtype is converted to the
-    network's dtype.
-
-    With runtime `"auto"`, onnxruntime computes the network on a CPU where no gradients are needed. It is faster there,
-    and its results are equal up to rounding. Torch computes the network in all other cases: where gradients are enabled
-    and the canvas or a parameter requires one, on accelerators, in other precisions, with weights that were changed
-    after loading, and in compiled, exported or transformed functions. Forward hooks of the network are not called where
-    onnxruntime computes it.
+    With runtime `"auto"`, onnxruntime computes the network on a CPU where no gradients are needed, which is faster and
+    equal up to rounding; no forward hooks are called then. Torch computes it in all other cases: with gradients, on
+    accelerators, in other precisions, with weights that were changed after loading, and in compiled, exported or
+    transformed functions.
     """
 
     def __init__(

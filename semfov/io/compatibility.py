@@ -91,13 +91,10 @@ def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str
 
 
 def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
-    """Check that a grid has between half and twice as many cells along each side as the grid of the training.
+    """Check that a grid `(columns, rows)` has half to twice as many cells along each side as that of the training.
 
-    Learned evidence takes sizes and distances as fractions of the image, so it carries over to somewhat finer and
-    coarser grids. It has learned from cells of one size how often a cell holds an object and how far the influence of
-    its neighbours reaches.
-
-    Shapes: grid `(columns, rows)`.
+    Learned evidence takes sizes as fractions of the image, but has learned how often a cell of one size holds an object
+    and how far the influence of its neighbours reaches.
     """
     cells = fitted.get("columns"), fitted.get("rows")
     if None not in cells and not all(n / 2 <= side <= 2 * n for n, side in zip(cells, grid, strict=True)):  # type: ignore[operator]

@@ -130,11 +130,7 @@ class PretrainedForEye(Pretrained):
 
 
 def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
-    """Write the command that fits all models to a detector.
-
-    >>> fit_command("mine.onnx")
-    'semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'
-    """
+    """Write the command that fits all models to a detector."""
     return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
 
 

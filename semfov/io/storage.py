@@ -92,11 +92,7 @@ def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
 
 
 def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str, Tensor] | None:
-    """Read the tensors that `write_tensors` wrote to this file under this key.
-
-    A file that was written under another key or another file name (for another scene, for instance) counts as missing.
-    So does a file that does not fit the schema.
-    """
+    """Read the tensors that `write_tensors` wrote to this file under this key; None for another key, file or schema."""
     try:
         tensors, record = read(path, _KIND)
         if schema is not None:
@@ -107,12 +103,7 @@ def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str
 
 
 def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
-    """Convert tensors to bytes in the safetensors format.
-
-    >>> import torch
-    >>> unpack_tensors(pack_tensors({"a": torch.tensor([1.5])}))
-    {'a': tensor([1.5000])}
-    """
+    """Convert tensors to bytes in the safetensors format."""
     from safetensors.torch import save
 
     # A view of a larger tensor may share its memory with another one, which the format refuses.

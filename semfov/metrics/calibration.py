@@ -25,10 +25,7 @@ class Calibration:
 
 
 def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Calibration:
-    """Compute all measures of `Calibration` for predictions over K + 1 classes.
-
-    Shapes: probabilities `(M, K+1)`, labels `(M,)`.
-    """
+    """Compute all measures of `Calibration` for predictions `(M, K+1)` of labels `(M,)`."""
     p = _probabilities(probabilities, "probabilities")
     check_shape(p, "probabilities", None, None)
     numbers = as_numbers(labels, "labels")
@@ -89,20 +86,13 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
 
 
 def _error_of(bins: Tensor) -> Tensor:
-    """Expected calibration error from the sums of `reliability`; bins `(3, bins)`.
-
-    >>> _error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
-    tensor(0.1500)
-    """
+    """Expected calibration error from the sums of `reliability`; bins `(3, bins)`."""
     count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)
 
 
 def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
-    """Sums for a reliability diagram: what was predicted and what came true, by bin of confidence.
-
-    Shapes: confidence `(M,)`, correct `(M,)` → `(3, bins)`.
-    """
+    """Sums `(3, bins)` for a reliability diagram: what was predicted and came true, by bin of confidence `(M,)`."""
     edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
     p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
     right = as_outcomes(correct, "correct")

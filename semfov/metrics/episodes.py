@@ -15,10 +15,7 @@ FloatArray = NDArray[np.float64]
 
 
 def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArray:
-    """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
-
-    Shapes: found_at `(..., episodes)` → `(..., shifts+1)`.
-    """
+    """Fraction of searches, `(..., episodes)`, that have found their target after 0..`shifts` gaze shifts."""
     steps = np.arange(shifts + 1)
     when = np.asarray(found_at)[..., None]
     found = (when >= 0) & (when <= steps)

@@ -53,12 +53,7 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
 
 
 def page_path(path: Path) -> Path:
-    """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`.
-
-    >>> page_path(Path("cup.pdf"))
-    Traceback (most recent call last):
-    semfov.errors.InputError: report: expected a file that ends in .html or .htm, got cup.pdf
-    """
+    """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`."""
     check(path.suffix.lower() in (".html", ".htm"), "report", "a file that ends in .html or .htm", path)
     return path
 

@@ -37,11 +37,7 @@ def zoom_data(
     width: int = 1280,
     quality: int = 75,
 ) -> Data:
-    """Collect the data of looks at a picture for a page, as JSON values.
-
-    Each look is shown at the resolution at which the detector received it, or that of the picture if it is coarser.
-    Detections with a score below 0.1 are left out.
-    """
+    """Collect the data of looks at a picture for a page, as JSON; each look at the resolution of the detector."""
     source = open_large(photograph_of(path, None) if picture is None else picture)
     wide, high = path.size
     expected = f"the picture of the record, {wide} × {high} px, or a reduced one"

@@ -136,12 +136,7 @@ def _write_gif(frames: Sequence[_Frame], file: Any, seconds: float, hold: float)
 
 
 def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[Any]:
-    """Frames as Pillow images with a common palette of 256 colours, which is made from `most` of them.
-
-    With a palette for each frame, static parts of the film would flicker.
-
-    Shapes: frames `(H, W, 3)`.
-    """
+    """Frames `(H, W, 3)` as Pillow images with a common palette, without which static parts of a film would flicker."""
     from PIL import Image
 
     chosen = [frames[round(n)] for n in np.linspace(0, len(frames) - 1, min(most, len(frames)))]

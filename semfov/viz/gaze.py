@@ -32,10 +32,7 @@ def plot_gaze(
     scanpaths: Sequence[Fixations] = (),
     cells: Tensor | None = None,
 ) -> Figure:
-    """Draw a density of fixations over the grey picture, its peaks in order, and scanpaths.
-
-    Shapes: cells `(rows, columns)`, the density; None takes that of all fixations, with its peaks.
-    """
+    """Draw a density of fixations (None: of all, with its peaks in order) over the grey picture, and scanpaths."""
     width, height = prediction.size
     figure, (axes,) = make_figure(1, 1, width=6.4, height=6.4 * height / width + 0.35, axes=only(ax))
     draw_image(axes, prediction.image, Grid(1, 1, prediction.size), grey=True)

@@ -13,10 +13,7 @@ _Point = tuple[float, float]
 def place_labels(
     boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
-    """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
-
-    Shapes: sizes `(width, height)`, frame `(width, height)` → `(x1, y1, x2, y2)`.
-    """
+    """Rectangles for labels `(width, height)` of boxes: at a free corner of the box, or further down."""
     placed: list[LabelBox] = list(obstacles)
     for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
         corners = [

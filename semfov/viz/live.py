@@ -30,12 +30,8 @@ VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:
     """Draw what is known at a frame, and where the next look goes, into the frame; image `(3, H, W)` → `(h, w, 3)`.
 
-    Where there is a belief in cells, the opacity of the colour over a cell is proportional to its probability; a circle
-    marks the present gaze, and a line leads to the point of the next one. A frame around the box of the target replaces
-    the circle if the look is a closer one.
-
-    Of windows, a frame marks the present window, a thin one the next, and boxes the objects: those that are confirmed
-    in their own colour. A frame that is longer than `longest` is reduced.
+    Of beliefs in cells, colours show probabilities, a circle the present gaze, a frame a closer look, and a line leads
+    to the next point. Of windows, frames show the present and the next one, and boxes the objects.
     """
     from PIL import Image, ImageDraw, ImageFont
 

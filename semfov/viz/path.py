@@ -70,13 +70,10 @@ def _free(region: LabelBox, numbers: list[tuple[float, float]], room: float) -> 
 
 
 class GazePath:
-    """Saccades as thin lines and fixations as numbered dots, from dark to bright in the order of time.
+    """Saccades as thin lines and fixations `(n, 2)` as numbered dots, from dark to bright in the order of time.
 
-    All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown.
-
-    In a picture that repeats after the width `around`, a saccade takes the short way, across the seam if need be.
-
-    Shapes: fixations `(n, 2)`.
+    All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown. In a
+    picture that repeats after the width `around`, a saccade takes the short way, across the seam if need be.
     """
 
     def __init__(

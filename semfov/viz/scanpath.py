@@ -377,10 +377,7 @@ def views_of(record: Record, image: Tensor, views: Sequence[Tensor] | None) -> l
 
 
 class LookFigure:
-    """A figure of one look that can show other looks: it is laid out once, and only differences are redrawn.
-
-    Shapes: image `(3, H, W)`, boxes `(M, 4)`.
-    """
+    """A figure of one look that can show other looks: it is laid out once, and only differences are redrawn."""
 
     def __init__(
         self,

@@ -101,11 +101,7 @@ def _json_reader(path: str | PathLike[str]) -> _Reader:
 
 
 def frame_of(text: str) -> tuple[int, int]:
-    """Width and height of a frame that a command line gives.
-
-    >>> frame_of("1920,1080"), frame_of("800x600")
-    ((1920, 1080), (800, 600))
-    """
+    """Width and height of a frame that a command line gives, such as `1920,1080` or `800x600`."""
     try:
         width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
     except ValueError:

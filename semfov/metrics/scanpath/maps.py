@@ -241,11 +241,7 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
 
 
 def _share_below(ordered: _Array, values: _Array) -> _Array:
-    """Fraction of ascending numbers that are lower than each of `values`; ties count half; values `(n,)` → `(n,)`.
-
-    >>> _share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
-    array([0.5])
-    """
+    """Fraction of ascending numbers that are lower than each of `values` `(n,)`; ties count half."""
     twice = np.searchsorted(ordered, values) + np.searchsorted(ordered, values, side="right")
     return np.asarray(twice / (2 * len(ordered)))
 

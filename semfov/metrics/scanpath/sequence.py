@@ -67,10 +67,7 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
 
 
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
-    """The clusters of `cluster_labels` as a fitted `sklearn.cluster.MeanShift`, to label fixations more than once.
-
-    Shapes: others `(m, 2)`.
-    """
+    """The clusters of `cluster_labels` as a fitted `MeanShift`, to label fixations more than once; others `(m, 2)`."""
     try:
         from sklearn.cluster import MeanShift
     except ImportError:
