@@ -11,7 +11,7 @@ import torch
 import semfov
 from semfov import FovealObservationModel
 from semfov.belief import Verification
-from semfov.io.compatibility import learned_for, recommended_model
+from semfov.io.compatibility import learned_for
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
@@ -158,8 +158,8 @@ def test_every_detector_has_all_kinds_of_models():
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])
 @pytest.mark.parametrize("detector", DETECTORS)
-def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
-    model = semfov.FovealObservationModel.from_pretrained(recommended_model(detector, growth))
+def test_a_shipped_model_is_fitted_for_the_sensor(detector, growth):
+    model = semfov.FovealObservationModel.from_pretrained(f"{detector}-sharp" if growth == 1 else detector)
     assert model.metadata["sensor"]["growth"] == growth
     assert model.metadata["detector"]["name"] == detector
     assert model.metadata["method"] == "discriminative"

@@ -1,5 +1,6 @@
 """Sums over predictions of parts of the data, which add up and are kept as JSON."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -23,12 +24,12 @@ class AddedSums(BinarySums):
     @property
     def probability(self) -> float:
         """Mean predicted probability."""
-        return self._mean(float(self.bins[1].sum()))
+        return float(self.bins[1].sum()) / (self.count or math.nan)
 
     @property
     def rate(self) -> float:
         """Fraction of the predictions that came true."""
-        return self._mean(float(self.bins[2].sum()))
+        return float(self.bins[2].sum()) / (self.count or math.nan)
 
     def record(self) -> dict[str, Any]:
         """The sums as JSON values, without empty bins; `from_record` reads them."""

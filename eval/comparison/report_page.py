@@ -17,7 +17,7 @@ from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.episodes import FloatArray
 from semfov.paths.stimulus import Stimulus
 from semfov.report.episode import Data, episode_data
-from semfov.report.page import pictures_of, table_html, write_page
+from semfov.report.page import table_html, write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 
@@ -99,7 +99,8 @@ def _episodes(run: ComparedLooking, records: Sequence[ResultRecord]) -> list[Dat
                 quality=60,
             )
         )
-        pictures.update(pictures_of(data[-1]))
+        shown = [data[-1]["image"], *(each["view"] for each in data[-1]["fixations"])]
+        pictures.update(picture for picture in shown if picture is not None)
         size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
         size += 7 * scanpath.values.numel()
     return data

@@ -158,7 +158,10 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     (2, 2)
     """
     if not isinstance(name, str):
-        return _index(name, len(classes), argument)
+        value = name.item() if isinstance(name, Tensor) and name.ndim == 0 else name
+        inside = isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) <= len(classes)
+        check(inside, argument, f"a name, or a whole number from 1 to {len(classes)}", repr(value))
+        return int(value)
     if name in classes:
         return list(classes).index(name) + 1
     name_key, keys = _plain_key(name), [_plain_key(other) for other in classes]
@@ -193,14 +196,6 @@ def class_numbers(
             raise InputError(f"{error}; several classes are a list: {several}") from None
     check(len(names) > 0, argument, "a class, several, or None for all", names)
     return tuple(dict.fromkeys(class_index(name, classes, argument) for name in names))
-
-
-def _index(value: object, classes: int, argument: str) -> int:
-    """An index 1..K from a whole number of any type."""
-    value = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
-    inside = isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) <= classes
-    check(inside, argument, f"a name, or a whole number from 1 to {classes}", repr(value))
-    return int(value)  # type: ignore[call-overload]
 
 
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:

@@ -248,12 +248,7 @@ def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDA
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     inverted = image.mode in _SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
     image.load()
-    pixels = _rgb(_turned(image, stored, _orientation(image), upright=upright), name, white)
-    return 1 - pixels if inverted else pixels
-
-
-def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
-    """Pixels `(H, W, 3)` in [0, 1] of a Pillow image of any mode."""
+    image = _turned(image, stored, _orientation(image), upright=upright)
     wide = image.mode in _SIXTEEN_BITS or image.mode == "F"
     pixels = np.asarray(image if wide else _over_white(image).convert("RGB"))
     if white is not None:
@@ -267,7 +262,8 @@ def _rgb(image: Any, name: str, white: White | None) -> NDArray[np.float32]:
             got = f"{pixels.min():g} to {pixels.max():g}; give white='auto', or the values that are black and white"
             raise DataError(f"{name}: expected {expected}, got {got}")
         pixels = pixels.astype(np.float32) / np.float32(most)
-    return np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels
+    pixels = np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels
+    return 1 - pixels if inverted else pixels
 
 
 def _over_white(image: Any) -> Any:
@@ -301,20 +297,15 @@ class PhotographPicture(LargePicture):
                 if image.mode in _PLAIN and self._white is None:
                     stored = _orientation(image)
                     image.load()
-                    self._array = _rgb_bytes(_turned(image, stored, _orientation(image), upright=True))
+                    whole = _turned(image, stored, _orientation(image), upright=True)
+                    width, height = whole.size
+                    self._array = np.empty((height, width, 3), np.uint8)
+                    for top in range(0, height, _ROWS):
+                        rows = whole.crop((0, top, width, min(top + _ROWS, height)))
+                        self._array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
                 else:
                     self._array = to_bytes(read_image(self.path, white=self._white))
         return self._array[y1:y2, x1:x2]
-
-
-def _rgb_bytes(image: Any) -> NDArray[np.uint8]:
-    """Bytes `(H, W, 3)` of a Pillow image of 8 bits, converted a few rows at a time."""
-    width, height = image.size
-    array = np.empty((height, width, 3), np.uint8)
-    for top in range(0, height, _ROWS):
-        rows = image.crop((0, top, width, min(top + _ROWS, height)))
-        array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
-    return array
 
 
 def upright_size(image: Any) -> tuple[int, int]:

@@ -6,7 +6,7 @@ import re
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from os import PathLike
 from pathlib import Path
@@ -440,15 +440,6 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
 _ACROSS, _SIDE = 5, 64  # windows in a row, and their sides in pixels, in which the values of a picture are looked at
 
 
-def _sample_windows(size: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
-    """Windows all over a picture in which its values are looked at, row by row."""
-    width, height = size
-    for row in range(_ACROSS):
-        for column in range(_ACROSS):
-            x, y = (length * (1 + 2 * n) // (2 * _ACROSS) for length, n in zip(size, (column, row), strict=True))
-            yield x, y, min(x + _SIDE, width), min(y + _SIDE, height)
-
-
 def _chosen_bands(
     count: int, bands: ChosenBands, usual: tuple[int, ...] | None, path: Path, *, alpha: bool = False
 ) -> list[int]:
@@ -481,10 +472,12 @@ def _tone_of(
     assert picture.path is not None
     if white is not None and not isinstance(white, str):
         return black_and_white(white, np.zeros(0))
-    seen = []
+    seen, (width, height) = [], picture.size
+    downs, acrosses = ([length * (1 + 2 * n) // (2 * _ACROSS) for n in range(_ACROSS)] for length in (height, width))
+    boxes = [(x, y, min(x + _SIDE, width), min(y + _SIDE, height)) for y in downs for x in acrosses]
     # What cannot be decoded is refused where it is read.
     with nullcontext() if white else suppress(Exception):
-        seen = [values(box).ravel() for box in _sample_windows(picture.size)]
+        seen = [values(box).ravel() for box in boxes]
     if white is not None:
         return black_and_white(white, np.concatenate(seen), nodata)
     if seen:

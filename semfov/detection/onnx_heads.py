@@ -27,20 +27,6 @@ def _cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
     return sum(columns * rows for columns, rows in (cells(canvas, stride) for stride in strides))
 
 
-def _decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
-    """Decode the raw output of YOLOX (Ge et al. 2021); raw `(B, N, 5 + K)`, canvas `(width, height)`.
-
-    For the cell (i, j) of a level with stride s, centre and size of the box are
-
-        c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
-    """
-    check_shape(raw, "raw", None, None, None)
-    grid = _grid(raw, canvas, strides, 0.0)
-    centre = (raw[..., 0:2] + grid[:, :2]) * grid[:, 2:]
-    size = raw[..., 2:4].exp() * grid[:, 2:]
-    return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
-
-
 def _decode_yolov5(rows: Tensor) -> Candidates:
     """Decode YOLOv5-style rows, whose boxes the network itself has decoded; rows `(B, N, 5 + K)`."""
     check_shape(rows, "rows", None, None, None)
@@ -112,12 +98,6 @@ def _decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Cand
     check_shape(logits, "logits", None, None, None)
     scores = logits.softmax(-1)
     return Candidates(_fractions(boxes, canvas), scores[..., :-1], background=scores[..., -1])
-
-
-def _decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """Decode DETRs trained with focal loss (RT-DETR): a sigmoid a class, without "no object"; logits `(B, Q, K)`."""
-    check_shape(logits, "logits", None, None, None)
-    return Candidates(_fractions(boxes, canvas), logits.sigmoid())
 
 
 def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offset: float) -> Tensor:
@@ -358,12 +338,22 @@ def _candidates(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candid
 
 
 def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+    """Decode the raw output of YOLOX (Ge et al. 2021), `(B, N, 5 + K)`.
+
+    For the cell (i, j) of a level with stride s, centre and size of the box are
+
+        c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
+    """
     raw = _first(outputs)
+    check_shape(raw, "raw", None, None, None)
     if values_known(raw) and raw.numel():
-        low, high = map(float, raw[..., :4].aminmax())
+        low, high = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         check(not 0 <= low < high <= 1, "output of the head", form, "numbers from 0 to 1, as fractions of the canvas")
-    return _decode_yolox(raw, canvas)
+    grid = _grid(raw, canvas, STRIDES[:3], 0.0)
+    centre = (raw[..., 0:2] + grid[:, :2]) * grid[:, 2:]
+    size = raw[..., 2:4].exp() * grid[:, 2:]
+    return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
 
 
 def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
@@ -388,8 +378,11 @@ def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Cand
 
 
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
+    """Decode DETRs trained with focal loss (RT-DETR): a sigmoid a class, without "no object"; logits `(B, Q, K)`."""
     if "pred_boxes" in outputs:
-        return _decode_rtdetr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas)
+        logits = outputs[_logits(outputs)]
+        check_shape(logits, "logits", None, None, None)
+        return Candidates(_fractions(outputs["pred_boxes"], canvas), logits.sigmoid())
     rows = _first(outputs)  # `(B, Q, 4 + K)`, with the scores after their sigmoid
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])

@@ -105,7 +105,10 @@ class _SourceDistribution(NamedTuple):
                 process.wait()
             log.seek(0)
             if process.returncode != 0:
-                raise DataError(f"pip: {_reason(log.read())}")
+                lines = [line.strip() for line in log if line.strip()]
+                errors = [line for line in lines if line.startswith("ERROR:")]
+                reason = ([*lines, *errors] or ["ended without a message"])[-1]  # the line that describes it best
+                raise DataError(f"pip: {reason.removeprefix('ERROR: ')}")
 
 
 def _largest(folder: Path) -> int:
@@ -118,13 +121,6 @@ def _largest(folder: Path) -> int:
             except FileNotFoundError:
                 continue
     return max(sizes)
-
-
-def _reason(log: str) -> str:
-    """The line of pip's output that describes the error best."""
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith("ERROR:")]
-    return ([*lines, *errors] or ["ended without a message"])[-1].removeprefix("ERROR: ")
 
 
 class _Weights(NamedTuple):

@@ -95,16 +95,14 @@ def _spell(part: object, words: list[str], imports: list[ast.Import | ast.Import
         if isinstance(part, ast.Import | ast.ImportFrom):
             imports.append(part)
     elif isinstance(part, list):
-        lines = [line for line in part if not _is_text(line)]
+        told = (line.value if isinstance(line, ast.Expr) else None for line in part)
+        texts = [isinstance(each, ast.Constant) and isinstance(each.value, str) for each in told]
+        lines = [line for line, text in zip(part, texts, strict=True) if not text]
         words.append(str(len(lines)))
         for line in lines:
             _spell(line, words, imports)
     else:
         words.append(repr(part))
-
-
-def _is_text(line: object) -> bool:
-    return isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant) and isinstance(line.value.value, str)
 
 
 def _imports(name: str, file: Path) -> Iterator[str]:

@@ -24,11 +24,6 @@ NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 
-def recommended_model(detector: str, growth: float) -> str:
-    """Name the observation model that is shipped for a detector with a sensor of this growth."""
-    return f"{detector}-sharp" if growth == 1 else detector
-
-
 def learned_for(detector: str, growth: float) -> str:
     """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth."""
     return f"{detector}-published" if growth == 1 else detector

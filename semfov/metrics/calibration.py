@@ -1,5 +1,6 @@
 """How well predicted probabilities agree with outcomes: scoring rules and calibration errors."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -147,12 +148,12 @@ class BinarySums:
     @property
     def nll(self) -> float:
         """Mean negative log likelihood, in nats; this and all other means are NaN where there are no predictions."""
-        return self._mean(self.surprisal)
+        return self.surprisal / (self.count or math.nan)
 
     @property
     def brier(self) -> float:
         """Mean squared error."""
-        return self._mean(self.square)
+        return self.square / (self.count or math.nan)
 
     @property
     def ece(self) -> float:
@@ -160,6 +161,3 @@ class BinarySums:
         first = self.bins[:, : len(_RARE) + 1].sum(1, keepdim=True)
         error = float(_error_of(torch.cat([first, self.bins[:, len(_RARE) + 1 :]], 1)))
         return error if self.count else float("nan")
-
-    def _mean(self, total: float) -> float:
-        return total / self.count if self.count else float("nan")

@@ -74,8 +74,10 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     ('<!DOCTYPE html>', True)
     """
     # Pictures of large pictures are in the markup, which is complete without the script.
-    drawn = [picture for episode in episodes if "looks" not in episode for picture in pictures_of(episode)]
-    numbers = {picture: number for number, picture in enumerate(dict.fromkeys(drawn))}
+    stepped = [episode for episode in episodes if "looks" not in episode]
+    drawn = [picture for each in stepped for picture in (each["image"], *(look["view"] for look in each["fixations"]))]
+    different = dict.fromkeys(picture for picture in drawn if picture is not None)
+    numbers = {picture: number for number, picture in enumerate(different)}
     data = {
         "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
         "pictures": list(numbers),
@@ -130,12 +132,6 @@ def _about_html(episodes: Sequence[Data]) -> str:
             fact = escape(episodes[0].get(key) or "")
             rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
     return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
-
-
-def pictures_of(episode: Data) -> list[str]:
-    """The pictures of an episode as data URIs, each as often as it is shown."""
-    views = [each["view"] for each in episode["looks" if "looks" in episode else "fixations"]]
-    return [picture for picture in (episode["image"], *views) if picture is not None]
 
 
 def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:

@@ -13,7 +13,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
-from semfov.io.compatibility import learned_for, recommended_model
+from semfov.io.compatibility import learned_for
 from semfov.io.files import check_regular
 from semfov.io.pretrained import shipped_model
 from semfov.observation.foveal import FovealObservationModel
@@ -141,7 +141,8 @@ def observation_name(eye: Eye) -> str:
         name = published_model(detector.name, sensor, detector.selection.threshold)
         if published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
             return name
-    return shipped_model(FovealObservationModel, recommended_model(detector.name, _growth_of(eye)), "MODEL")
+    name = f"{detector.name}-sharp" if _growth_of(eye) == 1 else detector.name
+    return shipped_model(FovealObservationModel, name, "MODEL")
 
 
 def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:

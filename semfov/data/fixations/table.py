@@ -7,6 +7,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -515,15 +516,10 @@ def _reader(
         if line["duration"].lower() in _GONE:
             line["duration"] = ""
         elif export.duration[1] != 1:
-            line["duration"] = repr(_finite(line["duration"]) * export.duration[1])
+            duration = math.nan  # which is refused with its place, as other texts are
+            with suppress(ValueError):
+                duration = float(line["duration"])
+            line["duration"] = repr(duration * export.duration[1])
         return line
 
     return read
-
-
-def _finite(text: str) -> float:
-    """The number; NaN, which is refused with its place, for other texts."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
