@@ -11,7 +11,7 @@ import torch
 
 import semfov
 from semfov import policies, viz
-from semfov.metrics.episodes import answers_of, count_right
+from semfov.metrics.episodes import answers_of, right_cells
 
 torch.set_grad_enabled(False)
 
@@ -64,7 +64,7 @@ for index in range(len(scenes)):
         cells += int(answers.any(-1).sum())
         for name, agent in agents.items():
             path = agent.explore(scene.image, start=start, shifts=looks, worth=0)
-            right[name] += count_right(path.probabilities[..., 1:], answers)
+            right[name] += right_cells(path.probabilities[..., 1:], answers).sum(-1)
 share = {name: counts / cells for name, counts in right.items()}
 print({name: f"{100 * counts[-1]:.0f} %" for name, counts in share.items()})
 
