@@ -83,9 +83,6 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
 
     All cells of a large object are about equally probable, and there is no need to fixate each of them.
 
-    >>> place_known(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]), 0.8)
-    tensor([True])
-
     Shapes: cells `(..., X·Y)`, visited `(..., X·Y)`.
     """
     fixated = cells.masked_fill(~visited, 0).amax(-1)

@@ -34,11 +34,11 @@ def register() -> None:
     """
     for task, name in _IDS.items():
         if name not in gymnasium.registry:
-            one, many = f"{__name__}:make", f"{__name__}:_make_vector"
+            one, many = f"{__name__}:_make", f"{__name__}:_make_vector"
             gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})
 
 
-def make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
+def _make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
     """Make an environment; options of `GazeEnv`, or of `ZoomEnv` where actions are windows."""
     return _KINDS[lookup(action, _KINDS, "action")][task](**options)
 
@@ -52,4 +52,4 @@ def _make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **optio
     own = inspect.signature(ZoomEnv).parameters.keys() - {"task", "scenery"}
     common = {name: options.pop(name) for name in list(options) if name not in own}
     scenery = common.pop("scenery", None) or open_zoom_scenery(**common)
-    return SyncVectorEnv([lambda: make(task, action, scenery=scenery, **options)] * num_envs, autoreset_mode=mode)
+    return SyncVectorEnv([lambda: _make(task, action, scenery=scenery, **options)] * num_envs, autoreset_mode=mode)

@@ -1,13 +1,12 @@
 """Episodes: the loop of active perception, where its looks come from, and the state between two looks."""
 
 from semfov.episode.looks import LiveLooks, Looks, Sight, StoredLooks
-from semfov.episode.loop import Acquire, Step, rollout
+from semfov.episode.loop import Step, rollout
 from semfov.episode.memory import Forgetting, Memory
 from semfov.episode.stopwatch import STAGES, Stopwatch
 
 __all__ = [
     "STAGES",
-    "Acquire",
     "Forgetting",
     "LiveLooks",
     "Looks",

@@ -15,9 +15,6 @@ from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Choice
 
-Acquire = Callable[[Tensor, Tensor], AcquisitionFunction]
-"""Makes the acquisition function for episodes `(A,)` that fixate cells `(A,)`."""
-
 
 @dataclass(frozen=True)
 class Step:
@@ -88,7 +85,7 @@ def attend(
 def rollout(
     looks: Looks,
     observer: Observer,
-    acquisition: AcquisitionFunction | Acquire,
+    acquisition: AcquisitionFunction | Callable[[Tensor, Tensor], AcquisitionFunction],
     start: Tensor,
     choice: Choice,
     *,
@@ -105,7 +102,7 @@ def rollout(
         looks: the source of looks: an eye (`LiveLooks`) or stored detections (`StoredLooks`).
         observer: turns looks into a belief.
         acquisition: acquisition function that values the cells; or a function that makes one for the current episodes
-            and cells, if it differs between episodes.
+            `(A,)` and the cells `(A,)` that they fixate, if it differs between episodes.
         start: `(B,)`, first cell of each episode.
         choice: way to choose the next fixation: `Greedy`, `Relaxed` for gradients, or `Given`.
         most: largest number of looks in an episode.

@@ -13,7 +13,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
 from semfov.errors import DataError, InputError, check
-from semfov.head.scenes import FIELDS, Flat, Panorama, Sphere, World, check_fields
+from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
 
@@ -68,7 +68,7 @@ class PanTiltCamera(Protocol):
     size: tuple[int, int]
     pan: tuple[float, float] = (-180.0, 180.0)
     tilt: tuple[float, float] = (-90.0, 90.0)
-    fields: tuple[float, ...] = FIELDS
+    fields: tuple[float, ...] = (60.0,)
     speeds: Speeds = Speeds()
 
     @abstractmethod

@@ -12,7 +12,7 @@ from semfov.belief.observers.base import own
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
 from semfov.head.speeds import STILL, Speeds
-from semfov.head.views import CELL_POINTS, Views
+from semfov.head.views import Views
 
 FORESIGHT = 0.5
 """Weight of the gain in sharpness over the cells of a view (`SearchGain`)."""
@@ -120,8 +120,9 @@ class ExploreGain(LookGain):
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
         self.model, self.unseen = model, unseen
-        third = torch.tensor([CELL_POINTS // 5, CELL_POINTS // 2, CELL_POINTS - 1 - CELL_POINTS // 5])
-        self._landings = (third[:, None] * CELL_POINTS + third).flatten()
+        side = views.view_grid.columns
+        third = torch.tensor([side // 5, side // 2, side - 1 - side // 5])
+        self._landings = (third[:, None] * side + third).flatten()
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
         """Expected gain of each action.

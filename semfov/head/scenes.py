@@ -21,7 +21,7 @@ from semfov.io.schema import is_number
 from semfov.sensor.perspective import even_rows, go_around, sample
 from semfov.sensor.sphere import Boxes, Camera, Regions, panorama_directions, panorama_points
 
-FIELDS = (60.0,)
+_FIELDS = (60.0,)
 """Default fields of view in degrees."""
 
 _VIEW = (416, 312)
@@ -93,7 +93,7 @@ class Sphere(_Scene):
         *,
         pan: tuple[float, float] = (-180.0, 180.0),
         tilt: tuple[float, float] = (-90.0, 90.0),
-        fields: tuple[float, ...] = FIELDS,
+        fields: tuple[float, ...] = _FIELDS,
         speeds: Speeds | None = None,
         cell: float = 6.0,
     ) -> None:
@@ -198,7 +198,7 @@ class Panorama(Sphere):
         image: ImageLike | tuple[int, int],
         size: tuple[int, int] = _VIEW,
         *,
-        fields: tuple[float, ...] = FIELDS,
+        fields: tuple[float, ...] = _FIELDS,
         speeds: Speeds | None = None,
         cell: float = 6.0,
         reach: float = 60.0,
@@ -227,7 +227,7 @@ class Panorama(Sphere):
         return sample(self._source, pose, self.size).clamp(0, 1), pose
 
 
-class Plane(_Scene):
+class _Plane(_Scene):
     """A plane in front of a window that moves over it, without anything to see.
 
     A pose is the middle of the window, in degrees to the right of and above the middle of the picture, and the window's
@@ -327,7 +327,7 @@ class Plane(_Scene):
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
 
 
-class Flat(Plane):
+class Flat(_Plane):
     """A large picture in front of the viewer, seen through a window that moves over it.
 
     The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
@@ -358,7 +358,7 @@ class Flat(Plane):
         picture: LargePicture | ImageLike | tuple[int, int],
         size: tuple[int, int] = _VIEW,
         *,
-        fields: tuple[float, ...] = FIELDS,
+        fields: tuple[float, ...] = _FIELDS,
         speeds: Speeds | None = None,
         degree: float | None = None,
         cell: float = 6.0,
@@ -378,5 +378,5 @@ class Flat(Plane):
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 
 
-World = Sphere | Plane
+World = Sphere | _Plane
 """A scene of either kind: both have the same methods."""

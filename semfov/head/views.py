@@ -12,7 +12,7 @@ from semfov.errors import check
 from semfov.head.scenes import World, check_fields
 from semfov.head.speeds import Speeds
 
-CELL_POINTS = 10
+_POINTS = 10
 """Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
 
 
@@ -42,8 +42,8 @@ class Views:
             self.tiling.append([row[::2] for row in numbers[::2]])
         self.poses = torch.stack(poses)
         wide, high = world.size
-        self.view_grid, self.cells = Grid(CELL_POINTS, CELL_POINTS, (wide, high)), CELL_POINTS**2
-        self.grid = Grid(CELL_POINTS, CELL_POINTS * len(poses), (wide, high * len(poses)))
+        self.view_grid, self.cells = Grid(_POINTS, _POINTS, (wide, high)), _POINTS**2
+        self.grid = Grid(_POINTS, _POINTS * len(poses), (wide, high * len(poses)))
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         centres = self.view_grid.centres
@@ -66,7 +66,7 @@ class Views:
         poses = [pose for row in self.tiling[0] for pose in row]
         middle = torch.tensor([0.0, 0.0, self.fields[0]]).expand(len(poses), 3)
         nearest = poses[int(self.world.turn(self.poses[poses], middle).argmin())]
-        return nearest * self.cells + self.cells // 2 + CELL_POINTS // 2
+        return nearest * self.cells + self.cells // 2 + _POINTS // 2
 
     @cached_property
     def reachable(self) -> Tensor:
@@ -77,7 +77,7 @@ class Views:
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
         """Interpolate values `(C, cells)` of a view's cells at the scene's cells that it shows, `(C, V)`."""
-        image = values.unflatten(-1, (CELL_POINTS, CELL_POINTS))[None]
+        image = values.unflatten(-1, (_POINTS, _POINTS))[None]
         place = (2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 

@@ -128,31 +128,28 @@ class Format:
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
-        return tensors, record, _restored(tensors, record)
-
-
-def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:
-    """Make the attributes of the base, and check that they fit each other."""
-    classes, target, lengths, targets = record["classes"], record.get("target"), record["lengths"], record["targets"]
-    check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
-    check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
-    check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
-    photograph = tensors.get("photograph")
-    sides = (1,) if photograph is None else photograph.shape[1:]
-    check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
-    looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
-    decision, closer, boxes = record.get("decision"), record["closer"], tensors.get("closer_boxes", torch.zeros(0, 4))
-    check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
-    for look in closer:
-        last = max(look["fixation"] or 0, look["number"] or 0)
-        fits = last < len(lengths) and 1 <= look["target"] < len(classes)
-        check(fits, "closer", f"a look below {len(lengths)} and the index of a class", look)
-    return {
-        **{name: record.get(name) for name in _PLAIN},
-        "classes": tuple(classes),
-        "targets": tuple(targets),
-        "photograph": photograph,
-        "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
-        "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
-        "closer": tuple(CloseUp(**look, box=box) for look, box in zip(closer, boxes, strict=True)),
-    }
+        classes, lengths, targets = (record[name] for name in ("classes", "lengths", "targets"))
+        target, photograph = record.get("target"), tensors.get("photograph")
+        check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
+        check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
+        check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
+        sides = (1,) if photograph is None else photograph.shape[1:]
+        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
+        looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
+        decision, closer = record.get("decision"), record["closer"]
+        boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
+        check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
+        for look in closer:
+            last = max(look["fixation"] or 0, look["number"] or 0)
+            fits = last < len(lengths) and 1 <= look["target"] < len(classes)
+            check(fits, "closer", f"a look below {len(lengths)} and the index of a class", look)
+        shared = {
+            **{name: record.get(name) for name in _PLAIN},
+            "classes": tuple(classes),
+            "targets": tuple(targets),
+            "photograph": photograph,
+            "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
+            "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
+            "closer": tuple(CloseUp(**look, box=box) for look, box in zip(closer, boxes, strict=True)),
+        }
+        return tensors, record, shared

@@ -25,12 +25,6 @@ def merge_fixations(
     The nearest fixation sees a box most sharply, and a closer look more sharply still. The score of the box of a closer
     look is the probability that the target is there, so a place that a closer look has refuted is no candidate.
 
-    >>> far, near = torch.tensor([[[0.0, 0, 10, 10]]]), torch.tensor([[[0.0, 1, 11, 10]]])
-    >>> scores, one = torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool)
-    >>> looks = Detections(far, scores, one), Detections(near, scores, one)
-    >>> merge_fixations(looks, [torch.tensor([90.0]), torch.tensor([5.0])]).boxes
-    tensor([[ 0.,  1., 11., 10.]])
-
     Shapes: distances `(L,)`, cut `(L,)`.
     """
     boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window, overview, points_closer
+from semfov.zoom.glances import Glance, Glances, Window, overview
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
@@ -122,7 +122,7 @@ def look_by_look(
     def prepare(window: Window) -> None:
         assert guess is not None
         beside: Window | None = window
-        if belief is not None and not points_closer(window, glances.lattice):
+        if belief is not None and not window.points_closer(glances.lattice):
             # Whatever the look shows, the belief about where to look next is known.
             belief.discount(window)
             beside = None

@@ -13,11 +13,12 @@ from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
-from semfov.detection.selection import select
+from semfov.detection.scores import BackgroundPolicy, Candidates, shares
+from semfov.detection.selection import check_candidates, check_scores, select
 from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import edges_at
 from semfov.threads import beside
-from semfov.zoom.hints import Hints, hints_of
+from semfov.zoom.hints import Hints
 from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
@@ -162,7 +163,7 @@ class WindowEye(nn.Module):
         windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
             return WindowLooks(detections, cut, None, windows)
-        faint = [hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
+        faint = [_hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
         placed = [
             Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
             for number, each in enumerate(faint)
@@ -268,6 +269,17 @@ class WindowEye(nn.Module):
         """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
         return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float) -> Hints:
+    """Take the hints from all boxes of a detector's head."""
+    confidence = candidates.confidence[image].detach()
+    index = (confidence >= faint).nonzero()[:, 0]
+    selected = candidates.take(image, index)
+    boxes = selected.boxes.detach()
+    check_candidates(image, confidence, boxes)
+    check_scores(image, selected)
+    return Hints(boxes, shares(selected, policy)[1].detach())
 
 
 def _unit(canvases: Tensor) -> Tensor:

@@ -40,6 +40,10 @@ class Window:
         x1, y1, x2, y2 = self.region(lattice)
         return (x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2
 
+    def points_closer(self, lattice: Lattice) -> bool:
+        """Whether a look tells where to look more closely: it is on the lattice, and not of the last level."""
+        return self.within is None and self.level < lattice.levels - 1
+
 
 @dataclass(frozen=True)
 class Glance:
@@ -123,7 +127,7 @@ class LiveGlances(Glances):
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Resample the windows and detect in them."""
-        hints = hints or any(points_closer(window, self.lattice) for window in windows)
+        hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
         meanwhile, self.meanwhile = self.meanwhile, None
@@ -146,7 +150,7 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
     look_gist, faint = None, None
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]
-    elif points_closer(window, lattice):
+    elif window.points_closer(lattice):
         look_gist = gist(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
         scores = look_gist.scores.flatten(0, 1)
     else:
@@ -154,8 +158,3 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
         faint = looks.hints[number] if lattice.levels == 1 else None
     show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
     return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
-
-
-def points_closer(window: Window, lattice: Lattice) -> bool:
-    """Whether a look at a window tells where to look more closely: it is on the lattice, and not of the last level."""
-    return window.within is None and window.level < lattice.levels - 1

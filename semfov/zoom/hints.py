@@ -10,9 +10,6 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.detector import FAINT
-from semfov.detection.scores import BackgroundPolicy, Candidates, shares
-from semfov.detection.selection import check_candidates, check_scores
 from semfov.zoom.lattice import Lattice
 
 FINEST = 32
@@ -30,17 +27,6 @@ class Hints(NamedTuple):
 
     boxes: Tensor
     scores: Tensor
-
-
-def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float = FAINT) -> Hints:
-    """Take the hints from all boxes of a detector's head."""
-    confidence = candidates.confidence[image].detach()
-    index = (confidence >= faint).nonzero()[:, 0]
-    selected = candidates.take(image, index)
-    boxes = selected.boxes.detach()
-    check_candidates(image, confidence, boxes)
-    check_scores(image, selected)
-    return Hints(boxes, shares(selected, policy)[1].detach())
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from torch import Tensor
 from semfov import Detector, InputError, Selection, WindowEye
 from semfov.detection import Candidates
 from semfov.detection.detector import FAINT
+from semfov.zoom.eye import _hints_of
 from semfov.zoom.glances import LiveGlances, on_lattice
-from semfov.zoom.hints import DETECTION_SCORE, hints_of
+from semfov.zoom.hints import DETECTION_SCORE
 
 KINDS = 3
 
@@ -130,6 +131,6 @@ def test_hints_that_are_not_finite_are_refused(value):
     boxes, classes = torch.rand(1, 5, 4), torch.full((1, 5, 2), 0.01)
     boxes[0, 3, 2] = value
     with pytest.raises(InputError, match="detector: boxes in image 0"):
-        hints_of(Candidates(boxes, classes), 0, "residual")
+        _hints_of(Candidates(boxes, classes), 0, "residual", 0.0)
     with pytest.raises(InputError, match="detector: objectness in image 0"):
-        hints_of(Candidates(torch.rand(1, 5, 4), classes, torch.full((1, 5), 2.0)), 0, "residual")
+        _hints_of(Candidates(torch.rand(1, 5, 4), classes, torch.full((1, 5), 2.0)), 0, "residual", 0.0)
