@@ -141,8 +141,9 @@ def rollout(
         values = acquire(episodes, cell)(belief, visited)
         next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
         watch.lap("choose")
-        chosen = values, next_cell, next_fixation, watch.seconds
-        step = Step(shift, episodes, cell, fixation, sight, belief, visited, *chosen)
+        step = Step(
+            shift, episodes, cell, fixation, sight, belief, visited, values, next_cell, next_fixation, watch.seconds
+        )
         yield step
         over = visited.all(-1)
         going = ~over if ends is None else ~(over | ends(step))

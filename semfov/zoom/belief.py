@@ -25,13 +25,6 @@ _Place = tuple[slice, slice]
 """Rows and columns of an array."""
 
 
-def _union(box: _Box, other: _Box | None) -> _Box:
-    """The smallest box that contains both boxes; the first one if there is no other."""
-    if other is None:
-        return box
-    return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
-
-
 def _extent(marked: NDArray[np.bool_]) -> _Box:
     """Find the smallest box that contains all marked cells; marked `(rows, columns)`."""
     rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
@@ -163,11 +156,7 @@ class _WindowOdds:
         self._odds: dict[int, Cells] = {
             level: np.full(lattice.places(level)[::-1], -np.inf, np.float32) for level in range(1, lattice.levels)
         }
-        self._changed: _Box | None = None
-
-    def mark(self, changed: _Box) -> None:
-        """Have the log odds computed anew where less or more is left to see."""
-        self._changed = _union(changed, self._changed)
+        self.changed: _Box | None = None
 
     @torch.no_grad()
     def update(self) -> Mapping[int, Cells]:
@@ -175,9 +164,9 @@ class _WindowOdds:
         fresh = [_Look(gist, self._lattice) for gist in self._gists[len(self._looks) :]]
         # A look changes what closer ones start from, and a change in what is left to see concerns looks of all levels.
         changed = [(look.box, look.gist.level) for look in fresh]
-        if self._changed is not None:
-            changed.append((self._changed, -1))
-            self._changed = None
+        if self.changed is not None:
+            changed.append((self.changed, -1))
+            self.changed = None
         if changed:
             self._looks = sorted(self._looks + fresh, key=lambda look: look.gist.level)
             concerned = [
@@ -263,17 +252,13 @@ class _WindowSums:
         self._band = np.zeros((len(places) + self._span - 1, len(places)), np.float32)
         self._band[places + np.arange(self._span)[:, None], places] = weight[:, None]
         self._sums = np.zeros([max(n - self._span, 0) + 1 for n in shape], np.float32)
-        self._changed: _Box | None = (0, 0, shape[1], shape[0])
-
-    def mark(self, changed: _Box) -> None:
-        """Have the windows summed again that hold one of some cells."""
-        self._changed = _union(changed, self._changed)
+        self.changed: _Box | None = (0, 0, shape[1], shape[0])
 
     def update(self) -> Cells:
         """Sum the cells of every window, `(down, across)`; the next call changes the result."""
-        if self._changed is None:
+        if self.changed is None:
             return self._sums
-        (x1, y1, x2, y2), self._changed = self._changed, None
+        (x1, y1, x2, y2), self.changed = self.changed, None
         reach = self._span - 1
         top, left = max(y1 - reach, 0), max(x1 - reach, 0)
         bottom, right = min(y2, self._sums.shape[0]), min(x2, self._sums.shape[1])
@@ -385,12 +370,12 @@ class ZoomBelief:
                 part[:] = 0
                 self._mark((x1, y1, x2, y2))
 
-    def _mark(self, changed: _Box, *, left: bool = True) -> None:
+    def _mark(self, box: _Box, *, left: bool = True) -> None:
         """Mark stored values of windows as outdated where cells, or the share of them that is left, changed."""
-        for sums in self._sums.values():
-            sums.mark(changed)
-        if left and self._odds is not None:
-            self._odds.mark(changed)
+        stored: list[_WindowSums | _WindowOdds] = [*self._sums.values()]
+        for each in [*stored, self._odds] if left and self._odds is not None else stored:
+            other = each.changed or box
+            each.changed = min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
 
     def _box(self, look: Gist) -> _Box:
         """The cells that a look shows."""

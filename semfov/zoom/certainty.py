@@ -67,14 +67,9 @@ class Certainty:
         """Read a certainty from the numbers of a file."""
         if len(numbers) == 2:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
-        first = len(FACTS) + 1
-        check(
-            len(numbers) - first in (2, 4, 5),
-            "certainty",
-            f"2, {first + 2}, {first + 4} or {first + 5} numbers",
-            len(numbers),
-        )
-        return cls(numbers[0], tuple(numbers[1:first]), *numbers[first:])
+        count = len(FACTS) + 6
+        check(len(numbers) == count, "certainty", f"2 or {count} numbers", len(numbers))
+        return cls(numbers[0], tuple(numbers[1:-5]), *numbers[-5:])
 
     @property
     def numbers(self) -> list[float]:

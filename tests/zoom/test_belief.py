@@ -47,7 +47,7 @@ def test_cached_window_sums_equal_recomputed_sums():
             np.testing.assert_allclose(kept.update(), expected, rtol=1e-5)
             row, column = int(generator.integers(shape[0])), int(generator.integers(shape[1]))
             cells[row : row + 2, column : column + 3] = generator.random()
-            kept.mark((column, row, min(column + 3, shape[1]), min(row + 2, shape[0])))
+            kept.changed = (column, row, min(column + 3, shape[1]), min(row + 2, shape[0]))
 
 
 @pytest.mark.parametrize("size", [(4096, 200), (4096, 530), (300, 4096)])
