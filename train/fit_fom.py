@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from semfov.fit.observation import count_misses, fit_published, level_edges, statistics_of
-from semfov.fit.outputs import split
 from semfov.fit.settings import FitConfig
+from semfov.fit.training import split
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import Calibration, calibration

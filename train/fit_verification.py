@@ -19,8 +19,8 @@ from pathlib import Path
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.fit.outputs import training_of
 from semfov.fit.searches import open_photographs
+from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, fit_in_folds, verification_report
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig

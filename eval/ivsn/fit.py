@@ -24,8 +24,8 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detector import Detector
 from semfov.errors import DataError
-from semfov.fit.outputs import training_of
 from semfov.fit.settings import FitConfig
+from semfov.fit.training import training_of
 from semfov.runs.command import command
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes

@@ -63,10 +63,17 @@ class ResultsFile:
     def add(self, number: int, row: dict[str, Any]) -> None:
         """Add a picture, or one that could not be read, with its `error`."""
         self._rows[number] = row
-        if self.kind == ".jsonl":
-            self._line(row["picture"])
-        elif time.monotonic() >= self._due:
-            self.write()
+        if self.kind != ".jsonl":
+            if time.monotonic() >= self._due:
+                self.write()
+            return
+        line = json.dumps(row["picture"], ensure_ascii=self._stream is not None) + "\n"
+        if self._stream is None:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(line)
+        else:  # which may have another encoding
+            self._stream.write(line)
+            self._stream.flush()
 
     def write(self) -> None:
         """Write the file, atomically."""
@@ -85,16 +92,6 @@ class ResultsFile:
         results, images = [part for row in rows for part in row["parts"]], [row["image_id"] for row in rows]
         ap, ap50 = self.truth.precision(results, images, [*categories])
         return f"AP {ap:.3f}, AP50 {ap50:.3f} against {self.truth.path} ({len(rows)} pictures, {len(results)} boxes)"
-
-    def _line(self, values: dict[str, Any]) -> None:
-        """Write a line now."""
-        line = json.dumps(values, ensure_ascii=self._stream is not None) + "\n"  # the stream may have another encoding
-        if self._stream is not None:
-            self._stream.write(line)
-            self._stream.flush()
-            return
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(line)
 
     def _text(self) -> str:
         every = [self._rows[number] for number in sorted(self._rows)]

@@ -23,12 +23,11 @@ from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms, decide, place_known
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
-from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
-from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
+from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error

@@ -19,12 +19,11 @@ from semfov.belief.observers import LearnedMap, Semantic
 from semfov.belief.observers.learned_map import MapBelief, MapLook
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError, InputError
-from semfov.fit.descent import descend
 from semfov.fit.detector_report import Difference, curves_figure, mean_percent, section
 from semfov.fit.examples import Examples, example_episodes
-from semfov.fit.outputs import Fit, split, training_of
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitOnLooksConfig
+from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error

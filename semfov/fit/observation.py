@@ -14,8 +14,8 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, section
-from semfov.fit.outputs import split
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel

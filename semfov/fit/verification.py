@@ -18,10 +18,10 @@ from semfov.decision import OUTCOMES, Verifier, verified
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import SUREST_OF_FEW
-from semfov.fit.outputs import training_of
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import FitOnCellsConfig
+from semfov.fit.training import training_of
 from semfov.io.manifest import Part
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, area_under_roc

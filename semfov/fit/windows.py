@@ -20,10 +20,9 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, ChosenScenes, Scenes
 from semfov.decision import OUTCOMES, SAME, settle
 from semfov.errors import check
-from semfov.fit.descent import descend
 from semfov.fit.evidence import choose_thresholds
-from semfov.fit.outputs import training_of
 from semfov.fit.searches import TargetSearch
+from semfov.fit.training import descend, training_of
 from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
 from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_evidence import (
@@ -157,9 +156,7 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         objects: Tensor,
         passes: int,
         likely: float,
-        glances: Sequence[Glance],
-        steps: Sequence[WindowLook],
-        boxes: Sequence[Tensor | None],
+        turns: Iterable[tuple[WindowStep[ZoomBelief], SearchFacts]],
     ) -> None:
         places = partial(CandidateBoxes, target, likely)
         super().__init__(
@@ -170,7 +167,13 @@ class _MosaicSearch(TargetSearch[WindowLook]):
             present=len(objects) > 0,
             passes=passes,
         )
-        self.looks, self.objects, self.glances, self.steps, self.boxes = looks, objects, glances, steps, boxes
+        self.looks, self.objects, self.steps = looks, objects, list[WindowLook]()
+        self.glances, self.boxes = list[Glance](), list[Tensor | None]()
+        for number, (turn, facts) in enumerate(turns, 1):
+            presence = facts.presence(turn.ahead)
+            self.steps.append(WindowLook(turn.glance.detections, number, presence, facts.best, turn.ahead))
+            self.glances.append(turn.glance)
+            self.boxes.append(facts.box if facts.detected else None)
 
     def look(self, index: int, number: int) -> WindowLook:
         """Return a look with the number of looks up to it."""
@@ -198,17 +201,8 @@ def _mosaic_searches(
     """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
     for index, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
-        glances: list[Glance] = []
-        states: list[WindowLook] = []
-        boxes: list[Tensor | None] = []
-        for number, (turn, facts) in enumerate(turns, 1):
-            detections, presence = turn.glance.detections, facts.presence(turn.ahead)
-            glances.append(turn.glance)
-            states.append(WindowLook(detections, number, presence, facts.best, turn.ahead))
-            boxes.append(facts.box if facts.detected else None)
         objects = annotation.boxes[annotation.labels == target]
-        likely = model.thresholds.confirm
-        yield _MosaicSearch(index, opened[index], target, objects, config.passes, likely, glances, states, boxes)
+        yield _MosaicSearch(index, opened[index], target, objects, config.passes, model.thresholds.confirm, turns)
 
 
 def _fit_closer(

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.detection.objects import LEAST
-from semfov.fit.descent import descend
+from semfov.fit.training import descend
 from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of

@@ -1,13 +1,17 @@
-"""The outputs of every fit: a model with metadata about the training, a report, the settings and measures as JSON."""
+"""Training of small networks: photographs that are held out, the loop, and what a model tells about it."""
 
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
+from semfov.runs.progress import task_bar
 
 _Model = TypeVar("_Model", bound=Pretrained)
 
@@ -38,3 +42,31 @@ def split(scene: Tensor, holdout: int) -> Tensor:
             "photographs"
         )
     return held_out
+
+
+def descend(
+    parameters: Iterable[nn.Parameter],
+    loss_of: Callable[[int], Tensor],
+    steps: int,
+    rate: float,
+    *,
+    clip: float | None = 1.0,
+    decay: float = 1e-2,
+    title: str = "training",
+) -> None:
+    """Train with AdamW and one cycle of the learning rate (Smith and Topin, 2019)."""
+    trained = list(parameters)
+    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+    with closing(task_bar(steps, title, "step")) as bar:
+        for number in range(steps):
+            loss = loss_of(number)
+            optimiser.zero_grad()
+            loss.backward()
+            if clip is not None:
+                torch.nn.utils.clip_grad_norm_(trained, clip)
+            optimiser.step()
+            schedule.step()
+            bar.update()
+            if number % 25 == 0:
+                bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
