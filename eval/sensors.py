@@ -39,8 +39,8 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import finish
-from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table
 from train.fit_fom import FitFomConfig, fit_fom

@@ -28,8 +28,8 @@ from semfov.gaze.policies import Policy
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.presets import label
+from semfov.runs.protocols import DrawnSearch, choose_searches
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import DrawnSearch, choose_searches
 from semfov.runs.setup import make_learned
 
 COUNTS = (1, 5, 15)

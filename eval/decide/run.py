@@ -36,8 +36,8 @@ from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import photograph_looks
+from semfov.runs.protocols import DrawnSearch, choose_searches, search_steps
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import DrawnSearch, choose_searches, search_steps
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks

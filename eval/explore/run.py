@@ -19,7 +19,7 @@ from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig
-from semfov.runs.exploration_protocol import (
+from semfov.runs.protocols import (
     Exploration,
     counts_of,
     explorations_of,

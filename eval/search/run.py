@@ -12,8 +12,8 @@ from eval.comparison.settings import ComparedConfig
 from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig
+from semfov.runs.protocols import Trial, episodes_of, run_episodes
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Trial, episodes_of, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Whole
 

@@ -26,9 +26,9 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST
 from semfov.episode import Stopwatch
 from semfov.paths import ZoomPath
+from semfov.runs.protocols import choose_classes
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
-from semfov.runs.search_protocol import choose_classes
 from semfov.runs.settings import Count, Range
 from semfov.runs.window_looking import (
     TileSize,

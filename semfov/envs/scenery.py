@@ -35,9 +35,8 @@ from semfov.runs.config import (
     RunConfig,
     SensorConfig,
 )
-from semfov.runs.exploration_protocol import explorations_of
 from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.search_protocol import Trial, episodes_of
+from semfov.runs.protocols import Trial, episodes_of, explorations_of
 from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
 from semfov.zoom.glances import Glance, overview

@@ -35,7 +35,7 @@ from semfov.metrics.episodes import FloatArray, area_under_roc, cumulative_perfo
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import (
+from semfov.runs.protocols import (
     choose_classes,
     choose_searches,
     episodes_of,

@@ -29,9 +29,9 @@ from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, answers_of
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.exploration_protocol import explorations_of, run_explorations
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
+from semfov.runs.protocols import explorations_of, run_explorations
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.settings import Count, Range, Share
 from semfov.runs.tables import table

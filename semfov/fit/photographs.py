@@ -17,7 +17,7 @@ from semfov.fit.verification import choose_confirm, examine, fit, verification_r
 from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread, left_out, logistic_regression
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import choose_classes
+from semfov.runs.protocols import choose_classes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely

@@ -26,7 +26,7 @@ from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import CellLooks
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.search_protocol import DrawnSearch, choose_classes, choose_searches
+from semfov.runs.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
 
 

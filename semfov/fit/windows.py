@@ -42,8 +42,8 @@ from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation.matching import box_iou
 from semfov.runs.progress import track
+from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import store_folder
-from semfov.runs.search_protocol import choose_classes
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker, run_tasks

@@ -8,7 +8,7 @@ import torch
 from semfov.envs import EpisodeEnv, GazeVectorEnv
 from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.runs.search_protocol import Trial
+from semfov.runs.protocols import Trial
 from semfov.runs.seeds import noise_for
 from semfov.zoom.glances import overview
 from semfov.zoom.policy import best_find, best_hit

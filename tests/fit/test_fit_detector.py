@@ -39,7 +39,7 @@ from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
-from semfov.runs.search_protocol import choose_classes
+from semfov.runs.protocols import choose_classes
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
 from tests.refusals import refused, unusable
 from tests.small import once

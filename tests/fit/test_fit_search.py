@@ -26,7 +26,7 @@ from semfov.fit.evidence import (
 from semfov.fit.examples import _ExampleLooks, example_episodes
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Given
-from semfov.runs.search_protocol import choose_classes
+from semfov.runs.protocols import choose_classes
 from tests.small import cells_of, looking
 
 GRID = Grid(4, 4, (640, 480))

@@ -17,7 +17,7 @@ from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
-from semfov.runs.search_protocol import choose_classes
+from semfov.runs.protocols import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_eye
 

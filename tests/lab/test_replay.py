@@ -10,7 +10,7 @@ from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.run import SearchConfig, SearchRun
 from semfov import ActivePerception, MapEvidence, rollout
 from semfov.belief.observers import LearnedMap
-from semfov.runs import exploration_protocol, search_protocol
+from semfov.runs import protocols
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from tests.small import run_settings
 
@@ -35,7 +35,7 @@ def run(settings):
     return SearchRun(SearchConfig(**settings, policies=(*SEMANTIC, SOUGHT)))
 
 
-def run_and_record_steps(run, module):
+def run_and_record_steps(run):
     """Records of the first scene by policy, each with the steps of all its episodes."""
     calls = []
 
@@ -47,7 +47,7 @@ def run_and_record_steps(run, module):
             yield step
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "rollout", spy)
+        patch.setattr(protocols, "rollout", spy)
         records, _ = run.outcomes(0)
     assert len(calls) == len(run.policies)
     by_policy = {name: [record for record in records if record["policy"] == name] for name in run.policies}
@@ -56,7 +56,7 @@ def run_and_record_steps(run, module):
 
 @pytest.fixture(scope="module")
 def searched(run):
-    return run_and_record_steps(run, search_protocol)
+    return run_and_record_steps(run)
 
 
 def steps_of(steps, episode):
@@ -149,7 +149,7 @@ def test_a_search_with_a_wrong_cue_is_replayed_with_the_belief_about_the_cue(run
 def test_a_replayed_exploration_has_the_original_beliefs_and_values(settings):
     policies = ("kl-calibrated", "recommended", "vocus2-raw", PolicyConfig("surprise", misses=True))
     run = ExploreRun(replace(ExploreConfig(**settings), policies=policies))
-    for records, steps in run_and_record_steps(run, exploration_protocol).values():
+    for records, steps in run_and_record_steps(run).values():
         for number, record in enumerate(records):
             path = replay(run, 0, record)
             assert path.cells.tolist() == record["cells"]

@@ -13,7 +13,7 @@ from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.exploration_protocol import explorations_of, run_explorations
+from semfov.runs.protocols import explorations_of, run_explorations
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from tests.small import FixedLook, kaplan

@@ -13,7 +13,7 @@ from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.metrics.episodes import cumulative_performance
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.search_protocol import episodes_of, run_episodes
+from semfov.runs.protocols import episodes_of, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from tests.small import FixedLook

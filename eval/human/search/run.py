@@ -19,8 +19,8 @@ from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch, StoredLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.protocols import Trial, run_episodes
 from semfov.runs.results import ResultRecord
-from semfov.runs.search_protocol import Trial, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Range, Settings
 
