@@ -71,11 +71,11 @@ class Record(Conversion):
 
     def __repr__(self) -> str:
         """The summary, the looks, and the most confident objects."""
-        objects, sure = self.objects, self.confirmed.tolist()
-        rows = zip(self.object_rows()[:_NAMED], sure, strict=False)
+        objects, lower = self.objects, self.listed_by_score.tolist()
         named = [
-            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){' (confirmed)' * confirmed}"
-            for row, confirmed in rows
+            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f})"
+            f"{' (confirmed)' * row['confirmed']}{' (by score alone)' * by_score}"
+            for row, by_score in zip(self.object_rows()[:_NAMED], lower, strict=False)
         ]
         more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
         found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"

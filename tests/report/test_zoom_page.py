@@ -102,6 +102,7 @@ def test_an_object_that_counts_by_its_score_in_the_whole_picture_is_told_from_th
     path = replace(zoom_path, classes=("background", "cat", "dog", "cup"), **found)
     assert path.listed_by_score.tolist() == [False, True]
     assert not replace(path, least=0.4).listed_by_score.any()
+    assert re.search(r"dog 0\.80 at \(\d+, \d+\), dog 0\.40 at \(\d+, \d+\) \(by score alone\)", repr(path))
     page = page_html("field", [zoom_data(path, large_picture, name="field")])
     assert "Less probable, listed by the score in the whole picture: 2." in page
     (axes,) = path.plot(image=large_picture).axes
