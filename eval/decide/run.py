@@ -283,7 +283,7 @@ class DecisionRun(ComparedLooking):
                         **common,
                         "outcome": decision.outcome,
                         "probability": decision.probability,
-                        "place": decision.place,
+                        "place": None if verifier is None else decision.place,
                         "looks": len(steps) + closely,
                         "closer": closely,
                         "right_place": None if decision.cell is None else bool(goal[decision.cell]),

@@ -107,15 +107,15 @@ def conclude(
     evidence = [
         grid.footprint(look.boxes, "soft")[0] * (look.mask[0] * look.scores[0, :, target])[:, None] for look in looks
     ]
+    cells = belief.probability(target)[0]
     if cell is None:
-        cells = belief.probability(target)[0]
         strongest = torch.cat([cells.new_zeros(1, len(grid)), *evidence]).amax(0)
         cell = int((cells * strongest if bool(strongest.any()) else cells).argmax())
     best, box = 0.0, None
     for look, values in zip(looks, evidence, strict=True):
         if len(values) and float(values[:, cell].max()) > best:
             best, box = float(values[:, cell].max()), look.boxes[0, int(values[:, cell].argmax())]
-    return Decision("found", probability, cell, box)
+    return Decision("found", probability, cell, box, float(cells[cell]))
 
 
 def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:

@@ -88,7 +88,7 @@ def test_without_closer_looks_or_without_their_model_the_belief_decides(image):
         other = plain.search(image, "red", start=0)
         assert one.cells.tolist() == other.cells.tolist()
         assert one.decision.outcome == other.decision.outcome
-        assert (one.decision.place, one.closer) == (None, ())
+        assert (one.decision.place, one.closer) == (pytest.approx(0.95), ())  # of the cell, by the belief
 
 
 def test_thresholds_can_be_changed_and_are_checked(image):

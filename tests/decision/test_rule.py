@@ -215,7 +215,9 @@ def test_search_ends_when_the_target_is_found(image):
     torch.testing.assert_close(decision.box, torch.tensor([130.0, 90, 150, 110]), atol=6, rtol=0)
     boxes = torch.cat([seen.boxes[0] for seen in scanpath.detections])
     assert bool((boxes == decision.box).all(-1).any())
-    assert scanpath.describe() == "“red” found after 2 gaze shifts (probability 0.97)"
+    assert scanpath.describe() == "“red” found after 2 gaze shifts (probability 0.97, 0.95 at this place)"
+    # The object has the probability of its place, not that of the picture.
+    assert scanpath.objects.scores[scanpath.confirmed].tolist() == pytest.approx([0.95])
 
 
 def test_the_target_may_be_found_in_another_cell_than_the_last_fixation(image):
@@ -252,7 +254,9 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
     # Without detections the belief alone decides.
     nothing = [Detections.empty(1, 3)]
-    assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
+    assert conclude(1, belief, nothing, grid, 2) == Decision(
+        "found", 0.75, int(known.argmax()), None, float(known.max())
+    )
 
 
 @pytest.mark.parametrize(
