@@ -15,6 +15,10 @@ from semfov.detection.objects import LEAST
 from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import InputError, check, check_shape, values_known
+from semfov.sensor.lines import constant
+
+_Outputs = Mapping[str, Tensor]
+_Canvas = tuple[int, int]
 
 
 def cells(canvas: tuple[int, int], stride: int) -> tuple[int, int]:
@@ -72,7 +76,7 @@ def _decode_distances(
     distances: Tensor,
     canvas: tuple[int, int],
     *,
-    strides: Sequence[int] = (8, 16, 32, 64),
+    strides: tuple[int, ...] = (8, 16, 32, 64),
     offset: float = 0.5,
 ) -> Candidates:
     r"""Decode boxes given as distributions over the distance to each side (distribution focal loss, Li et al. 2020).
@@ -87,7 +91,7 @@ def _decode_distances(
     bins = distances.shape[-1] // 4
     whole = bins > 0 and distances.shape[-1] == 4 * bins
     check(whole, "distances", "4 · bins channels, the same number of bins for each side", tuple(distances.shape))
-    grid = _grid(distances, canvas, strides, offset)
+    grid = _grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
     expected = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     point, reach = grid[:, :2] * grid[:, 2:], expected * grid[:, 2:]
     return Candidates(torch.cat([point - reach[..., :2], point + reach[..., 2:]], -1), classes)
@@ -100,16 +104,18 @@ def _decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Cand
     return Candidates(_fractions(boxes, canvas), scores[..., :-1], background=scores[..., -1])
 
 
-def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offset: float) -> Tensor:
+@constant
+def _grid(
+    count: int, canvas: _Canvas, strides: tuple[int, ...], offset: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Column, row and stride of each of the `count` cells of all levels, `(N, 3)`."""
     expected = _cell_count(canvas, strides)
-    what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
-    check(tensor.shape[1] == expected, "output of the head", what, tensor.shape[1])
+    what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {strides}"
+    check(count == expected, "output of the head", what, count)
     levels = []
     for stride in strides:
-        columns, rows = cells(canvas, stride)
-        column = torch.arange(columns, device=tensor.device, dtype=tensor.dtype) + offset
-        row = torch.arange(rows, device=tensor.device, dtype=tensor.dtype) + offset
-        x, y = torch.meshgrid(column, row, indexing="xy")
+        columns, rows = (torch.arange(side, device=device, dtype=dtype) + offset for side in cells(canvas, stride))
+        x, y = torch.meshgrid(columns, rows, indexing="xy")
         levels.append(torch.stack([x, y, torch.full_like(x, stride)], -1).reshape(-1, 3))
     return torch.cat(levels)
 
@@ -149,9 +155,6 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
     }
     return next((form for form, fits in forms.items() if fits), None)
 
-
-_Outputs = Mapping[str, Tensor]
-_Canvas = tuple[int, int]
 
 _FRACTIONS = 2.0
 """Coordinates up to here, of all boxes of a canvas, are no pixels."""
@@ -350,7 +353,7 @@ def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
         low, high = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         check(not 0 <= low < high <= 1, "output of the head", form, "numbers from 0 to 1, as fractions of the canvas")
-    grid = _grid(raw, canvas, STRIDES[:3], 0.0)
+    grid = _grid(raw.shape[1], canvas, STRIDES[:3], 0.0, raw.dtype, raw.device)
     centre = (raw[..., 0:2] + grid[:, :2]) * grid[:, 2:]
     size = raw[..., 2:4].exp() * grid[:, 2:]
     return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
