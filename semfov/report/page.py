@@ -88,13 +88,13 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
-    about = _about_html(episodes)
+    about, several = _about_html(episodes), bool(sections) or len(episodes) > 1
     contents = {
         "title": escape(title),
         "sections": sections,
-        # What the sections sum up comes before the facts about one episode.
-        "about": "" if sections else about,
-        "of_episode": about if sections else "",
+        # The facts about one of several episodes stand where it is chosen.
+        "about": "" if several else about,
+        "of_episode": about if several else "",
         "looks": "".join(
             _looks_html(episode, f"large-{number}", headed=number == 0)
             for number, episode in enumerate(episodes)

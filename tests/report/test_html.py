@@ -12,7 +12,7 @@ from PIL import Image
 
 from eval.comparison.curves_html import curves_html
 from semfov.decision import Decision
-from semfov.report import write_page
+from semfov.report import page_html, write_page
 from semfov.report.episode import episode_data
 from semfov.report.page import table_html
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
@@ -51,6 +51,8 @@ def test_a_page_begins_with_its_summary_or_else_with_the_facts_of_the_episode(ru
     data = episode_data(scanpath, image, [image] * 3, name="kitchen")
     single = write_page(tmp_path / "page.html", "Cup", [data]).read_text(encoding="utf-8")
     assert single.index('id="about"') < single.index('id="viewer"')
+    both = page_html("Cup", [data, data])
+    assert both.index('id="episode"') < both.index('id="about"')
 
 
 def test_names_are_not_interpreted_as_placeholders_of_the_template(scanpath, image, tmp_path):
