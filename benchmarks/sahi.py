@@ -42,7 +42,7 @@ from semfov.runs.window_looking import TileSize, right_boxes
 from semfov.viz.style import COLOURS, make_figure, save_figure, styled
 from semfov.zoom.episode import Order, WindowStep, look_by_look
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import LiveGlances, Window, overview
+from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.slices import slices
@@ -100,7 +100,7 @@ class Parts:
         """The boxes of a part `(H, W, 3)` that `merge` would take."""
         self.passes += 1
         view = self.eye.open(np.ascontiguousarray(pixels))
-        look = self.eye.glance(view, torch.tensor([overview(view.lattice).fixation]), hints=False).detections
+        look = self.eye.glance(view, torch.tensor([Window.overview(view.lattice).fixation]), hints=False).detections
         scores, labels = look.confidence[0], look.labels[0]
         if self.target is not None:
             scores, labels = look.scores[0, :, self.target], torch.full_like(labels, self.target)

@@ -11,7 +11,7 @@ from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window, around
+from semfov.zoom.glances import Glance, Glances, Window
 from train.zoom_slices import look_for_slice
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
@@ -51,7 +51,7 @@ def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
     The measure is the mean number of passes until a look at a photograph that shows the class.
     """
     near, opened = fit.mosaics["judged"], fit.opened("judged")
-    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
+    slots = [[Window.around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
     for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value

@@ -8,7 +8,7 @@ from torch import Tensor
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
-from semfov.zoom.glances import Glance, Glances, Window, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.policy import WindowChoice, best_hit
 
 
@@ -63,7 +63,7 @@ def _best_slice(
         half, (across, down) = max(1, lattice.span(level) // 4), lattice.places(level)
         for row in sorted({*range(0, down, half), down - 1}):
             for column in sorted({*range(0, across, half), across - 1}):
-                coarse = on_lattice(lattice, (level, column, row))
+                coarse = Window.on(lattice, (level, column, row))
                 if coarse in done:
                     continue
                 inside = [p for w, p in chances.items() if _inside(w, coarse) and _coarser(belief, w, level)]

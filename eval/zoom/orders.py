@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
-from semfov.zoom.glances import Glance, Glances, Window, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
 from semfov.zoom.slices import raw, slices
@@ -102,7 +102,7 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
             if top + dy < lattice.rows and left + dx < lattice.columns
         }
     )
-    windows = [on_lattice(lattice, (level, column, row)) for row, column in places]
+    windows = [Window.on(lattice, (level, column, row)) for row, column in places]
     return [(raw(glance, window, [] if target is None else [target], most=most), window) for window in windows]
 
 

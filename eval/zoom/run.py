@@ -39,7 +39,7 @@ from semfov.runs.window_looking import (
 )
 from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
-from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
+from semfov.zoom.glances import Glance, Glances, Window, half_steps
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
@@ -112,7 +112,7 @@ class ZoomRun(WindowLooking, SceneRun):
         """The slices of a scene: the photographs of a mosaic, or squares of a picture, in a photograph four."""
         if isinstance(self.scenes, Mosaics):
             boxes = [tile.slot for tile in self.scenes.tiles(index)]
-            return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+            return [Window.around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
         if lattice.levels == 1:
             return usual_slices(lattice)
         return slices(lattice, self.config.slice, self.config.step)

@@ -25,7 +25,7 @@ from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
 from semfov.zoom.certainty import SPREAD
-from semfov.zoom.closer import USUAL_WINDOW, candidates, closer_window, look_closely
+from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
@@ -393,7 +393,7 @@ class WindowEpisode(Episode[ZoomPath]):
         glance = look_closely(self._glances, box, self._closer)
         self._looks.append(_Look(self.passes, self._frame, glance, 0.0, perf_counter() - self._began, closely=True))
         self.passes += 1
-        return candidates(glance)
+        return glance.candidates
 
     def _end(self, limit: Ending | None) -> None:
         decided: Ending = "decision"

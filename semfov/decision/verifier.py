@@ -138,7 +138,7 @@ class Verifier(Generic[LookType]):
 
     def outcome(self) -> int:
         """Decide whether the search ends."""
-        return self._verified(self._chances, over=self.over)
+        return self._verified([self._chance(each) for each in self.verdicts], over=self.over)
 
     def conclude(self, room: float = math.inf) -> Decision:
         """Make the decision of a search that is over."""
@@ -150,7 +150,7 @@ class Verifier(Generic[LookType]):
     def decision(self, *, over: bool | None = None) -> Decision:
         """Make the decision as it stands after the last look."""
         over = self.candidate is None and self.over if over is None else over
-        chances, presence = self._chances, self.presence
+        chances, presence = [self._chance(each) for each in self.verdicts], self.presence
         outcome = OUTCOMES[verified(chances, presence, self.thresholds.confirm, over=True)]
         if outcome != "found":
             return Decision(outcome if over else "undecided", presence)
@@ -190,11 +190,6 @@ class Verifier(Generic[LookType]):
     def _recent(self) -> list[_Verdict]:
         """The closer looks of which at least half of the evidence is left."""
         return [verdict for verdict in self.verdicts if verdict.age <= self.places.forgetting.span]
-
-    @property
-    def _chances(self) -> list[float]:
-        """For each verdict, the probability that the target is still there."""
-        return [self._chance(verdict) for verdict in self.verdicts]
 
     def _chance(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""

@@ -39,7 +39,7 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.protocols import Trial, episodes_of, explorations_of
 from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
-from semfov.zoom.glances import Glance, overview
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
@@ -263,7 +263,7 @@ class ZoomScenery(_Surroundings):
     def _list(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
         glances = self.glances(scene)
-        first = glances.see([overview(glances.lattice)])[0]
+        first = glances.see([Window.overview(glances.lattice)])[0]
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:

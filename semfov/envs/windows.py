@@ -19,7 +19,7 @@ from semfov.envs.scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath
-from semfov.zoom.glances import Window, on_lattice, overview
+from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
@@ -126,7 +126,7 @@ class WindowGaze(Gazes):
         self.looking = WindowEpisode(self.scenery.classes, self.scenery.evidence, episode.target or None)
         self.looking.open(self.glances, told=True)
         self.done = set()
-        self._see(overview(self.glances.lattice))
+        self._see(Window.overview(self.glances.lattice))
 
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
         self._see(_window_of(self.glances.lattice, actions[0].numpy()))
@@ -158,7 +158,7 @@ def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
         )
         for axis in (0, 1)
     )
-    return on_lattice(lattice, (level, column, row))
+    return Window.on(lattice, (level, column, row))
 
 
 def _action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:

@@ -20,10 +20,10 @@ from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, candidates, look_closely
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance, Glances, overview
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
 
@@ -62,7 +62,7 @@ class _WholeSearch(TargetSearch[WindowLook]):
             number,
             target,
             places,
-            lambda box: candidates(look_closely(glances, box, model.window)),
+            lambda box: look_closely(glances, box, model.window).candidates,
             present=len(objects) > 0,
             spare=spare,
         )
@@ -73,7 +73,7 @@ class _WholeSearch(TargetSearch[WindowLook]):
     def look(self, index: int, number: int) -> WindowLook:
         """The look at the whole, with the probability after it."""
         presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return WindowLook(candidates(self.steps[0]), number, float(presence), self.best, 0.0)
+        return WindowLook(self.steps[0].candidates, number, float(presence), self.best, 0.0)
 
     def right(self, box: Tensor) -> bool:
         """Whether the centre of a box `(4,)` lies in an annotated box of the class."""
@@ -110,7 +110,7 @@ def fit_photographs(
         annotation = pictures.annotation(index)
         glances = StoredGlances(eye, pictures, index, None)
         with torch.inference_mode():
-            looks = glances.see([overview(glances.lattice), *usual_slices(glances.lattice)])
+            looks = glances.see([Window.overview(glances.lattice), *usual_slices(glances.lattice)])
         usual = choose_classes(pictures, index, annotation, 2, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
         for place, target in enumerate(choose_classes(pictures, index, annotation, 2, _AREA, config.seed, _ABSENT)):

@@ -18,7 +18,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, Survey, pool
-from semfov.zoom.glances import Glances, Window, around, half_steps
+from semfov.zoom.glances import Glances, Window, half_steps
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 
@@ -63,7 +63,7 @@ def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
     """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
     tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
     slots: Any = [tuple(map(float, tile.slot)) for tile in tiles]
-    return [*half_steps(lattice), *(around(lattice, slot) for slot in slots)]
+    return [*half_steps(lattice), *(Window.around(lattice, slot) for slot in slots)]
 
 
 def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:

@@ -262,7 +262,7 @@ class ZoomPath(Record):
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
         tensors["show"] = torch.stack([glance.show for glance in self.glances])
-        windows = [_window_values(glance.window) for glance in self.glances]
+        windows = [{name: getattr(glance.window, name) for name in _WINDOW_VALUES} for glance in self.glances]
         unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
         numbers = {"unseen": unseen, "spread": self.spread, "seconds": list(self.seconds)}
@@ -342,7 +342,8 @@ class WindowMoment(ZoomPath, Moment):
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
-        return tensors, {**record, "number": self.number, "next_window": _window_values(self.next_window)}
+        window = {name: getattr(self.next_window, name) for name in _WINDOW_VALUES}
+        return tensors, {**record, "number": self.number, "next_window": window}
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
@@ -352,11 +353,6 @@ class WindowMoment(ZoomPath, Moment):
             "number": record["number"],
             "next_window": _window_from(record["next_window"], fields["lattice"]),
         }
-
-
-def _window_values(window: Window) -> dict[str, Any]:
-    """The JSON values of a window."""
-    return {name: getattr(window, name) for name in _WINDOW_VALUES}
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:

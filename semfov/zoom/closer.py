@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
-from semfov.zoom.glances import Glance, Glances, Window, around
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
@@ -46,20 +45,12 @@ def closer_window(lattice: Lattice, box: Tensor, photograph: tuple[float, float]
         context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
     window = window_around(box.double(), lattice.size, context=context, least=least)
     x1, y1, x2, y2 = window.tolist()
-    return around(lattice, (x1, y1, x2, y2))
+    return Window.around(lattice, (x1, y1, x2, y2))
 
 
 def look_closely(glances: Glances, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Glance:
     """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
     return glances.see([closer_window(glances.lattice, box, photograph)], hints=glances.lattice.levels == 1)[0]
-
-
-def candidates(glance: Glance) -> Detections:
-    """What a look shows of places that may hold a target: its detections, in a photograph all its hints."""
-    if glance.hints is None:
-        return glance.detections
-    boxes, scores = glance.hints.boxes, glance.hints.scores
-    return Detections(boxes[None], F.pad(scores, (1, 0))[None], torch.ones(1, len(boxes), dtype=torch.bool))
 
 
 class WindowLook(NamedTuple):

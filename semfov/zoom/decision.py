@@ -12,7 +12,7 @@ from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifie
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook, candidates
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence, features
 from semfov.zoom.glances import Glance
@@ -177,7 +177,7 @@ class WindowDecisions:
             state = torch.tensor([self._presence]), torch.tensor([facts.detected]), torch.tensor([self._ahead])
             self.outcome = int(settle(*state, self.thresholds))
             return
-        look = WindowLook(candidates(turn.glance), number, self._presence, facts.best, self._ahead)
+        look = WindowLook(turn.glance.candidates, number, self._presence, facts.best, self._ahead)
         self.verifier.see(look, last=last)
         self._settle(self.verifier)
 

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 from semfov.episode import Forgetting
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window, overview
+from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
@@ -110,7 +110,7 @@ def look_by_look(
     overview is renewed after as many frames. The episode has no end: where the order has no window left, the window
     that was looked at longest ago is looked at again.
     """
-    recent, first = _Recent(belief, forgetting), overview(glances.lattice)
+    recent, first = _Recent(belief, forgetting), Window.overview(glances.lattice)
 
     def choose() -> Sequence[WindowChoice]:
         choices = order(recent.looks, recent.windows)

@@ -1,5 +1,7 @@
 """Windows of a picture, and the results of looks at them."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,10 +9,11 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from semfov.detection.detections import Detections
 from semfov.zoom.eye import Resampled, WindowEye, WindowLooks, WindowView
-from semfov.zoom.hints import Gist, Hints, gist
+from semfov.zoom.hints import Gist, Hints
 from semfov.zoom.lattice import Lattice
 
 
@@ -22,6 +25,30 @@ class Window:
     level: int
     cells: tuple[int, int, int, int]
     within: tuple[float, float, float, float] | None = None
+
+    @staticmethod
+    @lru_cache(4096)
+    def on(lattice: Lattice, action: tuple[int, int, int]) -> Window:
+        """The window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
+        level, column, row = action
+        x, y, magnification = lattice.fixation(level, column, row)
+        span = lattice.span(level)
+        return Window((x, y, magnification), level, (column, row, column + span, row + span))
+
+    @staticmethod
+    def overview(lattice: Lattice) -> Window:
+        """The window with the whole picture."""
+        return Window.on(lattice, (0, 0, 0))
+
+    @staticmethod
+    def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
+        """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
+        x1, y1, x2, y2 = box
+        magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
+        level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
+        wide, high = lattice.pitch
+        cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
+        return Window(((x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification), level, cells, box)
 
     def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
         """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels."""
@@ -56,29 +83,13 @@ class Glance:
     gist: Gist | None
     hints: Hints | None = None
 
-
-@lru_cache(4096)
-def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
-    """The window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
-    level, column, row = action
-    x, y, magnification = lattice.fixation(level, column, row)
-    span = lattice.span(level)
-    return Window((x, y, magnification), level, (column, row, column + span, row + span))
-
-
-def overview(lattice: Lattice) -> Window:
-    """The window with the whole picture."""
-    return on_lattice(lattice, (0, 0, 0))
-
-
-def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
-    """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
-    x1, y1, x2, y2 = box
-    magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
-    level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
-    wide, high = lattice.pitch
-    cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
-    return Window(((x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification), level, cells, box)
+    @property
+    def candidates(self) -> Detections:
+        """What it shows of places that may hold a target: its detections, in a photograph all its hints."""
+        if self.hints is None:
+            return self.detections
+        boxes, scores = self.hints
+        return Detections(boxes[None], F.pad(scores, (1, 0))[None], torch.ones(1, len(boxes), dtype=torch.bool))
 
 
 def half_steps(lattice: Lattice) -> Iterator[Window]:
@@ -88,7 +99,7 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
         across, down = lattice.places(level)
         for row in sorted({*range(0, down, half), down - 1}):
             for column in sorted({*range(0, across, half), across - 1}):
-                yield on_lattice(lattice, (level, column, row))
+                yield Window.on(lattice, (level, column, row))
 
 
 class Glances(ABC):
@@ -151,7 +162,7 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]
     elif window.points_closer(lattice):
-        look_gist = gist(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
+        look_gist = Gist.of(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
         scores = look_gist.scores.flatten(0, 1)
     else:
         scores = looks.hints[number].scores

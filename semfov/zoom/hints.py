@@ -1,5 +1,7 @@
 """What a look shows of where to zoom in: hints, which are faint candidates too, and the strongest in each cell."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,47 +48,47 @@ class Gist:
     size: Tensor
     found: Tensor
 
+    @staticmethod
+    def of(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
+        """Compute the gist of a look at a window of the lattice; action `(level, column, row)`."""
+        level, column, row = action
+        span = lattice.span(level)
+        scale = max(1, span // FINEST)
+        columns = -(-min(span, lattice.columns - column) // scale)
+        rows = -(-min(span, lattice.rows - row) // scale)
+        width, height = lattice.pitch
+        numbers = (column * width, row * height), (width * scale, height * scale), (columns - 1, rows - 1)
+        low, pitch, last = np.array(numbers, np.float32)
+        kinds, cells = hints.scores.shape[-1], rows * columns
+        boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
+        confident = scores.amax(-1)
+        class_scores = detections.scores[0, :, 1:].detach().float().numpy()
+        sure = (class_scores.max(1, initial=0) >= DETECTION_SCORE).nonzero()[0]
+        corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
+        cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
+        across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
+        number = down * columns + across
+        at, there = number[: len(boxes)], number[len(boxes) :]
+        place = torch.from_numpy(at)
+        strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
+        top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")
+        leads = (confident.numpy() == top.numpy()[at]).nonzero()[0]
+        wide, high = np.log2(np.maximum(boxes[leads, 2:] - boxes[leads, :2], 1e-3)).T
+        size = np.zeros(cells, np.float32)
+        size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
+        found = np.zeros((cells, kinds), np.bool_)
+        found[there, class_scores[sure].argmax(1)] = True
+        shape = rows, columns
+        return Gist(
+            level,
+            (column, row),
+            scale,
+            strongest.view(*shape, -1),
+            torch.from_numpy(size).view(shape),
+            torch.from_numpy(found).view(*shape, -1),
+        )
+
     @cached_property
     def best(self) -> Tensor:
         """Highest score of any class among the hints of each cell, `(rows, columns)`."""
         return self.scores.amax(-1)
-
-
-def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
-    """Compute the gist of a look at a window of the lattice; action `(level, column, row)`."""
-    level, column, row = action
-    span = lattice.span(level)
-    scale = max(1, span // FINEST)
-    columns = -(-min(span, lattice.columns - column) // scale)
-    rows = -(-min(span, lattice.rows - row) // scale)
-    width, height = lattice.pitch
-    numbers = (column * width, row * height), (width * scale, height * scale), (columns - 1, rows - 1)
-    low, pitch, last = np.array(numbers, np.float32)
-    kinds, cells = hints.scores.shape[-1], rows * columns
-    boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
-    confident = scores.amax(-1)
-    class_scores = detections.scores[0, :, 1:].detach().float().numpy()
-    sure = (class_scores.max(1, initial=0) >= DETECTION_SCORE).nonzero()[0]
-    corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
-    cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
-    across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
-    number = down * columns + across
-    at, there = number[: len(boxes)], number[len(boxes) :]
-    place = torch.from_numpy(at)
-    strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
-    top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")
-    leads = (confident.numpy() == top.numpy()[at]).nonzero()[0]
-    wide, high = np.log2(np.maximum(boxes[leads, 2:] - boxes[leads, :2], 1e-3)).T
-    size = np.zeros(cells, np.float32)
-    size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
-    found = np.zeros((cells, kinds), np.bool_)
-    found[there, class_scores[sure].argmax(1)] = True
-    shape = rows, columns
-    return Gist(
-        level,
-        (column, row),
-        scale,
-        strongest.view(*shape, -1),
-        torch.from_numpy(size).view(shape),
-        torch.from_numpy(found).view(*shape, -1),
-    )

@@ -6,7 +6,7 @@ from functools import reduce
 import numpy as np
 
 from semfov.zoom.belief import Cells, ZoomBelief
-from semfov.zoom.glances import Window, on_lattice
+from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 
 WindowChoice = tuple[Window, float]
@@ -91,7 +91,7 @@ def _better(
         value = float(flat[place])
         if not value > (0.0 if best is None else best[1]):
             return best
-        window = on_lattice(lattice, (level, place % across, place // across))
+        window = Window.on(lattice, (level, place % across, place // across))
         if window not in done:
             return window, value
         flat = flat.copy()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
-from semfov.zoom.glances import Glance, Window, around
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice
 
@@ -20,7 +20,7 @@ def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
         return sorted({*range(0, last, step), last})
 
     boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in starts(height) for x in starts(width)]
-    return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+    return [Window.around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
 
 
 def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:

@@ -10,7 +10,7 @@ from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.protocols import Trial
 from semfov.runs.seeds import noise_for
-from semfov.zoom.glances import overview
+from semfov.zoom.glances import Window
 from semfov.zoom.policy import best_find, best_hit
 
 
@@ -62,7 +62,7 @@ class WindowAgent:
         gaze, belief, lattice = self.gaze, self.gaze.looking.belief, self.gaze.glances.lattice
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
-        return _action_of(lattice, overview(lattice) if choice is None else choice[0])
+        return _action_of(lattice, Window.overview(lattice) if choice is None else choice[0])
 
 
 @dataclass

@@ -18,7 +18,7 @@ from semfov.envs import ZoomEnv, open_zoom_scenery
 from semfov.envs.registration import _IDS
 from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
-from semfov.zoom.glances import on_lattice, overview
+from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 from tests.envs.agents import WindowAgent
 from tests.refusals import refused
@@ -44,7 +44,7 @@ def test_an_action_selects_the_nearest_window_and_converts_back(size, place, num
     mine = np.abs(np.array(window.fixation[:2]) + 0.5 - middle).max()
     assert mine <= away.min() + 1e-2
     level, column, row = lattice.actions[number % len(lattice)].tolist()
-    same = on_lattice(lattice, (level, column, row))
+    same = Window.on(lattice, (level, column, row))
     x, y = (np.array(same.fixation[:2]) + 0.5) / size
     share = np.clip([x, y, level / max(lattice.levels - 1, 1)], 0, 1).astype(np.float32)
     assert _window_of(lattice, share.astype(np.float64)) == same
@@ -174,7 +174,7 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
         raise AssertionError("the detector was called")
 
     monkeypatch.setattr(again.eye, "glance", refuse)
-    kept = again.glances(0).see([overview(again.glances(0).lattice)])[0]
+    kept = again.glances(0).see([Window.overview(again.glances(0).lattice)])[0]
     assert torch.equal(kept.show, env.gazes.looking.glances[0].show)
 
 

@@ -7,7 +7,7 @@ import torch
 from eval.zoom.observed import ObservedRates
 from eval.zoom.orders import sparse
 from semfov import FovealObservationModel, InputError, WindowEye
-from semfov.zoom.glances import LiveGlances, overview
+from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
@@ -23,7 +23,7 @@ def test_sparse_slices_are_those_in_which_the_overview_shows_enough():
     eye = WindowEye(Coloured())
     glances = LiveGlances(eye, eye.open(pixels))
     windows = usual_slices(glances.lattice)
-    (look,) = glances.see([overview(glances.lattice)])
+    (look,) = glances.see([Window.overview(glances.lattice)])
     (hints,) = eye.glance(glances.view, torch.tensor([look.window.fixation])).hints
     wide, high = glances.lattice.pitch
     for targets in ([], [1], [2]):

@@ -11,7 +11,7 @@ from semfov.fit.photographs import _explored, fit_photographs
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.certainty import SPREAD
-from semfov.zoom.glances import LiveGlances, overview
+from semfov.zoom.glances import LiveGlances, Window
 from tests.zoom.conftest import Squares
 
 COUNT, SIZE = 30, (192, 144)
@@ -106,5 +106,5 @@ def test_a_photograph_without_objects_has_no_most_frequent_class():
     empty = Annotation(torch.zeros(0, 4), torch.zeros(0).long(), torch.zeros(0).bool(), SIZE)
     eye = WindowEye(Squares().eval())
     glances = LiveGlances(eye, eye.open(Photographs()[0].image))
-    told = [*_explored(glances.see([overview(glances.lattice)]), glances.lattice, empty)]
+    told = [*_explored(glances.see([Window.overview(glances.lattice)]), glances.lattice, empty)]
     assert [(each.target, each.held) for each in told] == [(None, 0)]

@@ -13,7 +13,7 @@ from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, around, overview
+from semfov.zoom.glances import Glance, Window
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
@@ -185,7 +185,7 @@ def test_objects_that_a_look_at_the_whole_picture_shows_count_too():
     seen = look((LEFT, 1, 0.6), (RIGHT, 2, 0.7), (shifted(RIGHT, 12), 2, 0.9))
     glances = tuple(
         Glance(window, seen, torch.zeros(3).bool(), torch.zeros(2), None)
-        for window in (overview(lattice), around(lattice, (0.0, 0.0, 60.0, 60.0)))
+        for window in (Window.overview(lattice), Window.around(lattice, (0.0, 0.0, 60.0, 60.0)))
     )
     boxes = torch.tensor([shifted(LEFT, 3), shifted(LEFT, -1), RIGHT, RIGHT])
     labels, looks = torch.tensor([1, 1, 1, 2]), torch.zeros(4).long()

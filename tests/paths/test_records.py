@@ -25,7 +25,7 @@ from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.viz import plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, around, on_lattice
+from semfov.zoom.glances import Glance, Window
 from tests.refusals import refused, unusable
 
 CLASSES = ("background", "cup", "cat")
@@ -68,9 +68,9 @@ def scanpath():
 def zoom_path():
     lattice = Lattice.over((400, 300), (100, 100))
     windows = [
-        on_lattice(lattice, (0, 0, 0)),
-        on_lattice(lattice, (1, 16, 8)),
-        around(lattice, (10.0, 20.5, 60.0, 80.0)),
+        Window.on(lattice, (0, 0, 0)),
+        Window.on(lattice, (1, 16, 8)),
+        Window.around(lattice, (10.0, 20.5, 60.0, 80.0)),
     ]
     glances = tuple(
         Glance(window, seen, torch.arange(seen.mask.shape[1]) % 2 == 1, torch.tensor([0.3, 0.1 * number]), None)

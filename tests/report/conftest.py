@@ -17,7 +17,7 @@ from semfov.report import write_page
 from semfov.report.zoom import zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.glances import Glance, Window
 from tests import small
 
 
@@ -94,7 +94,7 @@ def zoom_path(hostile: str) -> ZoomPath:
     scores = torch.tensor([[0.3, 0.1, 0.5, 0.1], [0.1, 0.04, 0.8, 0.06], [0.1, 0.6, 0.2, 0.1]])
     glances = tuple(
         Glance(
-            on_lattice(lattice, action),
+            Window.on(lattice, action),
             Detections(boxes[None, number], scores[None, number, None], torch.ones(1, 1, dtype=torch.bool)),
             torch.zeros(1, dtype=torch.bool),
             scores[number, 1:],

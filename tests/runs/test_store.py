@@ -10,7 +10,7 @@ from semfov.runs import store as store_module
 from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.store import DetectionStore, RememberedLooks, cell_store
 from semfov.runs.zoom_store import GlanceStore
-from semfov.zoom.glances import Glance, around, on_lattice
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
@@ -49,7 +49,11 @@ def windows(folder, **settings):
 
 NUMBERED = {5: detections(5, 2), 0: detections(0, 0), 3: detections(3, 1)}
 BOXED = {(1.0, 2.5, 30.1, 40.0): detections(7, 2), (0.0, 0.0, 1 / 3, 1.0): detections(8, 1)}
-WINDOWS = [on_lattice(LATTICE, (0, 0, 0)), on_lattice(LATTICE, (1, 2, 1)), around(LATTICE, (10.0, 20.0, 110.5, 120.0))]
+WINDOWS = [
+    Window.on(LATTICE, (0, 0, 0)),
+    Window.on(LATTICE, (1, 2, 1)),
+    Window.around(LATTICE, (10.0, 20.0, 110.5, 120.0)),
+]
 GLANCES = {window: glance(number, window) for number, window in enumerate(WINDOWS)}
 
 KINDS = {

@@ -9,7 +9,7 @@ from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief, _WindowSums
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import pool, pool_spans
-from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
 from tests.zoom import plain
@@ -31,7 +31,7 @@ def evidence():
 @pytest.fixture
 def belief(glances, evidence):
     known = ZoomBelief(glances.lattice, evidence, 1)
-    known.add(glances.see([on_lattice(glances.lattice, (0, 0, 0))])[0])
+    known.add(glances.see([Window.on(glances.lattice, (0, 0, 0))])[0])
     return known
 
 
@@ -84,7 +84,7 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
     belief, seen = ZoomBelief(lattice, evidence, target), []
     actions = [[0, 0, 0], *lattice.actions[torch.randint(len(lattice), (7,), generator=generator)].tolist()]
     for turn, action in enumerate(actions):
-        seen += glances.see([on_lattice(lattice, tuple(action))])
+        seen += glances.see([Window.on(lattice, tuple(action))])
         belief.add(seen[-1])
         jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + turn % 3)
         jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + turn % 2)
@@ -127,10 +127,10 @@ def test_changes_in_cells_without_hints_change_no_odds(belief):
         ].any()
     ]
     row, column = empty[len(empty) // 2]
-    belief.discount(on_lattice(lattice, (finest, column, row)))
+    belief.discount(Window.on(lattice, (finest, column, row)))
     assert all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
     row, column = (int(n) * look.scale for n in shown.nonzero()[0])
-    belief.discount(on_lattice(lattice, (finest, min(column, lattice.columns - CELLS), min(row, lattice.rows - CELLS))))
+    belief.discount(Window.on(lattice, (finest, min(column, lattice.columns - CELLS), min(row, lattice.rows - CELLS))))
     assert not all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
 
 
@@ -139,7 +139,7 @@ def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
     table = torch.from_numpy(belief._level_odds(lattice.levels - 1).copy())
     # The picture ends inside a cell of the overview, so only windows on whole cells are compared.
     for row, column in ((0, 0), (6, 8), (12, 4)):
-        window = on_lattice(lattice, (lattice.levels - 1, column, row))
+        window = Window.on(lattice, (lattice.levels - 1, column, row))
         assert odds_of(belief, window) == pytest.approx(float(table[row, column]), abs=1e-4)
 
 
@@ -185,7 +185,7 @@ def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
     looks = [(0, 0, 0), (1, 0, 0), (glances.lattice.levels - 1, 1, 1), (1, 1, 0)]
     levels = range(1, glances.lattice.levels)
     for action in looks:
-        (glance,) = glances.see([on_lattice(glances.lattice, action)])
+        (glance,) = glances.see([Window.on(glances.lattice, action)])
         for belief in (asked, waiting):
             belief.add(glance)
         for level in levels:

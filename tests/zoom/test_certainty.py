@@ -20,7 +20,7 @@ from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.episode import find_everything
-from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.objects import _object_facts, merge, merge_with_facts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
@@ -114,7 +114,7 @@ def test_objects_have_the_facts_of_their_looks():
     def look(level, box, score):
         vectors = torch.tensor([[[1 - score, score, 0.0]]])
         seen = Detections(torch.tensor([[box]]), vectors, torch.ones(1, 1, dtype=torch.bool))
-        return Glance(on_lattice(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
+        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
 
     near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
     faint = look(2, [21.0, 20, 90, 92], 0.04)
@@ -139,7 +139,7 @@ def test_a_cut_box_is_the_same_object_from_half_of_its_area_on(x, count):
 
     def look(level, box, cut):
         seen = Detections(torch.tensor([[box]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool))
-        return Glance(on_lattice(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
+        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
 
     whole = look(1, [100.0, 20, 300, 90], False)
     objects, _ = merge_with_facts([whole, look(3, [x, 20.0, 160, 90], True)], lattice)

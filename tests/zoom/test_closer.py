@@ -14,7 +14,7 @@ from semfov.decision import OUTCOMES, Verifier
 from semfov.io.storage import read, write_file
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.closer import CandidateBoxes, WindowLook, closer_window, look_closely
-from semfov.zoom.glances import Glance, Glances, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window
 from tests.refusals import refused, unusable
 from tests.zoom.conftest import Squares
 
@@ -54,7 +54,7 @@ def seen(boxes, scores):
     """A look with some detections of class 1 of 2."""
     vectors = torch.tensor([[1 - score, score, 0.0] for score in scores])[None]
     found = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
-    return Glance(on_lattice(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
+    return Glance(Window.on(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
 
 
 class Scripted(Glances):

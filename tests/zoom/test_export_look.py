@@ -14,7 +14,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import pool_spans
-from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.glances import LiveGlances, Window
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript", reason="torch exports ONNX with it")
@@ -136,7 +136,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
         assert lattice.span(level) == 32
         # Around the red square.
         column, row = (int(middle / pitch) - 13 for middle, pitch in zip((656, 336), lattice.pitch, strict=True))
-        window = on_lattice(lattice, (level, column, max(row, 0)))
+        window = Window.on(lattice, (level, column, max(row, 0)))
         gist = LiveGlances(eye, view).see([window])[0].gist
         pixels = view.picture.pixels((0, 0, *view.picture.size))
         found = run(tmp_path / "look.onnx", pixels, window.fixation)

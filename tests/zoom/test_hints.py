@@ -10,7 +10,7 @@ from semfov import Detector, InputError, Selection, WindowEye
 from semfov.detection import Candidates
 from semfov.detection.detector import FAINT
 from semfov.zoom.eye import _hints_of
-from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.hints import DETECTION_SCORE
 
 KINDS = 3
@@ -46,7 +46,7 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, faint,
     lattice = view.lattice
     assert column < lattice.places(level)[0]
     assert row < lattice.places(level)[1]
-    window = on_lattice(lattice, (level, column, row))
+    window = Window.on(lattice, (level, column, row))
     glance = LiveGlances(eye, view).see([window])[0]
     look = glance.gist
     rows, columns, _ = look.scores.shape
@@ -106,7 +106,7 @@ def test_a_look_without_hints_shows_its_detections():
     eye = WindowEye(detector)
     view = eye.open(torch.zeros(3, 384, 512))
     last = view.lattice.levels - 1
-    window = on_lattice(view.lattice, (last, 3, 3))
+    window = Window.on(view.lattice, (last, 3, 3))
     plain, hinted = (LiveGlances(eye, view).see([window], hints=hints)[0] for hints in (False, True))
     assert plain.gist is None
     assert hinted.gist is None

@@ -11,9 +11,9 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import SEEN, PhotographPlaces, WindowLook, candidates, closer_window
+from semfov.zoom.closer import SEEN, PhotographPlaces, WindowLook, closer_window
 from semfov.zoom.evidence import PhotographEvidence
-from semfov.zoom.glances import LiveGlances, overview
+from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.slices import ranked, raw, usual_slices
 
 SIZE = (192, 144)
@@ -84,7 +84,7 @@ def test_slices_of_a_photograph_show_all_of_it_enlarged(size):
 
 def test_slices_are_ranked_by_the_hints_whose_centre_they_show(detector, photograph):
     glances = LiveGlances(eye := WindowEye(detector), eye.open(photograph))
-    (whole,) = glances.see([overview(glances.lattice)])
+    (whole,) = glances.see([Window.overview(glances.lattice)])
     windows = usual_slices(glances.lattice)
     values = []
     for window in windows:
@@ -175,9 +175,9 @@ def test_evidence_says_how_large_the_window_of_a_closer_look_is(detector, photog
 
 def test_hints_below_the_threshold_of_detections_are_places(detector, photograph):
     glances = LiveGlances(eye := WindowEye(detector), eye.open(photograph / 20))
-    (whole,) = glances.see([overview(glances.lattice)])
+    (whole,) = glances.see([Window.overview(glances.lattice)])
     assert not len(whole.detections.boxes[0])
-    places = candidates(whole)
+    places = whole.candidates
     assert len(places.boxes[0]) == len(whole.hints.boxes) > 0
     assert places.scores[0, :, 1:].tolist() == whole.hints.scores.tolist()
 

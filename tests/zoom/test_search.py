@@ -11,7 +11,7 @@ from semfov import Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import open_picture
 from semfov.data.large import open_large
 from semfov.zoom import GlimpseEvidence, Lattice, merge
-from semfov.zoom.glances import Glance, LiveGlances, on_lattice
+from semfov.zoom.glances import Glance, LiveGlances, Window
 from tests.refusals import refused
 
 
@@ -139,7 +139,7 @@ def make_glance(level, column, row, boxes, scores, cut):
     vectors[0, :, 1] = torch.tensor(scores)
     vectors[0, :, 0] = 1 - vectors[0, :, 1]
     detections = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
-    return Glance(on_lattice(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
+    return Glance(Window.on(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
 
 
 def test_merging_keeps_small_objects_in_front_of_large_ones():
@@ -154,8 +154,8 @@ def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     for cut in ("keep", "drop", "background"):
         eye = WindowEye(detector, cut=cut)
         view = eye.open(picture)
-        window = on_lattice(view.lattice, (view.lattice.levels - 1, 33, 15))  # its border lies in the red square
-        other = on_lattice(view.lattice, (view.lattice.levels - 1, 34, 15))
+        window = Window.on(view.lattice, (view.lattice.levels - 1, 33, 15))  # its border lies in the red square
+        other = Window.on(view.lattice, (view.lattice.levels - 1, 34, 15))
         found[cut], whole = LiveGlances(eye, view).see([window, other])
         assert whole.detections.mask.shape == (1, len(whole.cut))
     keep, drop, background = found.values()

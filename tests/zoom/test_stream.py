@@ -7,7 +7,7 @@ import torch
 
 from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
 from semfov.zoom import GlimpseEvidence, Lattice
-from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.objects import without_replaced
 from tests.refusals import refused
 from tests.zoom.test_closer import Fickle, evidence
@@ -127,7 +127,7 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
         low = torch.rand(6, 2, generator=generator) * 700
         boxes = torch.cat([low, low + 40], -1)[None]
         detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
-        glances.append(Glance(on_lattice(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
+        glances.append(Glance(Window.on(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
     kept = without_replaced(glances, lattice)
     for number, (glance, left) in enumerate(zip(glances, kept, strict=True)):
         expected = []

@@ -9,7 +9,7 @@ from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts,
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import Survey
-from semfov.zoom.glances import half_steps, on_lattice
+from semfov.zoom.glances import Window, half_steps
 from semfov.zoom.hints import Gist
 from train.fit_zoom import judge_survey
 
@@ -33,7 +33,7 @@ def survey():
 def example(rule):
     """A mosaic in which a closer look finds as many objects as `rule` gives for its window."""
     objects = 12
-    looks = [_WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
+    looks = [_WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
     for window in half_steps(LATTICE):
         if window.level == 0:
             continue
@@ -80,7 +80,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
-    glance = _WindowResult(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    glance = _WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
     for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
         belief.add(glance)

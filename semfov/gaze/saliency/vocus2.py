@@ -1,6 +1,5 @@
 """VOCUS2: saliency as the contrast of two Gaussian pyramids, of centres and of surrounds."""
 
-from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -61,18 +60,6 @@ def _twin_pyramids(
     return pyramids
 
 
-def _combine_maps(maps: Sequence[Tensor], size: tuple[int, int], fusion: _Fusion = "mean") -> Tensor:
-    """Mean or maximum of all maps, each enlarged to `size` by cubic interpolation.
-
-    Shapes: maps `(B, N, h, w)`, size `(height, width)` → `(B, height, width)`.
-    """
-    if fusion == "mean":
-        # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
-        enlarged = (enlarge(layer.mean(1), size) for layer in maps)
-        return sum(enlarged, next(enlarged)) / len(maps)
-    return torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
-
-
 def vocus2_saliency(
     image: Tensor,
     *,
@@ -123,7 +110,13 @@ def vocus2_saliency(
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
-        saliency = _combine_maps(maps, (image.shape[-2], image.shape[-1]), fusion)
+        size = image.shape[-2], image.shape[-1]
+        if fusion == "mean":
+            # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
+            enlarged = (enlarge(layer.mean(1), size) for layer in maps)
+            saliency = sum(enlarged, next(enlarged)) / len(maps)
+        else:
+            saliency = torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
     return rescale(saliency, flat) if normalise else saliency
