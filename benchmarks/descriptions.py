@@ -7,13 +7,14 @@ out.
 """
 
 import argparse
+from inspect import signature
 from pathlib import Path
 
 import torch
 
 from benchmarks.tables import table
 from semfov.data.classes import _SYNONYMS, _TABLE, _other_numbers, _plain_key
-from semfov.data.word_vectors import TEMPERATURE, WordVectors, words_of
+from semfov.data.word_vectors import WordVectors, spread, words_of
 from semfov.detection.class_names import COCO_CLASSES
 
 NEAREST = (1, 3, 5, 10)
@@ -57,7 +58,8 @@ def main() -> None:
     shares = [f"{100 * float((rank <= count).double().mean()):.1f}" for count in NEAREST]
     print(table(["", *(f"among the nearest {count}, %" for count in NEAREST)], [["right class", *shares]]))
     chances = [(near / t).log_softmax(-1).gather(1, right[:, None]).mean() for t in TEMPERATURES]
-    head = [f"{t:g}{' (used)' if t == TEMPERATURE else ''}" for t in TEMPERATURES]
+    used = signature(spread).parameters["temperature"].default
+    head = [f"{t:g}{' (used)' if t == used else ''}" for t in TEMPERATURES]
     print("", table(["temperature", *head], [["log probability", *(f"{float(c):.3f}" for c in chances)]]), sep="\n")
 
 

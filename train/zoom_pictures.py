@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scattered import Scattered
 from semfov.data.scene import Scenes
 from semfov.fit.windows import MosaicFit, crowded
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.settings import Count
+from train.scattered import Scattered
 
 RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]
 

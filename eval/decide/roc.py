@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eval.presence import roc
 from semfov.metrics.episodes import area_under_roc
-from semfov.viz.style import COLOURS, LINES, make_figure, styled
+from semfov.viz.style import COLOURS, make_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ def plot_roc(scores: Mapping[str, Tensor], present: Tensor) -> Figure:
     figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed")
     for panel, widest in zip(panels, (1.0, 0.1), strict=True):
         for (name, score), colour, line in zip(
-            scores.items(), COLOURS * len(scores), LINES * len(scores), strict=False
+            scores.items(), COLOURS * len(scores), ("-", "--", "-.", ":") * len(scores), strict=False
         ):
             alarms, hits = roc(score, present)
             label = f"{name} ({area_under_roc(score, present):.3f})"

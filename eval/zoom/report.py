@@ -17,7 +17,7 @@ from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import table
-from semfov.viz.reliability import plot_reliability
+from semfov.viz.curves import plot_reliability
 from semfov.viz.style import save_figure
 
 

@@ -25,7 +25,7 @@ could would will may might must do does which what where who when how
 _IGNORED = frozenset(_COMMON.split())
 """Words of a description that are ignored because most descriptions have them."""
 
-TEMPERATURE = 0.08
+_TEMPERATURE = 0.08
 """Temperature of `spread`, chosen on synonyms of COCO's classes (docs/words.md)."""
 
 
@@ -134,7 +134,7 @@ def spread(
     classes: Sequence[str],
     vectors: WordVectors,
     *,
-    temperature: float = TEMPERATURE,
+    temperature: float = _TEMPERATURE,
     least: float = 0.1,
 ) -> dict[str, float]:
     r"""Find the classes that a description may mean, with a weight for each.

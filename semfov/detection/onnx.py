@@ -16,7 +16,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
 from semfov.detection.onnx_file import check_canvas, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, Signature, misplaced, recognise
-from semfov.detection.onnx_session import OnnxSession, Provider
+from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
@@ -209,7 +209,7 @@ def load_onnx(
     selection: Selection | None = None,
     threads: int | None = None,
     device: torch.device | str = "cpu",
-    providers: Sequence[Provider] | None = None,
+    providers: Sequence[str | tuple[str, Mapping[str, Any]]] | None = None,
 ) -> OnnxDetector:
     """Load a detector from an ONNX file, or a published one by its name."""
     name = fspath(name_or_path)

@@ -42,7 +42,7 @@ _MOST_SECONDS = 10.0
 _MOST_REASON = 400
 """Largest number of characters of onnxruntime's reasons that a message has."""
 
-Provider = str | tuple[str, Mapping[str, Any]]
+_Provider = str | tuple[str, Mapping[str, Any]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
 _MOST_BATCH = 1024
@@ -68,7 +68,7 @@ class OnnxSession:
         *,
         threads: int | None = None,
         device: torch.device | str = "cpu",
-        providers: Sequence[Provider] | None = None,
+        providers: Sequence[_Provider] | None = None,
         spinning: bool = False,
         open_ended: bool | None = None,
         further: Sequence[str] = (),
@@ -311,7 +311,7 @@ def _reason(error: Exception) -> str:
     return text if len(text) <= _MOST_REASON else f"…{text[-_MOST_REASON:]}"
 
 
-def _providers(device: torch.device, providers: Sequence[Provider] | None) -> list[Any]:
+def _providers(device: torch.device, providers: Sequence[_Provider] | None) -> list[Any]:
     """The given execution providers; else those for a device, then the CPU's for what it does not support."""
     import onnxruntime as ort
 

@@ -6,9 +6,8 @@ last value of a cell. To draw in an existing figure, give its axes as `ax=` or `
 
 from semfov.viz.animation import animate
 from semfov.viz.belief import plot_belief, plot_belief_bars
-from semfov.viz.curves import plot_curves
+from semfov.viz.curves import plot_curves, plot_reliability
 from semfov.viz.drawing import CONFIDENT
-from semfov.viz.reliability import plot_reliability
 from semfov.viz.scanpath import plot_episode, plot_fixation, plot_foveated_strip, plot_scanpath
 from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure

@@ -23,7 +23,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 GAZE, TARGET, FOUND, TRUTH, OTHER = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[4], COLOURS[5]
 """Colours with a meaning: gaze, detections of the target, the found target, annotated boxes, other detections."""
 
-LINES = ("-", "--", "-.", ":")
+_LINES = ("-", "--", "-.", ":")
 
 PROBABILITY = "viridis"
 UNCERTAINTY = "cividis"
@@ -193,4 +193,4 @@ def overlay_colours() -> Colormap:
 def line_style(order: int, count: int) -> dict[str, Any]:
     """Colour and dashes of line `order` of `count` lines; no two are alike, and few lines differ in dashes too."""
     group = len(COLOURS) if count > len(COLOURS) else 2
-    return {"color": COLOURS[order % len(COLOURS)], "linestyle": LINES[order // group % len(LINES)]}
+    return {"color": COLOURS[order % len(COLOURS)], "linestyle": _LINES[order // group % len(_LINES)]}

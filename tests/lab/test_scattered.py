@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from semfov.data.scattered import Scattered
 from tests.refusals import refused
 from tests.small import RedBoxes
+from train.scattered import Scattered
 
 
 def make(**changes):
