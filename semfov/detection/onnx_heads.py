@@ -12,7 +12,7 @@ from torch import Tensor
 
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import LEAST
-from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
+from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import InputError, check, check_shape, values_known
 from semfov.sensor.lines import constant
@@ -167,7 +167,7 @@ _MOST_MISPLACED = 0.5
 
 _LETTERBOX = Preprocessing()
 _YOLOX = Preprocessing(channels="bgr", scale=255.0, corner=True)
-_IMAGENET = Preprocessing(mean=IMAGENET_MEAN, std=IMAGENET_STD, stretch=True)
+_IMAGENET = Preprocessing(mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225), stretch=True)
 _NANODET = Preprocessing(
     channels="bgr", scale=255.0, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395), stretch=True
 )

@@ -81,7 +81,3 @@ def check_bytes(canvas: Tensor) -> None:
     """Raise `InputError` unless a canvas is `(B, 3, H, W)`, bytes."""
     fits = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
     check(fits, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")
-
-
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -12,7 +12,7 @@ from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
-from semfov.detection.preprocessing import IMAGENET_MEAN, IMAGENET_STD, Preprocessing
+from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import DataError, InputError, check
@@ -51,8 +51,8 @@ class TransformersDetector(ModuleDetector):
             )
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
-        normal = config.model_type in _IMAGENET
-        settings: dict[str, Any] = {"do_normalize": normal, "image_mean": IMAGENET_MEAN, "image_std": IMAGENET_STD}
+        normal, usual = config.model_type in _IMAGENET, HEADS["detr"].preprocessing
+        settings: dict[str, Any] = {"do_normalize": normal, "image_mean": usual.mean, "image_std": usual.std}
         settings |= processor or {}
         size = _size(settings, _EDGES if normal else _SQUARE)
         self.resizes = bool(settings.get("do_resize", True))
