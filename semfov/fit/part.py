@@ -29,7 +29,7 @@ _FEW = 8
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
 _LONGEST = 15
-"""Maximum number of gaze shifts in them."""
+"""Maximum number of gaze shifts in the searches and explorations that are compared."""
 
 
 class PartResult(NamedTuple):

@@ -83,23 +83,15 @@ class SearchedPhotograph:
         everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.targets, self.store, self.everywhere = grid, targets, store, everywhere
+        self.grid, self.targets, self.everywhere = grid, targets, everywhere
         self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
-            lambda: photograph_looks(eye, lambda: self.image, grid), store, lambda: scenes.digest(index)
+            lambda: photograph_looks(eye, lambda: scenes[index].image[None], grid), store, lambda: scenes.digest(index)
         )
-        self._image: Tensor | None = None
         self._from_cells: Detections | None = None
-
-    @property
-    def image(self) -> Tensor:
-        """The photograph, `(1, 3, H, W)`."""
-        if self._image is None:
-            self._image = self.scenes[self.index].image[None]
-        return self._image
 
     def close(self) -> None:
         """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
-        self._image = self._from_cells = None
+        self._from_cells = None
         self.looks.close()
 
     def look(self, cell: int) -> Detections:

@@ -280,25 +280,19 @@ def verification_report(
     odds = torch.stack([fold(closer.features) for fold in folds])
     odds = odds[closer.fold, torch.arange(len(closer.fold))]
     figures: dict[str, float | None] = {}
-    for name, logit, there in (
-        ("cell", closer.features[:, 1], closer.right),
-        ("place", odds[:, 0], closer.right),
-        ("image", closer.features[:, 0], closer.present),
-        ("presence", odds[:, 1], closer.present),
+    chances = [["", "NLL", "ECE", "area under ROC"]]
+    for where, name, logit, there in (
+        ("at the place, before", "cell", closer.features[:, 1], closer.right),
+        ("at the place, after", "place", odds[:, 0], closer.right),
+        ("in the image, before", "image", closer.features[:, 0], closer.present),
+        ("in the image, after", "presence", odds[:, 1], closer.present),
     ):
-        figures[f"{name}_nll"] = float(F.binary_cross_entropy_with_logits(logit, there.to(logit)))
-        figures[f"{name}_ece"] = float(calibration_error(logit.sigmoid(), there))
-        figures[f"{name}_area"] = _area(logit, there)
+        nll = float(F.binary_cross_entropy_with_logits(logit, there.to(logit)))
+        own = {"nll": nll, "ece": float(calibration_error(logit.sigmoid(), there)), "area": _area(logit, there)}
+        figures |= {f"{name}_{what}": value for what, value in own.items()}
+        chances.append([where, *map(_figure_text, own.values())])
     there = torch.tensor([each.present for each in searches])
     figures["area"] = _area(torch.tensor([each.presence for each in searches]), there)
-    chances = [["", "NLL", "ECE", "area under ROC"]]
-    for where, name in (
-        ("at the place, before", "cell"),
-        ("at the place, after", "place"),
-        ("in the image, before", "image"),
-        ("in the image, after", "presence"),
-    ):
-        chances.append([where, *(_figure_text(figures[f"{name}_{what}"]) for what in ("nll", "ece", "area"))])
     assert model.thresholds is not None
     chosen = model.thresholds.confirm
     decisions = [

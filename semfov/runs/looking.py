@@ -39,7 +39,6 @@ class Looking(SceneRun):
             raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
         components = len(self.scenes.classes) + 1
         self.store = cell_store(store_folder(config.cache) / "looks", self.eye.settings(), columns, rows, components)
-        self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
         """Check that the files of the scenes and of the detector exist, before any of them is loaded."""
@@ -52,12 +51,6 @@ class Looking(SceneRun):
     def depends_on(self) -> dict[str, Any]:
         """List the eye and the cells."""
         return {"eye": self.eye.settings(), "cells": [*self.cells]}
-
-    def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a scene depend on."""
-        if index not in self._digests:
-            self._digests[index] = self.scenes.digest(index)
-        return self._digests[index]
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""

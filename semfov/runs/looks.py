@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -35,6 +36,7 @@ def photograph_looks(
     Shapes: image `(1, 3, H, W)`.
     """
     view: View | None = None
+    image = cache(image)
 
     def look(action: int | tuple[float, ...]) -> Detections:
         nonlocal view

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -47,7 +47,7 @@ class WholeBar:
         yield
         self._move(before + sum(self.stages[name].values()))
 
-    def task(self, title: str, total: float) -> Bar:
+    def task(self, title: str, total: float) -> tqdm[Any]:
         """A task with this title, which moves the bar."""
         return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
 
@@ -70,27 +70,19 @@ class WholeBar:
         self._bar.close()
 
 
-class _Task:
-    """A task that moves the bar of a `WholeBar`."""
+class _Task(tqdm):  # type: ignore[type-arg]
+    """A task that moves the bar of a `WholeBar`, and shows no bar or values of its own."""
 
     def __init__(self, whole: WholeBar, step: float) -> None:
+        super().__init__(disable=True)
         self._whole, self._step = whole, step
 
-    def update(self, n: float = 1) -> None:
-        self._whole._move(self._whole._at + n * self._step)
-
-    def set_postfix(self, **values: object) -> None:
-        """Show nothing: values of one task say nothing about the whole."""
-
-    def close(self) -> None:
-        """Do nothing: the bar stays open for other tasks."""
+    def update(self, n: float | None = 1) -> None:
+        """Move the bar by so many items."""
+        self._whole._move(self._whole._at + (n or 0) * self._step)
 
 
-Bar: TypeAlias = "tqdm[Any] | _Task"
-"""Shows the progress of a task."""
-
-
-def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
+def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tqdm[Any]:
     """A bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
     whole = _whole.get()
     if whole is not None:

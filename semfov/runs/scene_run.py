@@ -6,8 +6,9 @@ import hashlib
 import json
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import closing
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,10 @@ class SceneRun(ABC):
         """The outcomes of finished scenes."""
         return SceneResults(self.config.out / "parts", self.key, self.digest)
 
-    def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a scene depend on."""
-        return self.scenes.digest(index)
+    @cached_property
+    def digest(self) -> Callable[[int], str]:
+        """Gives the sha256 of what the pixels of a scene depend on, by its number."""
+        return cache(self.scenes.digest)
 
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:

@@ -25,14 +25,11 @@ from semfov.sensor import Foveation, named_sensor
 _Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
 
 
-def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
-    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
-    _check_data(data)
-    check_detector(detector.name)
+def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
+    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded.
 
-
-def _check_data(data: DataConfig) -> None:
-    """Raise an error unless photographs and annotations both exist, or the settings name neither of them."""
+    The settings may name neither photographs nor annotations.
+    """
     if (data.root is None) != (data.annotations is None):
         present, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
         raise InputError(
@@ -43,11 +40,13 @@ def _check_data(data: DataConfig) -> None:
         raise DataError(f"data.root: no such folder: {data.root}; check the path")
     if data.annotations is not None and not data.annotations.exists():
         raise DataError(f"data.annotations: no such file: {data.annotations}; check the path")
+    if detector is not None:
+        check_detector(detector.name)
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
-    _check_data(data)
+    check_sources(data)
     if data.root is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
     ids = None
@@ -74,7 +73,7 @@ def _photographs(
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
     """Split photographs into every n-th one and the others; of the embedded scenes make two sets."""
-    _check_data(data)
+    check_sources(data)
     if data.root is None:
         count, seeds = data.limit or 16, (data.scene_seed, data.scene_seed + 1)
         larger, smaller = (EmbeddedScenes(classes, count=count, seed=seed) for seed in seeds)

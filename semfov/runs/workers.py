@@ -1,5 +1,7 @@
 """Runs tasks in this process, in processes of this machine, or in any executor, such as a cluster's."""
 
+from __future__ import annotations
+
 import ctypes
 import logging
 import multiprocessing
@@ -20,11 +22,12 @@ from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
 import torch
+from tqdm import tqdm
 
 from semfov.errors import InputError, SemfovError
 from semfov.io.code import package_digest
 from semfov.io.files import discard_unfinished
-from semfov.runs.progress import Bar, task_bar
+from semfov.runs.progress import task_bar
 from semfov.threads import available_cores
 
 _REACH = 10.0
@@ -233,7 +236,7 @@ _shared: ContextVar[tuple[ExitStack, dict[int, Executor]] | None] = ContextVar("
 
 
 def _in_processes(
-    job: Callable[[_Task], _Result], tasks: Sequence[_Task], processes: int, title: str, bar: Bar
+    job: Callable[[_Task], _Result], tasks: Sequence[_Task], processes: int, title: str, bar: tqdm[Any]
 ) -> Iterator[tuple[_Task, _Result]]:
     shared = _shared.get()
     try:
@@ -271,7 +274,7 @@ def _started(processes: int) -> Iterator[Executor]:
 
 
 def _on_cluster(
-    address: str, job: Callable[[_Task], _Result], tasks: Sequence[_Task], title: str, bar: Bar
+    address: str, job: Callable[[_Task], _Result], tasks: Sequence[_Task], title: str, bar: tqdm[Any]
 ) -> Iterator[tuple[_Task, _Result]]:
     """Run tasks on a cluster; those that were lost with its scheduler are given to the next one at the same address."""
     left = dict.fromkeys(tasks)

@@ -222,16 +222,17 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     searches = iter(verified_in(found, [model, model], evidence, config))
     ends = []
     for photograph in found:
+        image = photograph.scenes[photograph.index].image
         for sought in photograph.targets:
             verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1}
-            scanpath = agent.search(photograph.image[0], sought.target, how="fovea", **options)
+            scanpath = agent.search(image, sought.target, how="fovea", **options)
             right, looks = verified.found(confirm)
             assert scanpath.found == (right is not None)
             assert len(scanpath.cells) + len(scanpath.closer) == looks
             if scanpath.found:
                 assert bool(sought.goal[scanpath.decision.cell]) == right
                 assert scanpath.decision.place == pytest.approx(max(place for place, _ in verified.places), abs=1e-5)
-            plain = agent.search(photograph.image[0], sought.target, how="fovea", **options, closer=0)
+            plain = agent.search(image, sought.target, how="fovea", **options, closer=0)
             right = bool(sought.goal[plain.decision.cell]) if plain.found else None
             assert (right, len(plain.cells)) == verified.unverified
             ends.append((scanpath.found, len(scanpath.closer), plain.found))
