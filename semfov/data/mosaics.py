@@ -59,7 +59,15 @@ class Mosaics(ComposedScenes):
             photographs = self._sharing[int(generator.integers(len(self._sharing)))]
         rounds = -(-slots // len(photographs))
         order = np.concatenate([generator.permutation(photographs) for _ in range(rounds)])[:slots]
-        return [self._tile(int(scene), slot) for slot, scene in enumerate(order)]
+        tiles = []
+        for slot, scene in enumerate(order.tolist()):
+            (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
+            scale = min(wide / width, high / height)
+            width, height = (max(1, round(side * scale)) for side in (width, height))
+            left, top = slot % self.columns * wide, slot // self.columns * high
+            x, y = left + (wide - width) // 2, top + (high - height) // 2
+            tiles.append(_Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height)))
+        return tiles
 
     @cached_property
     def _sharing(self) -> list[NDArray[np.intp]]:
@@ -69,14 +77,6 @@ class Mosaics(ComposedScenes):
             presence[index, self.scenes.annotation(index).labels.numpy()] = True
         least = -(-self.columns * self.rows // 4)
         return [column.nonzero()[0] for column in presence.T if column.sum() >= least]
-
-    def _tile(self, scene: int, slot: int) -> _Tile:
-        (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
-        scale = min(wide / width, high / height)
-        width, height = (max(1, round(side * scale)) for side in (width, height))
-        left, top = slot % self.columns * wide, slot // self.columns * high
-        x, y = left + (wide - width) // 2, top + (high - height) // 2
-        return _Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height))
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a mosaic."""

@@ -17,36 +17,14 @@ _UNIFORM = 1.0
 
 
 def fit_tables(
-    statistics: DirichletStatistics, *, method: Method, shrinkage: float, minimum: int, enough: int | None
-) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-    """Fit α, `ln π`, the expected scores and their record; warn of levels that fell back."""
-    alpha, fallback = _fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
-    if fallback:
-        text = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
-        text += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
-        # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
-        warnings.warn(f"levels with fewer than {minimum} objects fall back: {text}", stacklevel=4)
-    prior, expected = _estimate_prior(statistics.count, shrinkage), _expected_table(statistics, fallback, shrinkage)
-    record = {
-        "counts": statistics.count.tolist(),
-        "fallback": {str(level): source for level, source in fallback.items()},
-        "method": method,
-        "shrinkage": shrinkage,
-        "minimum": minimum,
-        "enough": enough,
-    }
-    return alpha, prior, expected, record
-
-
-def _fit_table(
     statistics: DirichletStatistics,
     *,
     method: Method = "newton",
     shrinkage: float = 10.0,
     minimum: int = 100,
     enough: int | None = None,
-) -> tuple[Tensor, dict[int, int]]:
-    r"""Maximum a posteriori α `(K+1, N, K+1)` for every class and level, and the levels that fell back.
+) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    r"""Maximum a posteriori α `(K+1, N, K+1)`, `ln π`, expected scores, and a record; warns of fallbacks.
 
     The mean log scores of a table cell (one class at one level) are shrunk towards those of its class over all levels.
     The latter are shrunk, with a weight of one sample, towards those of Dir(1, ..., 1) (`semfov.dirichlet.shrink`):
@@ -54,9 +32,8 @@ def _fit_table(
     .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
               g_k = \frac{n_k \bar g_k + \psi(1) - \psi(K+1)}{n_k + 1}
 
-    A class without samples gets the uniform density, and a cell without samples gets the density of its class. A level
-    with fewer than `minimum` objects takes the parameters of its inner neighbour. Level 0 has none: it is recorded as
-    falling back on itself, and keeps its shrunk estimate.
+    A level with fewer than `minimum` objects takes the parameters of its inner neighbour. Level 0 has none: it is
+    recorded as falling back on itself, and keeps its shrunk estimate.
 
     Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say how they treat
     cells with few samples or none. Cells with `enough` detections get the maximum of the likelihood; the treatment of
@@ -76,11 +53,19 @@ def _fit_table(
         if objects < minimum:
             fallback[level] = fallback.get(level - 1, max(level - 1, 0))
             alpha[:, level] = alpha[:, fallback[level]]
-    return alpha, fallback
+    if fallback:
+        text = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
+        text += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
+        # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
+        warnings.warn(f"levels with fewer than {minimum} objects fall back: {text}", stacklevel=4)
+    prior, expected = _estimate_prior(statistics.count, shrinkage), _expected_table(statistics, fallback, shrinkage)
+    told = {"method": method, "shrinkage": shrinkage, "minimum": minimum, "enough": enough}
+    levels = {str(level): source for level, source in fallback.items()}
+    return alpha, prior, expected, {"counts": statistics.count.tolist(), "fallback": levels, **told}
 
 
 def _expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
-    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage and fallback as in `_fit_table`."""
+    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage as in `fit_tables`."""
     classes = statistics.sum(1)
     uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
     parent = shrink(classes.mean, classes.count, uniform, _UNIFORM)

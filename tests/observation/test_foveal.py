@@ -13,7 +13,7 @@ import torch
 
 from semfov import DirichletStatistics, FovealObservationModel, InputError, dirichlet
 from semfov.io.compatibility import NETWORKS, check_same_detector
-from semfov.observation.fitting import _estimate_prior, _expected_table, _fit_table
+from semfov.observation.fitting import _estimate_prior, _expected_table, fit_tables
 from tests.refusals import refused
 
 CLASSES = ["cup", "cat", "dog"]
@@ -158,8 +158,8 @@ def test_cells_with_few_samples_follow_their_class():
     counts = torch.full((4, 3), 3000)
     counts[2, 1] = 0
     counts[3] = 0
-    fitted, fallback = _fit_table(draw(alpha, counts), shrinkage=10.0)
-    assert fallback == {}
+    fitted, _, _, record = fit_tables(draw(alpha, counts), shrinkage=10.0)
+    assert record["fallback"] == {}
     np.testing.assert_allclose(fitted[2, 1], alpha[2, 1], rtol=0.15)
     torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
 
@@ -174,7 +174,7 @@ def test_fits_without_data_or_of_identical_samples_are_finite():
     statistics = DirichletStatistics((4, 3), 4)
     rows = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).repeat(500, 1)
     statistics.update(rows, (torch.ones(500).long(), torch.zeros(500).long()))
-    alpha, _ = _fit_table(statistics, minimum=0)
+    alpha = fit_tables(statistics, minimum=0)[0]
     assert bool(alpha.isfinite().all())
     assert bool((alpha > 0).all())
     assert alpha[1, 0].argmax() == 1

@@ -215,7 +215,7 @@ def test_words(gaze):
 
 def test_the_film_has_a_frame_after_each_fixation(gaze, tmp_path):
     film = gaze.animate(people=2, duration=0.8, seed=1)
-    assert len(film) == max(map(len, gaze.scanpaths(2, seconds=0.8, seed=1))) + 1
+    assert len(film.frames) == max(map(len, gaze.scanpaths(2, seconds=0.8, seed=1))) + 1
     assert not np.array_equal(film.frames[0], film.frames[1])
     assert gaze.animate(tmp_path / "gaze.gif", people=2, duration=0.4).stat().st_size > 1000
     refused("seconds", gaze.animate, seconds=0)
