@@ -155,7 +155,7 @@ def plot_scanpath(
         GazePath(axes, scanpath.points, scanpath.size, found=bool(scanpath.found))
         return figure
     _draw_place(axes, scanpath, image, boxes)
-    axes.set_title(fill(scanpath.describe(), 80), parse_math=False)
+    axes.set_title(fill(scanpath.describe(), 100), parse_math=False)
     outlined = any(scanpath.outline(look) is not None for look in scanpath)
     entries, sure = _annotation_entries(scanpath, boxes), scanpath.confirmed
     name, count, others = scanpath.target_name or "objects", int(sure.sum()), int((~sure).sum())
