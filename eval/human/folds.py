@@ -51,10 +51,10 @@ class StudiedFold(Fold):
         if self._given == "features":
             return super().fit()
         # The density of other people holds the centre bias already.
-        centre = log_centre(self.groups, self.fitted()) if self._given == "none" else torch.zeros(1, 1)
+        centre = log_centre(self.groups(), self.fitted()) if self._given == "none" else torch.zeros(1, 1)
         model = FixationDensity({"none": 1}, centre=centre)
-        known = [self.maps(model, *each) for each in zip(self.groups, self.fitted(), strict=True)]
-        fit_oculomotor(model, self.groups, known, self.fitted(), self.settings)
+        known = [self.maps(model, *each) for each in zip(self.groups(), self.fitted(), strict=True)]
+        fit_oculomotor(model, self.groups(), known, self.fitted(), self.settings)
         return model.requires_grad_(False)
 
     def maps(self, model: FixationDensity, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
@@ -72,7 +72,7 @@ def spread(number: int, count: int) -> list[int]:
 
 def in_first(fold: Fold, picture: int) -> tuple[Viewed, int]:
     """The group of a picture of the first data set, and its place there."""
-    places = [(group, place) for group in fold.groups if group.source == 0 for place in range(len(group))]
+    places = [(group, place) for group in fold.groups() if group.source == 0 for place in range(len(group))]
     return places[picture]
 
 

@@ -47,13 +47,8 @@ class Fold:
     def __init__(
         self, groups: _Groups, number: int, count: int, settings: GazeFit, judges: _Groups | None = None
     ) -> None:
-        self._groups, self.number, self.count, self.settings = groups, number, count, settings
+        self.groups, self.number, self.count, self.settings = groups, number, count, settings
         self._judges = judges or groups  # the same pictures, with the fixations that are predicted
-
-    @property
-    def groups(self) -> Sequence[Viewed]:
-        """The pictures, by data set and size."""
-        return self._groups()
 
     @property
     def what(self) -> dict[str, object]:
@@ -65,7 +60,7 @@ class Fold:
         """For each group the other pictures and those held out."""
         before: dict[int, int] = {}
         split = []
-        for group in self.groups:
+        for group in self.groups():
             first = before.get(group.source, 0)
             split.append(_folds(len(group), self.count, self.number, first))
             before[group.source] = first + len(group)
@@ -73,18 +68,18 @@ class Fold:
 
     def fitted(self, source: int | None = None) -> list[list[int]]:
         """The pictures of each group that models are fitted to, of one data set or of all."""
-        pairs = zip(self.groups, self._split, strict=True)
+        pairs = zip(self.groups(), self._split, strict=True)
         return [fitted if source in (None, group.source) else [] for group, (fitted, _) in pairs]
 
     @cached_property
     def centres(self) -> dict[int, Tensor]:
         """Log density of the centre bias of each data set."""
-        sources = {each.source for each in self.groups}
-        return {source: log_centre(self.groups, self.fitted(source)) for source in sources}
+        sources = {each.source for each in self.groups()}
+        return {source: log_centre(self.groups(), self.fitted(source)) for source in sources}
 
     def fit(self) -> FixationDensity:
         """The model that is fitted to the other pictures."""
-        return fitted_density(self.settings, self.groups, self.fitted(), f"fold {self.number + 1} of {self.count}")
+        return fitted_density(self.settings, self.groups(), self.fitted(), f"fold {self.number + 1} of {self.count}")
 
     def maps(self, model: FixationDensity, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
         """The maps of some pictures of a group."""
@@ -93,7 +88,7 @@ class Fold:
     def scores(self, model: FixationDensity) -> Scores:
         """Scores on the held-out pictures with and without each term, and of the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, (_, some) in zip(self.groups, self._judges(), self._split, strict=True):
+        for group, seen, (_, some) in zip(self.groups(), self._judges(), self._split, strict=True):
             known = self.maps(model, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
             found = {CENTRE: score(bias, seen, flat_maps(group, some), some, conditional=False)[0]}
