@@ -346,9 +346,13 @@ class _Packed:
         labelled = valid & (label > 0)
         # official files have two decimals, so a difference of up to 0.01 is rounding
         outside = valid & ((edges - cut).abs() > 0.01).any(-1)
-        for what, which in (("without area in the image, dropped", ~solid), ("of crowds, dropped", dropped)):
-            self._count(f"boxes {what}", which)
-        self._count("boxes cut to the image", outside)
+        for what, which in (
+            ("without area in the image, dropped", ~solid),
+            ("of crowds, dropped", dropped),
+            ("cut to the image", outside),
+        ):
+            if which.any():
+                self.repairs[f"boxes {what}"] = int(which.sum())
         for at in (valid & ~labelled).nonzero()[:, 0].tolist():
             name = coco.cats[entries[at][1]["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
@@ -356,10 +360,6 @@ class _Packed:
         self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
         self._boxes, self._labels, self._crowd = boxes[labelled], label[labelled], crowd[labelled]
         self._ends: list[int] = rows[labelled].bincount(minlength=len(self.ids)).cumsum(0).tolist()
-
-    def _count(self, what: str, which: torch.Tensor) -> None:
-        if which.any():
-            self.repairs[what] = int(which.sum())
 
     def annotation(self, row: int) -> Annotation:
         own = slice(self._ends[row - 1] if row else 0, self._ends[row])

@@ -35,22 +35,17 @@ def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, st
     if not frame and not isinstance(source, str | PathLike):
         expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
         raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
-    where = "the table" if frame else str(source)
-    header, rows = _of_frame(source) if frame else _of_file(Path(source))
-    return where, header, rows
-
-
-def _of_frame(frame: Any) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
-    """Names of the columns of a `pandas.DataFrame`, and its rows as text; missing values are empty."""
-    header = [str(name) for name in frame.columns]
+    if not frame:
+        return str(source), *_of_file(Path(source))
+    header = [str(name) for name in source.columns]
     _check_different("the table", header)
     rows = []
-    for number, row in enumerate(frame.itertuples(index=False, name=None)):
+    for number, row in enumerate(source.itertuples(index=False, name=None)):
         # A column of whole numbers in which one is missing is one of floats.
         plain = [int(each) if isinstance(each, float) and each.is_integer() else each for each in row]
-        texts = ["" if str(value) in _MISSING else str(value) for value in plain]
+        texts = ["" if str(value) in _MISSING else str(value) for value in plain]  # missing values are empty
         rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
-    return header, rows
+    return "the table", header, rows
 
 
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")

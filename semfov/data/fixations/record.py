@@ -121,7 +121,9 @@ def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.
     except (TypeError, ValueError, RuntimeError):
         numbers = None
     if numbers is None:
-        raise InputError(f"{argument}: expected real numbers in rows of one length, got {_named(values)}")
+        kind = getattr(values, "dtype", None)
+        got = type(values).__name__ + ("" if kind is None else f" of {kind}")
+        raise InputError(f"{argument}: expected real numbers in rows of one length, got {got}")
     if finite:
         check(bool(np.isfinite(numbers).all()), argument, "finite numbers", "infinite ones or NaN; leave these out")
     return numbers
@@ -134,11 +136,6 @@ def as_path(points: Any, argument: str, *, least: int = 0) -> NDArray[np.float64
     check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
     check(len(path) >= least, argument, "at least one fixation", "none")
     return path
-
-
-def _named(values: Any) -> str:
-    kind = getattr(values, "dtype", None)
-    return type(values).__name__ if kind is None else f"{type(values).__name__} of {kind}"
 
 
 def _box(corners: _Values) -> tuple[float, float, float, float]:
