@@ -74,15 +74,18 @@ class Gatherer(Observer, Generic[_Model]):
             "visited": cells.bool(),
         }
 
-    def gather(self, belief: GatheredBelief, look: EvidenceLook) -> dict[str, Tensor]:
-        """Gather the evidence of one more look in each episode: the attributes of `GatheredBelief`."""
+    def gather(self, belief: GatheredBelief, look: EvidenceLook) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """Gather the evidence of one more look in each episode, for one class or several.
+
+        It gives the attributes of `GatheredBelief`, and the networks' inputs: those of `Gathered` up to the class.
+        """
 
         def by_cell(values: Tensor) -> Tensor:
             """`(B, X·Y)`, the same for all classes."""
             return values if look.evidence.ndim == values.ndim else values[:, None]
 
         near = self.each(nearness, look.distance)
-        return {
+        gathered = {
             "closest": torch.minimum(look.distance, belief.closest),
             "nearest": torch.where(by_cell(look.distance < belief.closest), look.evidence, belief.nearest),
             "best": torch.maximum(look.evidence, belief.best),
@@ -92,13 +95,9 @@ class Gatherer(Observer, Generic[_Model]):
             "looks": belief.looks + 1,
             "visited": belief.visited.scatter(-1, look.fixated[:, None], True),
         }
-
-    def read(self, gathered: dict[str, Tensor]) -> list[Tensor]:
-        """Inputs of the networks: the attributes of `Gathered` up to the class, for one class or several."""
-        total, weight = gathered["total"], gathered["weight"]
-        mean = total / (weight if total.ndim == weight.ndim else weight[:, None])
+        mean = gathered["total"] / by_cell(gathered["weight"])
         unchanged = (gathered[name] for name in ("closest", "score", "looks", "visited"))
-        return [gathered["nearest"], gathered["best"], mean, *unchanged]
+        return gathered, [gathered["nearest"], gathered["best"], mean, *unchanged]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
         r"""Discount the gathered evidence, and count the closest look as one from farther away; see `Observer.fade`.

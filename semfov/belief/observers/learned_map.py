@@ -76,7 +76,7 @@ class LearnedMap(Gatherer[MapEvidence]):
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
         belief, look = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
         columns = look.columns
-        all_looks = self.gather(belief, look)
+        all_looks, inputs = self.gather(belief, look)
 
         def probabilities(*gathered: Tensor) -> Tensor:
             """Probabilities `(B, X·Y, T+1)` from the gathered evidence, whose rows are of T classes each."""
@@ -89,5 +89,5 @@ class LearnedMap(Gatherer[MapEvidence]):
             nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
             return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)
 
-        values = self.each(probabilities, *self.read(all_looks), look.target, look.stands_for)
+        values = self.each(probabilities, *inputs, look.target, look.stands_for)
         return MapBelief(**all_looks, probabilities=values)

@@ -81,7 +81,7 @@ class Target(Gatherer[TargetEvidence]):
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
         belief, look = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
         columns = look.columns
-        all_looks = self.gather(belief, look)
+        all_looks, inputs = self.gather(belief, look)
 
         def probabilities(*gathered: Tensor) -> Tensor:
             what = Gathered(*gathered)
@@ -89,7 +89,7 @@ class Target(Gatherer[TargetEvidence]):
             image = self.model.presence(cells, what)[:, None]
             return torch.cat([cells, self.model.chance(what, columns), image], -1).sigmoid()
 
-        values = self.each(probabilities, *self.read(all_looks), look.target)
+        values = self.each(probabilities, *inputs, look.target)
         number = all_looks["closest"].shape[-1]
         present, following, anywhere = values[:, :number], values[:, number:-1], values[:, -1]
         return TargetBelief(**all_looks, present=present, following=following, anywhere=anywhere)
