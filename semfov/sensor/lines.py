@@ -19,7 +19,7 @@ from semfov.errors import values_known
 _SMALL = 112
 
 # Pixels of planes that are filtered together.
-_CACHED = 1 << 19
+_CACHED = 1 << 18
 
 # The C library returns freed blocks of several MB to the system, and every look would request their pages again. Once
 # a block of this size was freed, it keeps up to twice as much.
