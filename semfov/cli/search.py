@@ -66,33 +66,28 @@ class _PictureJob(ABC):
 
     def __init__(self, options: Any, agent: ActivePerception | None = None) -> None:
         self.options: Any = options
-        self._sources = picture_sources(options)
-        self.several = len(self._sources) > 1
+        self.sources = picture_sources(options)
+        self.several = len(self.sources) > 1
         for name in ("crops", "labels"):
-            places = Counter(str(source.place.with_suffix("")) for source in self._sources)
+            places = Counter(str(source.place.with_suffix("")) for source in self.sources)
             again = [place for place, times in places.items() if times > 1]
             expected = f"pictures of different names with --{name}, whose files have their names"
             check(not again or getattr(options, name) is None, name, expected, ", ".join(again[:3]))
         self.truth = None if options.annotations is None else Truth(options.annotations)
         if self.truth is not None:
-            for source in self._sources:
+            for source in self.sources:
                 self.truth.image_id(source.name)
         self.start = _check(options)
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
         self.aim(self.agent.classes[1:])
+        if not self.sources:
+            scene = embedded_picture(self.agent.classes[1:], self.target, options.seed)
+            self.sources = [PictureSource("embedded scene", scene=scene)]
 
     def aim(self, classes: Sequence[str] | None) -> None:
         """Take the target from the options; before the names of the classes are known it is not checked."""
         self.title = "exploration"
-
-    @property
-    def sources(self) -> list[PictureSource]:
-        """The pictures; an embedded scene if none is named."""
-        if not self._sources:
-            scene = embedded_picture(self.agent.classes[1:], self.target, self.options.seed)
-            self._sources = [PictureSource("embedded scene", scene=scene)]
-        return self._sources
 
     def depends_on(self) -> dict[str, Any]:
         """What outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""

@@ -48,6 +48,7 @@ class Fold:
         self, groups: _Groups, number: int, count: int, settings: GazeFit, judges: _Groups | None = None
     ) -> None:
         self.groups, self.number, self.count, self.settings = groups, number, count, settings
+        self.title = f"fold {number + 1} of {count}"
         self._judges = judges or groups  # the same pictures, with the fixations that are predicted
 
     @property
@@ -79,7 +80,7 @@ class Fold:
 
     def fit(self) -> FixationDensity:
         """The model that is fitted to the other pictures."""
-        return fitted_density(self.settings, self.groups(), self.fitted(), f"fold {self.number + 1} of {self.count}")
+        return fitted_density(self.settings, self.groups(), self.fitted(), self.title)
 
     def maps(self, model: FixationDensity, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
         """The maps of some pictures of a group."""
@@ -118,8 +119,8 @@ class FoldStore:
 
     def model(self, name: str, fold: Fold) -> FixationDensity:
         """The model of a fold, read or fitted."""
-        file, what = _place(name, fold)
-        key, path = digest_of({**self.what, **what}), self.folder / f"{file} model.safetensors"
+        key = digest_of({**self.what, "name": name, **fold.what})
+        path = self.folder / f"{name} {fold.title} model.safetensors"
         try:
             model = FixationDensity.from_pretrained(path)
             if model.metadata.get("key") == key:
@@ -140,7 +141,8 @@ class FoldStore:
                 scores = fold.scores(self.model(name, fold))
                 return {f"{row}/{source}": each for (row, source), each in scores.items()}
 
-            for key, each in self.kept(*_place(name, fold), computed).items():
+            kept = self.kept(f"{name} {fold.title}", {"name": name, **fold.what}, computed)
+            for key, each in kept.items():
                 row, _, source = key.rpartition("/")
                 parts.setdefault((row, int(source)), []).append(each)
         return {key: torch.cat(each) for key, each in parts.items()}
@@ -155,8 +157,3 @@ class FoldStore:
             kept = compute()
             write_tensors(path, key, kept)
         return kept
-
-
-def _place(name: str, fold: Fold) -> tuple[str, dict[str, object]]:
-    """The name of a fold's files, and what they depend on."""
-    return f"{name} fold {fold.number + 1} of {fold.count}", {"name": name, **fold.what}

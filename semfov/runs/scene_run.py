@@ -29,19 +29,15 @@ class SceneRun(ABC):
     scenes: Scenes
 
     @cached_property
-    def settings_key(self) -> str:
-        """sha256 of all settings, models and scenes that the outcomes depend on."""
-        return digest_of({"scenes": self.scenes.fingerprint, **self.depends_on()})
-
-    @cached_property
     def code(self) -> str:
         """Digest of the whole package, of the versions of the libraries that it uses, and of the run's own code."""
         return digest_of([package_digest(), versions(), class_digest(type(self))])
 
-    @property
+    @cached_property
     def key(self) -> str:
-        """Short key of settings and code; it keeps the outcomes of different runs apart."""
-        return f"{self.settings_key[:16]}-{self.code[:16]}"
+        """Short key of settings, models and scenes, and of the code; it keeps the outcomes of different runs apart."""
+        depends_on = digest_of({"scenes": self.scenes.fingerprint, **self.depends_on()})
+        return f"{depends_on[:16]}-{self.code[:16]}"
 
     @abstractmethod
     def depends_on(self) -> dict[str, Any]:
