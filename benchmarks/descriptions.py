@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.tables import table
 from semfov.data.classes import _SYNONYMS, _TABLE, _other_numbers, _plain_key
-from semfov.data.word_vectors import WordVectors, spread, words_of
+from semfov.data.word_vectors import WordVectors, _words_of, spread
 from semfov.detection.class_names import COCO_CLASSES
 
 NEAREST = (1, 3, 5, 10)
@@ -36,7 +36,7 @@ def cases() -> list[tuple[str, int]]:
     return [
         (other, places[0])
         for other, places in pairs
-        if len(places) == 1 and not set(words_of(other)) & set(words_of(COCO_CLASSES[places[0]]))
+        if len(places) == 1 and not set(_words_of(other)) & set(_words_of(COCO_CLASSES[places[0]]))
     ]
 
 

@@ -63,7 +63,7 @@ class WordVectors:
             DataError: the file is missing, or the line of a wanted word does not hold a vector of the common length.
             InputError: the file has none of the words.
         """
-        words = sorted({word for name in names for word in words_of(name)})
+        words = sorted({word for name in names for word in _words_of(name)})
         check_regular(path)
         vectors: dict[str, Tensor] = {}
         try:
@@ -87,7 +87,7 @@ class WordVectors:
         Raises:
             InputError: none of the words has a vector.
         """
-        vectors = [self.vectors[word] for word in words_of(name) if word in self.vectors]
+        vectors = [self.vectors[word] for word in _words_of(name) if word in self.vectors]
         check(bool(vectors), "name", "a name with at least one word in the file of word vectors", repr(name))
         return torch.stack(vectors).mean(0)
 
@@ -100,7 +100,7 @@ class WordVectors:
         Returns:
             Whether the name has a vector.
         """
-        return any(word in self.vectors for word in words_of(name))
+        return any(word in self.vectors for word in _words_of(name))
 
     def similarity(self, names: Sequence[str], others: Sequence[str]) -> Tensor:
         r"""Compute the cosine similarity of names, :math:`u \cdot v / (\lVert u \rVert \lVert v \rVert)`.
@@ -123,7 +123,7 @@ class WordVectors:
         return stacked / stacked.norm(dim=-1, keepdim=True)
 
 
-def words_of(name: str) -> list[str]:
+def _words_of(name: str) -> list[str]:
     """Split a name or a description into words, and leave out common words such as `the` and `something`."""
     words = re.findall(r"[^\W_]+(?:'[^\W_]+)?", canonical_name(name))
     return [word for word in words if word not in _IGNORED] or words

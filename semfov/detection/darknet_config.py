@@ -4,13 +4,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from semfov.errors import DataError
 from semfov.io.files import check_regular, read_text
 from semfov.io.schema import excerpt
 
 _MOST_BYTES = 2**20
+_T = TypeVar("_T", int, float)
 
 
 class Section(NamedTuple):
@@ -29,17 +30,11 @@ class Section(NamedTuple):
 
     def integers(self, key: str, default: str | None = None) -> tuple[int, ...]:
         """The value of `key` as a list of whole numbers."""
-        try:
-            return tuple(int(part) for part in self._entries(key, default))
-        except ValueError as error:
-            raise self._refuse(key, "whole numbers") from error
+        return self._values(int, key, default, "whole numbers")
 
     def numbers(self, key: str, default: str | None = None) -> tuple[float, ...]:
         """The value of `key` as a list of numbers."""
-        try:
-            numbers = tuple(float(part) for part in self._entries(key, default))
-        except ValueError as error:
-            raise self._refuse(key, "numbers") from error
+        numbers = self._values(float, key, default, "numbers")
         if not all(map(math.isfinite, numbers)):
             raise self._refuse(key, "finite numbers")
         return numbers
@@ -51,8 +46,11 @@ class Section(NamedTuple):
             raise self._refuse(key, f"one whole number of at least {minimum}")
         return values[0]
 
-    def _entries(self, key: str, default: str | None) -> list[str]:
-        return [part for part in self.text(key, default).split(",") if part.strip()]
+    def _values(self, kind: Callable[[str], _T], key: str, default: str | None, expected: str) -> tuple[_T, ...]:
+        try:
+            return tuple(kind(part) for part in self.text(key, default).split(",") if part.strip())
+        except ValueError as error:
+            raise self._refuse(key, expected) from error
 
     def _refuse(self, key: str, expected: str) -> DataError:
         return DataError(

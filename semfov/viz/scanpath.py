@@ -59,10 +59,7 @@ def _draw_objects(
     last: int | None = None,
     tagged: bool = True,
 ) -> list[Artist]:
-    """Draw the objects of a record with their scores; a box across the seam of a panorama is drawn at both ends.
-
-    For labels the figure must be laid out, because their positions depend on the layout.
-    """
+    """Draw the objects of a record, at both ends of a seam; for labels the figure must be laid out."""
     last = len(record) if last is None else last
     rows = [row for row in record.object_rows() if row["look"] <= last]
     width, height = record.size

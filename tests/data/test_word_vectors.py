@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.data import WordVectors, spread
-from semfov.data.word_vectors import words_of
+from semfov.data.word_vectors import _words_of
 from tests.refusals import refused, unusable
 
 VECTORS = np.random.default_rng(0).normal(size=(6, 5))
@@ -79,7 +79,7 @@ def test_weights_are_a_softmax_whose_largest_is_one(temperature, seed):
     [("something to drink from", ["drink"]), ("Fire-Hydrant", ["fire", "hydrant"]), ("one of it", ["one", "of", "it"])],
 )
 def test_function_words_are_ignored_unless_there_are_no_others(description, words):
-    assert words_of(description) == words
+    assert _words_of(description) == words
 
 
 def test_errors_name_the_file_line_or_argument(path, tmp_path):
