@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
-from semfov.sensor.lines import constant
+from semfov.sensor.lines import constant, empty
 from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, widened
 from semfov.threads import one_thread_if_small
 
@@ -95,10 +95,7 @@ def foveate(
         bands = source if isinstance(source, Bands) else laplacian_pyramid(source, levels, convention)
         result = _collapse(bands, fixation, widths, growth)
         return result if many else result[:, 0]
-    views = like.new_empty(batch, number, like.shape[1], *size)
-    if like.dtype.itemsize > 2:
-        # NumPy asks for large pages of memory, of which fewer are fetched when the views are written.
-        views = torch.from_numpy(np.empty_like(views.numpy()))
+    views = empty(like, batch, number, like.shape[1], *size)
     for b in (slice(n, n + max(1, step // number)) for n in range(0, batch, max(1, step // number))):
         if isinstance(source, Bands):
             own = Bands(tuple(band[b] for band in source.details), source.base[b], source.convention)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, TypeVar, TypeVarTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +24,8 @@ _CACHED = 1 << 18
 
 # The C library returns freed blocks of several MB to the system, and every look would request their pages again. Once
 # a block of this size was freed, it keeps up to twice as much.
-torch.empty(31 << 20, dtype=torch.uint8)
+_KEPT = 31 << 20
+torch.empty(_KEPT, dtype=torch.uint8)
 
 _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
@@ -46,6 +48,14 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
         return result
 
     return call
+
+
+def empty(like: Tensor, *shape: int) -> Tensor:
+    """`like.new_empty(shape)`, on a CPU in large pages of memory where the C library would not keep it."""
+    new = like.new_empty(shape)
+    # NumPy asks for large pages, of which fewer are fetched when the tensor is written.
+    large = new.nbytes > _KEPT and new.itemsize > 2 and new.device.type == "cpu"
+    return torch.from_numpy(np.empty_like(new.numpy())) if large else new
 
 
 _Part = tuple[tuple[int, int, int], tuple[int, int, int], int]
@@ -112,7 +122,7 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     if not shrinks:
         planes = planes.contiguous()
     number = planes.shape[0]
-    result = planes.new_empty(number, down.length, across.length)
+    result = empty(planes, number, down.length, across.length)
     # So many planes are filtered at a time that what is between the passes stays in the cache.
     sides = (down.length, across.count) if shrinks else (down.count, across.length)
     most = max(1, _CACHED // (sides[0] * sides[1]))
