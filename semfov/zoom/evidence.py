@@ -545,7 +545,7 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
     Shapes: scores `(rows, columns, K)` → `(down, across, K)`.
     """
     best = scores.amax(-1)
-    maps = torch.cat([best[None], (best > _levels(scores.dtype, scores.device)).to(best)])
+    maps = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
     by_span: dict[int, tuple[Tensor, Tensor]] = {}
     top, have = scores, (1, 1)
     for span in sorted(spans):
@@ -558,12 +558,6 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         total, hinted, clear = (means * (size[0] * size[1])).unbind()
         by_span[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
     return [by_span[span] for span in spans]
-
-
-@constant
-def _levels(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Scores above which hints are counted, `(2, 1, 1)`: any, and clear ones."""
-    return torch.tensor([0.0, 0.02], dtype=dtype, device=device)[:, None, None]
 
 
 def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:

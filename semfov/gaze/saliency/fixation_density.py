@@ -444,13 +444,7 @@ def _interpolation(
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
     """Maps `(..., rows, columns)` blurred by a Gaussian of σ cells, whose weights sum to 1 at the border, too."""
-    squares = (_squares(cells, sigma.dtype, sigma.device) for cells in maps.shape[-2:])
+    places = (torch.arange(cells, device=sigma.device, dtype=sigma.dtype) for cells in maps.shape[-2:])
+    squares = ((place[:, None] - place).square() for place in places)
     down, across = ((each / (-2 * sigma.square())).softmax(-1) for each in squares)
     return down @ maps @ across.mT
-
-
-@constant
-def _squares(cells: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Squared distances between the cells of a line, `(cells, cells)`."""
-    place = torch.arange(cells, device=device, dtype=dtype)
-    return (place[:, None] - place).square()
