@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.data.images import from_pillow, read_image
 from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.errors import InputError, check, check_pixels, lookup
+from semfov.errors import InputError, check, check_pixels, lookup, values_known
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -93,7 +93,11 @@ def as_images(
         return pixels
     got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
     check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
-    return pixels.to(device, torch.float32 if like is None else like.dtype).div_(_WHITE[pixels.dtype])
+    dtype, most = torch.float32 if like is None else like.dtype, _WHITE[pixels.dtype]
+    if dtype == torch.float32 and device.type == "cpu" and values_known(pixels):
+        # Other than torch, NumPy converts and divides in one pass over memory.
+        return torch.from_numpy(np.divide(pixels.cpu().numpy(), most, dtype=np.float32))
+    return pixels.to(device, dtype).div_(most)
 
 
 def as_pixels(
