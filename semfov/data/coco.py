@@ -81,8 +81,11 @@ def _check(data: dict[str, Any]) -> None:
                 raise _Fault(f"{where}: expected {key} to be a whole number of pixels, got {_show(image, key)}")
     _ids(data, "annotations", {})
     for where, annotation in _entries(data, "annotations"):
-        _check_reference(where, annotation, "image_id", images, "images")
-        _check_reference(where, annotation, "category_id", categories, "categories")
+        for key, ids, what in (("image_id", images, "images"), ("category_id", categories, "categories")):
+            value = annotation.get(key)
+            if isinstance(value, bool) or not isinstance(value, int | str) or value not in ids:
+                got = _show(annotation, key)
+                raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {got}")
         box = annotation.get("bbox")
         if not (isinstance(box, list) and len(box) == 4 and all(map(is_number, box)) and min(box[2:]) >= 0):
             raise _Fault(
@@ -121,12 +124,6 @@ def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | s
             if not is_plain(entry[field]):
                 raise _Fault(f"{where}: expected {field} to have no control characters, got {_show(entry, field)}")
     return ids
-
-
-def _check_reference(where: str, entry: dict[str, Any], key: str, ids: set[int | str], what: str) -> None:
-    value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | str) or value not in ids:
-        raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {_show(entry, key)}")
 
 
 def _kind(value: object) -> str:

@@ -31,7 +31,7 @@ from semfov.data.images import (
 )
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture, bytes_of
+from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture
 from semfov.errors import DataError, check, lookup
 from semfov.io.files import check_regular
 
@@ -280,7 +280,7 @@ class _RasterPicture(LargePicture):
         x1, y1, x2, y2 = box
         right, bottom = (min(-(-n // reduction) * reduction, m) for n, m in zip((x2, y2), self.size, strict=True))
         outwards = x1 // reduction * reduction, y1 // reduction * reduction, right, bottom
-        return bytes_of(self._window(outwards, reduction))
+        return torch.from_numpy(self._window(outwards, reduction)).permute(2, 0, 1)
 
     def _window(self, box: _Box, reduction: int) -> NDArray[np.uint8]:
         pixels = bytes_between(self._values(box, reduction), self._tone)

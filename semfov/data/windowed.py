@@ -52,7 +52,7 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
 
 
-def bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
+def _bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
     """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared; they are not to be written to."""
     try:
         # Other than `from_numpy`, it takes arrays that may not be written to.
@@ -102,7 +102,7 @@ class LargePicture(ABC):
         """
         self._inside(box)
         coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
-        return self._reduced(box, reduction) if coarse and reduction >= self._first else bytes_of(self._given(box))
+        return self._reduced(box, reduction) if coarse and reduction >= self._first else _bytes_of(self._given(box))
 
     def _given(self, box: _Box) -> NDArray[np.uint8]:
         """The pixels of a window; raises `InputError` where a reader gives others."""
@@ -162,7 +162,7 @@ class LargePicture(ABC):
             bottom = min(top + rows, high)
             # The filter reaches over the borders of a strip by less than one pixel of the copy.
             low, end = max(top - 1, 0), min(bottom + 1, high)
-            strip = bytes_of(self._given((0, low * first, width, min(end * first, height))))
+            strip = _bytes_of(self._given((0, low * first, width, min(end * first, height))))
             part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
             copy[top:bottom] = part.permute(1, 2, 0)
         return copy.permute(2, 0, 1)

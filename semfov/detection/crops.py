@@ -26,7 +26,12 @@ def merge_crops(
         limits = boxes.new_tensor([*size, *size], dtype=boxes.dtype)
         boxes = torch.minimum(boxes.clamp(min=0), limits)
         own = boxes.detach()
-        whole = _whole(own, window, limits[:2], side)
+        low, high = window[:, :2], window[:, 2:]
+        border = _BORDER * (high - low) / side
+        near = torch.where(low > 0, low + border, -torch.inf)
+        far = torch.where(high < limits[:2], high - border, torch.inf)
+        # Which of the boxes `(N, 4)` are whole in which of the crops `(L, 4)`, `(N, L)`.
+        whole = ((own[:, None, :2] > near) & (own[:, None, 2:] < far)).all(-1)
         sharper = torch.arange(crops, device=number.device) < number[:, None]
         left = (own[:, 2:] > own[:, :2]).all(-1) & ~(whole & sharper).any(-1)
         index = left.nonzero()[:, 0]
@@ -38,12 +43,3 @@ def merge_crops(
             Detections(boxes[chosen][None], scores[chosen][None], torch.ones_like(chosen, dtype=torch.bool)[None])
         )
     return merged[0] if len(merged) == 1 else Detections.stack(merged)
-
-
-def _whole(boxes: Tensor, windows: Tensor, size: Tensor, side: int) -> Tensor:
-    """Tell which boxes `(N, 4)` are whole in which of the crops `(L, 4)`, `(N, L)`."""
-    low, high = windows[:, :2], windows[:, 2:]
-    border = _BORDER * (high - low) / side
-    near = torch.where(low > 0, low + border, -torch.inf)
-    far = torch.where(high < size, high - border, torch.inf)
-    return ((boxes[:, None, :2] > near) & (boxes[:, None, 2:] < far)).all(-1)

@@ -233,26 +233,23 @@ def _fitting(signature: Signature) -> Iterator[str]:
     shapes = dict(signature.outputs)
     names = list(shapes)
     if "pred_boxes" in shapes and any(name in shapes for name in _DETR_LOGITS):
-        yield from _detr(shapes[_logits(shapes)][-1], signature.classes)
+        # A softmax has one channel more than classes. Unknown classes are COCO's, 91 ids or 80 classes.
+        channels, classes = shapes[_logits(shapes)][-1], signature.classes
+        if channels == (80 if classes is None else classes):
+            yield "rtdetr"
+        elif channels == (92 if classes is None else classes + 1):
+            yield "detr"
     elif {"labels", "boxes", "scores"} <= set(shapes):
         raise InputError(
             f"outputs {', '.join(names)}: expected all class scores of each box, got one class; export the model "
             f"without its top-k"
         )
-    elif {"boxes", _classes(shapes)} <= set(shapes):
+    elif "boxes" in shapes and shapes.keys() & {"classes", "scores"}:
         yield "candidates"
     elif len(shapes) > 1:
         yield from _distances(signature)
     elif len(shapes[names[0]]) == 3:
         yield from _single(signature, names[0], *shapes[names[0]][1:])
-
-
-def _detr(channels: int, classes: int | None) -> Iterator[str]:
-    """Heads of DETR; a softmax has one channel more than classes. Unknown classes are COCO's, 91 ids or 80 classes."""
-    if channels == (80 if classes is None else classes):
-        yield "rtdetr"
-    elif channels == (92 if classes is None else classes + 1):
-        yield "detr"
 
 
 def _distances(signature: Signature) -> Iterator[str]:
@@ -318,10 +315,6 @@ def _logits(outputs: Mapping[str, object]) -> str:
     return next(name for name in _DETR_LOGITS if name in outputs)
 
 
-def _classes(outputs: Mapping[str, object]) -> str:
-    return "classes" if "classes" in outputs else "scores"
-
-
 def _first(outputs: _Outputs) -> Tensor:
     return next(iter(outputs.values()))
 
@@ -335,9 +328,8 @@ def _rows(outputs: _Outputs, canvas: _Canvas, *, across: bool = False) -> Tensor
 
 
 def _candidates(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
-    return Candidates(
-        outputs["boxes"], outputs[_classes(outputs)], outputs.get("objectness"), outputs.get("background")
-    )
+    scores = outputs["classes" if "classes" in outputs else "scores"]
+    return Candidates(outputs["boxes"], scores, outputs.get("objectness"), outputs.get("background"))
 
 
 def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:

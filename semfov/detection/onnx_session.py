@@ -21,8 +21,8 @@ _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "te
 
 # Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
 _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
-    "orig_target_sizes": lambda canvas: _repeat(canvas, [canvas.shape[-1], canvas.shape[-2]]),
-    "im_shape": lambda canvas: _repeat(canvas, [canvas.shape[-2], canvas.shape[-1]]).to(canvas.dtype),
+    "orig_target_sizes": lambda canvas: torch.tensor([[canvas.shape[3], canvas.shape[2]]] * canvas.shape[0]),
+    "im_shape": lambda canvas: canvas.new_tensor([[canvas.shape[2], canvas.shape[3]]] * canvas.shape[0]),
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
 }
 
@@ -226,9 +226,10 @@ def check_file(path: Path) -> bool:
     """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
     import onnx
 
-    check_regular(path, f"ONNX model {str(path)!r}")
+    name = f"ONNX model {str(path)!r}"
+    check_regular(path, name)
     if not path.is_file():
-        raise DataError(f"ONNX model {str(path)!r}: no such file; check the path")
+        raise DataError(f"{name}: no such file; check the path")
     try:
         model = onnx.load(path, load_external_data=False)
         stored = [*model.graph.initializer]
@@ -236,9 +237,10 @@ def check_file(path: Path) -> bool:
             for entry in tensor.external_data:
                 if entry.key == "location":
                     check_regular(inside(path.parent, entry.value))
-        _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
+        for tensor in stored:
+            _check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
         if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
-            raise DataError(f"ONNX model {str(path)!r}: expected at most {_MOST_METADATA:,} characters of metadata")
+            raise DataError(f"{name}: expected at most {_MOST_METADATA:,} characters of metadata")
         slim = _without_weights(model)
         for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
             for place, side in enumerate(value.type.tensor_type.shape.dim):
@@ -249,14 +251,15 @@ def check_file(path: Path) -> bool:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
         reason = " ".join(str(error).split())[-400:]
-        raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from None
+        raise DataError(f"cannot load the {name}: {reason}") from None
     values = [*inferred.value_info, *inferred.input, *inferred.output]
-    _check_sizes(path, ((value.name, _dims(value)) for value in values))
+    for value in values:
+        _check_elements(f"{name}: tensor {excerpt(value.name)}", _dims(value))
     known = {
         value.name for value in values if all(each.HasField("dim_value") for each in value.type.tensor_type.shape.dim)
     }
     steps = {node.op_type for node in model.graph.node}
-    made = {name for node in model.graph.node for name in node.output if name}
+    made = {output for node in model.graph.node for output in node.output if output}
     return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
 
 
@@ -265,11 +268,6 @@ def _check_elements(name: str, sizes: Iterable[int]) -> None:
     sizes = list(sizes)
     if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
         raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
-
-
-def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> None:
-    for name, dims in tensors:
-        _check_elements(f"ONNX model {str(path)!r}: tensor {excerpt(name)}", dims)
 
 
 def _dims(value: Any) -> list[int]:
@@ -332,7 +330,3 @@ def _providers(device: torch.device, providers: Sequence[_Provider] | None) -> l
 
 def _sizes(shape: Sequence[int | str | None]) -> tuple[int | None, ...]:
     return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)
-
-
-def _repeat(canvas: Tensor, row: list[int]) -> Tensor:
-    return torch.tensor([row]).expand(canvas.shape[0], -1).contiguous()

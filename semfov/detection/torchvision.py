@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from os import PathLike, fspath
+from os import fspath
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, cast
@@ -152,7 +152,9 @@ def load_torchvision(
         raise InputError("classes: expected the names of the model's classes without background, got None")
     else:
         model |= {"num_classes": len(classes) + first, "weights_backbone": None}
-        digest = "" if weights is None else sha256(_file(weights))
+        if weights is not None and not Path(weights).is_file():
+            raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
+        digest = "" if weights is None else sha256(weights)
     try:
         network = models.get_model(name, weights=enum, **model)
     except (TypeError, ValueError) as error:
@@ -163,7 +165,7 @@ def load_torchvision(
         known = sorted({each for call in builders for each in inspect.signature(call).parameters})
         lookup(option, known, f"option of {name}")
     if enum is None and weights is not None:
-        _load_state(network, _file(weights))
+        _load_state(network, Path(weights))
     network.requires_grad_(False).to(device)
     return TorchvisionDetector(
         network,
@@ -184,13 +186,6 @@ def _member(enum: Any, weights: Any) -> Any:
     if isinstance(weights, str) and not Path(text).suffix:
         return enum[lookup(text, [*enum.__members__], f"{enum.__name__} member")]
     return None
-
-
-def _file(weights: str | PathLike[str]) -> Path:
-    path = Path(weights)
-    if not path.is_file():
-        raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
-    return path
 
 
 def _download(enum: Any) -> str:

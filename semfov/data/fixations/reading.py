@@ -23,6 +23,8 @@ DATA_SETS: dict[_Reader, str] = {
     read_ruarte: "Ruarte and others",
 }
 """Readers of JSON, with the data set whose form they read."""
+_BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
+"""How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""
 
 
 def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fixations]:
@@ -76,24 +78,15 @@ def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | No
     kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
     if kind == ".asc":
         return read_eyelink
-    if kind == ".json":
-        return _json_reader(source)
-    return table_reader(source, columns)
-
-
-_BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
-"""How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""
-
-
-def _json_reader(path: str | PathLike[str]) -> _Reader:
-    """The reader of the data set that a file of JSON has the form of, as it begins."""
-    check_regular(path)
+    if kind != ".json":
+        return table_reader(source, columns)
+    check_regular(source)
     try:
-        begins = _BEGINNING.match(read_text(path))
+        begins = _BEGINNING.match(read_text(source))
     except (OSError, UnicodeError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
+        raise DataError(f"{source}: cannot be read as JSON ({error}); correct or replace the file") from None
     if begins is None:
-        raise DataError(f"{path}: expected JSON, a list or an object, got other text; correct or replace the file")
+        raise DataError(f"{source}: expected JSON, a list or an object, got other text; correct or replace the file")
     trials, people = begins.groups()
     if trials:
         return read_cocosearch

@@ -404,9 +404,7 @@ def read_export(
     named = _named_columns(columns, _OURS)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     where, header, rows = of_source(source)
-    by_key = {_key(name): name for name in reversed(header)}
-    _split_location(by_key, rows)
-    export = next((each for each in _EXPORTS if _fits(each, by_key)), None)
+    export, by_key = _export_of(header, rows)
     if export is None:
         programs = ", ".join(dict.fromkeys(each.program for each in _EXPORTS))
         raise DataError(
@@ -459,28 +457,24 @@ def table_reader(source: Any, columns: Mapping[str, str] | None) -> Callable[...
     header = of_source(source)[1]
     if {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or not {*(columns or ())} <= {*_OURS}:
         return read_table
-    by_key = {_key(name): name for name in header}
-    _split_location(by_key, [])
-    return read_export if any(_fits(each, by_key) for each in _EXPORTS) else read_table
+    return read_table if _export_of(header, [])[0] is None else read_export
 
 
-def _key(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-def _fits(export: _Export, by_key: Mapping[str, str]) -> bool:
-    return {*export.point, *export.needs} <= {*by_key} and not {*export.lacks} & {*by_key}
-
-
-def _split_location(by_key: dict[str, str], rows: Sequence[tuple[str, dict[str, str]]]) -> None:
-    """Make two columns of one with pairs, `[x, y]`."""
+def _export_of(
+    header: Sequence[str], rows: Sequence[tuple[str, dict[str, str]]]
+) -> tuple[_Export | None, dict[str, str]]:
+    """The program of a table, and its columns by plain names; a column of pairs, `[x, y]`, becomes two."""
+    by_key = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(header)}
     name = by_key.get("location")
-    if name is None or "locationx" in by_key:
-        return
-    by_key |= {"locationx": "location_x", "locationy": "location_y"}
-    for _, row in rows:
-        pair = re.split(r"[,\s]+", row.get(name, "").strip("[]() "))
-        row["location_x"], row["location_y"] = pair if len(pair) == 2 else ("", "")
+    if name is not None and "locationx" not in by_key:
+        by_key |= {"locationx": "location_x", "locationy": "location_y"}
+        for _, row in rows:
+            pair = re.split(r"[,\s]+", row.get(name, "").strip("[]() "))
+            row["location_x"], row["location_y"] = pair if len(pair) == 2 else ("", "")
+    fitting = (
+        each for each in _EXPORTS if {*each.point, *each.needs} <= by_key.keys() and not {*each.lacks} & by_key.keys()
+    )
+    return next(fitting, None), by_key
 
 
 def _reader(
