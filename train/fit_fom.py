@@ -25,7 +25,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from semfov.fit.observation import count_misses, fit_published, level_edges, statistics_of
+from semfov.fit.observation import count_misses, fit_published, statistics_of
 from semfov.fit.settings import FitConfig
 from semfov.fit.training import split
 from semfov.io.files import write_text
@@ -100,7 +100,7 @@ class FitFomConfig(FitConfig):
         """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
         if self.mosaics:
             return [n - 0.5 for n in range(1, self.levels)]
-        return level_edges(self.sensor, self.levels, self.width)
+        return self.sensor.level_edges(self.levels, self.width)
 
 
 def _report_markdown(

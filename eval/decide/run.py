@@ -17,7 +17,7 @@ from eval.comparison.settings import ComparedConfig
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
 from semfov.agents.episode import EpisodeLimits
-from semfov.agents.windows import USUAL_PASSES, WindowEpisode
+from semfov.agents.windows import WindowEpisode
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
@@ -188,7 +188,7 @@ class DecisionRun(ComparedLooking):
                 ("background", *self.eye.detector.classes),
                 self.windows,
                 target,
-                limits=EpisodeLimits(USUAL_PASSES),
+                limits=EpisodeLimits(WindowEpisode.usual_passes),
                 confirm=config.confirm,
                 give_up=config.give_up,
                 closer=None if config.closer else 0,

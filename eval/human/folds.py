@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.gaze import GazeFit, fit_oculomotor
-from semfov.fit.gaze_folds import Fold, flat_maps
+from semfov.fit.gaze_folds import Fold
 from semfov.fit.viewing import Viewed, counted, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 
@@ -61,7 +61,7 @@ class StudiedFold(Fold):
         if self._given == "features":
             return super().maps(model, group, pictures)
         if self._given == "none":
-            return flat_maps(group, pictures)
+            return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
         return [others_of(group, each, self.centres[group.source]) for each in pictures]
 
 

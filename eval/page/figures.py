@@ -14,7 +14,7 @@ from eval.page.origin import missing
 from eval.page.tables import Runs, published, published_columns
 from eval.page.thresholds import CONTRASTS, Contrast
 from semfov.metrics.episodes import FloatArray
-from semfov.viz.curves import draw_curves
+from semfov.viz.curves import plot_curves
 from semfov.viz.style import make_figure, save_figure, styled
 
 if TYPE_CHECKING:
@@ -84,8 +84,10 @@ def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
     rows = -(-len(panels) // 2)
     figure, every = make_figure(rows, 2, width=8.8, height=2.9 * rows + 0.5)
     for axes, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
-        draw_curves(axes, curves, errors)
-        axes.set(xlabel="gaze shifts", ylabel=label, title=title)
+        plot_curves(curves, errors, label=label, title=title, ax=axes)
+        legend = axes.get_legend()
+        assert legend is not None
+        legend.remove()
     for axes in every[len(panels) :]:
         axes.remove()
     figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)

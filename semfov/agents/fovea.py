@@ -32,7 +32,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction, ExpectedGain
+from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.paths import Ending, FoveaMoment, GazePrediction, RecordedLook, Scanpath
@@ -111,7 +111,13 @@ class FoveaAgent:
         )
         grid = episode.open(image)
         if isinstance(observer, LearnedMap) and (policy is None or worth is not None):
-            episode.ends = _outcome_by_gain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
+            gain, least = ExpectedGain(observer.model, grid), _WORTH if worth is None else worth
+
+            def outcome(step: Step) -> Tensor:
+                best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
+                return ((best < least) & (least > 0) & ~step.visited.all(-1)).long()
+
+            episode.ends = outcome
         return episode.run()
 
     def find_all(
@@ -446,16 +452,6 @@ def _outcome_of(
             if weight > 0
         ]
         return torch.stack(hits).any(0).long()
-
-    return outcome
-
-
-def _outcome_by_gain(gain: AcquisitionFunction, worth: float) -> Callable[[Step], Tensor]:
-    """Make the function that decides which explorations end with a step; → `(A,)`."""
-
-    def outcome(step: Step) -> Tensor:
-        best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
-        return ((best < worth) & (worth > 0) & ~step.visited.all(-1)).long()
 
     return outcome
 

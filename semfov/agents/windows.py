@@ -34,9 +34,6 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.objects import merge, probable_objects, without_replaced
 from semfov.zoom.slices import ranked, usual_slices
 
-USUAL_PASSES = 24
-"""Default for the largest number of passes of the detector."""
-
 LIKELY = 0.5
 """Default for the least probability of the objects that a record counts."""
 
@@ -144,7 +141,7 @@ class ZoomAgent(nn.Module):
         check_whole(0 if closer is None else closer, "closer", 0, 100)
         episode = self.episode(
             class_index(target, self.classes[1:], "target"),
-            limits=EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look),
+            limits=EpisodeLimits(WindowEpisode.usual_passes if passes is None else passes, seconds, on_look),
             confirm=confirm, give_up=give_up, closer=closer,
         )  # fmt: skip
         return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
@@ -186,7 +183,7 @@ class ZoomAgent(nn.Module):
             DataError: the file cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(USUAL_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits(WindowEpisode.usual_passes if passes is None else passes, seconds, on_look)
         check_whole(batch, "batch", 1, MOST_PASSES)
         check_number(worth, "worth", 0, float("inf"))
         if least is not None:
@@ -254,6 +251,9 @@ class WindowEpisode(Episode[ZoomPath]):
     did. With rate 0 nothing is forgotten or replaced: frames of a still picture give the looks, the closer looks and
     the objects of a search or an exploration of the picture up to its end.
     """
+
+    usual_passes = 24
+    """Default for the largest number of passes of the detector."""
 
     def __init__(
         self,

@@ -193,7 +193,13 @@ def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = _with_classes(config.named())
     if config.gaze.fixations:
-        _fit_gaze(config)
+        gaze = replace(config.gaze, cache=config.gaze.cache or config.cache)
+        fitted, scored = fit_gaze_model(gaze, make_detector(config.detector), config.out / "progress" / "gaze")
+        path, text = config.out / "gaze.safetensors", gaze_report(scored)
+        fitted.save(path)
+        write_text(config.out / "gaze.md", text)
+        print(text, "written:", f"  {path}", f"  {config.out / 'gaze.md'}", sep="\n")
+        print(f"\nnext:\n  semfov gaze PHOTO.jpg --detector {config.model} --model {path}")
         if config.data.root is None:
             return
     started = time.monotonic()
@@ -240,17 +246,6 @@ def fit_folder(config: FitDetectorConfig) -> None:
     target = f'"{target}"' if " " in target else target
     options = f"--target {target} --models {fspath(config.out)}"
     print(f"\nnext:\n  semfov search PHOTO.jpg {options}\n  semfov find PHOTOS {options} --out found.csv")
-
-
-def _fit_gaze(config: FitDetectorConfig) -> None:
-    """Fit where people look, and write the model and its report into the folder."""
-    gaze = replace(config.gaze, cache=config.gaze.cache or config.cache)
-    model, scored = fit_gaze_model(gaze, make_detector(config.detector), config.out / "progress" / "gaze")
-    path, report = config.out / "gaze.safetensors", gaze_report(scored)
-    model.save(path)
-    write_text(config.out / "gaze.md", report)
-    print(report, "written:", f"  {path}", f"  {config.out / 'gaze.md'}", sep="\n")
-    print(f"\nnext:\n  semfov gaze PHOTO.jpg --detector {config.model} --model {path}")
 
 
 def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:

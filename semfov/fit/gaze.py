@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from semfov.fit.viewing import Events, Viewed, events_of, log_centre
+from semfov.fit.viewing import Events, Viewed, log_centre
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 from semfov.gaze.saliency.oculomotor import OculomotorBias
@@ -190,7 +190,7 @@ def fit_oculomotor(
     model.oculomotor = OculomotorBias()
     places = [{picture: row for row, picture in enumerate(some)} for some in pictures]
     events = [
-        {picture: events_of(group.paths[picture], group.size, cells_of(group.size)) for picture in some}
+        {picture: Events.of(group.paths[picture], group.size, cells_of(group.size)) for picture in some}
         for group, some in zip(groups, pictures, strict=True)
     ]
 
@@ -256,7 +256,7 @@ def score(
     rows: list[list[Tensor]] = [[] for _ in without]
     terms = {"centre bias": model.centre_bias(size)[None]}
     for one, picture in zip(maps, pictures, strict=True):
-        events = events_of(group.paths[picture], size, raster[::-1])
+        events = Events.of(group.paths[picture], size, raster[::-1])
         if conditional:
             events = events.some(torch.randperm(len(events.cell), generator=generator)[:_SCORED])
         given: dict[str, Tensor] = {**terms, "map": _for_events(one, events)}

@@ -92,7 +92,8 @@ class Fold:
         for group, seen, (_, some) in zip(self.groups(), self._judges(), self._split, strict=True):
             known = self.maps(model, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
-            found = {CENTRE: score(bias, seen, flat_maps(group, some), some, conditional=False)[0]}
+            flat = [torch.zeros(1, *cells_of(group.size))] * len(some)
+            found = {CENTRE: score(bias, seen, flat, some, conditional=False)[0]}
             for conditional, names in ROWS.items():
                 if self.settings.saccade_epochs or not conditional:
                     scored = score(model, seen, known, some, conditional=conditional, without=((CENTRE,), ()))
@@ -100,11 +101,6 @@ class Fold:
             for name, each in found.items():
                 scores.setdefault((name, group.source), []).append(each)
         return {key: torch.cat(parts) for key, parts in scores.items()}
-
-
-def flat_maps(group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
-    """Maps of some pictures of a group that tell nothing."""
-    return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
 
 
 class FoldStore:

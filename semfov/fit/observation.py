@@ -20,7 +20,6 @@ from semfov.metrics.calibration import calibration, surprisal
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.statistics import DirichletStatistics
-from semfov.runs.config import SensorConfig
 from semfov.runs.samples import Samples, all_cells
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
@@ -29,18 +28,6 @@ from semfov.zoom.eye import WindowEye
 _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 """Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
 `(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
-
-
-def level_edges(sensor: SensorConfig, levels: int = 8, width: float = 50.0) -> list[float]:
-    """Borders between levels of distance, in units of the image's longer side: the steps of a sensor that has some.
-
-    A level is `width` pixels wide in an image whose longer side is 640, for a fovea of 100 pixels.
-    """
-    own = sensor.kind.borders(sensor.whole())
-    if own is not None:
-        # Farther away than the longer side there is hardly anything.
-        return [edge / sensor.reference for edge in own if edge < sensor.reference]
-    return [width / 100.0 * sensor.fovea * n for n in range(1, levels)]
 
 
 def fit_published(
@@ -97,7 +84,7 @@ class ObservationFit(PartFit):
     def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
         config, run, samples = self.config, self.run, self.inputs.samples
-        holdout, edges = self.settings["holdout"], level_edges(config.sensor)
+        holdout, edges = self.settings["holdout"], config.sensor.level_edges()
         held_out = split(samples.scene, holdout)
         judged = samples[held_out]
         fitted = samples[~held_out]

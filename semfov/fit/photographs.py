@@ -14,7 +14,7 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
-from semfov.fit.windows_certainty import Exploration, fit_certainty, fit_spread, left_out, logistic_regression
+from semfov.fit.windows_certainty import Exploration, fit_spread, left_out, logistic_regression
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
@@ -142,7 +142,8 @@ def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
     """Fit the probability of objects of all classes; looks at all slices leave nothing to expect."""
     after = [seen for each in explored if each.target is None for seen in each.objects.values()]
     facts, right = (torch.cat(column) for column in zip(*after, strict=True))
-    return replace(fit_certainty(facts[right >= 0], right[right >= 0] > 0), strength=1.0)
+    offset, *weights = logistic_regression(facts[right >= 0], right[right >= 0] > 0)
+    return Certainty(offset, tuple(weights), strength=1.0)
 
 
 def _usual(held: Tensor, count: int) -> Tensor:

@@ -222,20 +222,20 @@ class Events(NamedTuple):
     cell: Tensor
     person: Tensor
 
+    @classmethod
+    def of(cls, paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Events:
+        """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
+        before = [torch.zeros(0, LONGEST - 1, 2)]
+        for path in paths:
+            padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
+            before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
+        cell = _numbers_of_cells(torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)]), size, cells)
+        person = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(path) - 1 for path in paths]).long())
+        return cls(torch.cat(before), cell, person)
+
     def some(self, index: Tensor) -> Events:
         """Some of the events."""
         return Events(*(each[index] for each in self))
-
-
-def events_of(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Events:
-    """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
-    before = [torch.zeros(0, LONGEST - 1, 2)]
-    for path in paths:
-        padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
-        before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
-    cell = _numbers_of_cells(torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)]), size, cells)
-    person = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(path) - 1 for path in paths]).long())
-    return Events(torch.cat(before), cell, person)
 
 
 def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, blur: float = 2.5) -> Tensor:

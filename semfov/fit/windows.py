@@ -28,12 +28,10 @@ from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_evidence import (
     SurveyExample,
     ZoomExample,
-    example_of,
     fit_presence,
     fit_rates,
     fit_survey,
     pair_windows,
-    windows_of,
 )
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.files import json_sha256
@@ -268,7 +266,7 @@ def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
     kind, index = task
     pictures = fit.pictures[kind]
     glances = StoredGlances(fit.eye, pictures, index, fit.store)
-    glances.see(windows_of(pictures, index, glances.lattice))
+    glances.see(ZoomExample.windows(pictures, index, glances.lattice))
     glances.save()
     kept = fit.store.read(pictures.digest(index))
     return b"" if kept is None else pack_tensors(kept)
@@ -326,7 +324,7 @@ class MosaicFit:
         least = self.eye.detector.least
         return {
             kind: [
-                example_of(self.pictures[kind], n, looks, least)
+                ZoomExample.of(self.pictures[kind], n, looks, least)
                 for n, looks in enumerate(self.opened(kind))
                 if looks.lattice.levels > 1
             ]

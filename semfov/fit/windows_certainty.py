@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice, product
@@ -101,22 +101,27 @@ class Exploration(NamedTuple):
 
 
 @torch.inference_mode()
-def _explorations(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], *, passes: int, title: str
-) -> Iterator[Exploration]:
-    """Explore pictures, for objects of all classes and for those of the most frequent class of each."""
-    for index, looks in enumerate(track(opened, title, "picture")):
-        annotation = pictures.annotation(index)
-        for target in (None, int(annotation.labels.bincount().argmax())):
-            glances: list[Glance] = []
-            remaining, promised = [], [0.0]
-            for turn in islice(find_everything(looks, model, target), _FURTHER * passes):
-                glances.append(turn.glance)
-                remaining.append(turn.belief.remaining())
-                promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
-            counts = {min(n, len(glances)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
-            yield Exploration.of(target, glances, counts, looks.lattice, annotation, remaining, promised[1:])
-        looks.save()
+def explorations_of_kinds(
+    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
+) -> dict[str, list[Exploration]]:
+    """Explore pictures by kind, for objects of all classes and for those of the most frequent class of each."""
+    explored: dict[str, list[Exploration]] = {kind: [] for kind in some}
+    for kind, (pictures, opened) in some.items():
+        for index, looks in enumerate(track(opened, f"exploring, {kind}", "picture")):
+            annotation = pictures.annotation(index)
+            for target in (None, int(annotation.labels.bincount().argmax())):
+                glances: list[Glance] = []
+                remaining, promised = [], [0.0]
+                for turn in islice(find_everything(looks, model, target), _FURTHER * passes):
+                    glances.append(turn.glance)
+                    remaining.append(turn.belief.remaining())
+                    promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
+                counts = {min(n, len(glances)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
+                explored[kind].append(
+                    Exploration.of(target, glances, counts, looks.lattice, annotation, remaining, promised[1:])
+                )
+            looks.save()
+    return explored
 
 
 def logistic_regression(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> list[float]:
@@ -153,12 +158,6 @@ def logistic_regression(facts: Tensor, right: Tensor, *, ridge: float = 1.0, ste
     return coefficients.tolist()
 
 
-def fit_certainty(facts: Tensor, right: Tensor) -> Certainty:
-    """Fit the probability of objects; it expects none that no look has shown. Shapes: facts `(n, 14)`, right `(n,)`."""
-    offset, *weights = logistic_regression(facts, right)
-    return Certainty(offset, tuple(weights))
-
-
 def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tensor]:
     """Facts about the objects of explorations after some numbers of looks, and which are right, without crowds."""
     after = [
@@ -172,7 +171,8 @@ def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tenso
 
 def _fitted(explored: Sequence[Exploration], passes: int) -> Certainty:
     """Fit the probability of objects, and then the number of objects that further looks show."""
-    return _fit_unseen(fit_certainty(*_judged(explored, passes)), explored)
+    offset, *weights = logistic_regression(*_judged(explored, passes))
+    return _fit_unseen(Certainty(offset, tuple(weights)), explored)
 
 
 def _fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certainty:
@@ -262,16 +262,6 @@ def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list
         *table(rows),
         "",
     ]
-
-
-def explorations_of_kinds(
-    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
-) -> dict[str, list[Exploration]]:
-    """The explorations of pictures by their kind."""
-    return {
-        kind: [*_explorations(model, pictures, opened, passes=passes, title=f"exploring, {kind}")]
-        for kind, (pictures, opened) in some.items()
-    }
 
 
 def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:

@@ -40,6 +40,28 @@ class ZoomExample(NamedTuple):
     looks: tuple[_WindowResult, ...]
     least: float = LEAST
 
+    @staticmethod
+    def windows(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
+        """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
+        tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
+        slots: Any = [tuple(map(float, tile.slot)) for tile in tiles]
+        return [*half_steps(lattice), *(Window.around(lattice, slot) for slot in slots)]
+
+    @classmethod
+    def of(cls, pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> "ZoomExample":
+        """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`.
+
+        A look finds the objects that it shows with a detection of their class.
+        """
+        annotation, looks = pictures.annotation(index), []
+        for glance in glances.see(cls.windows(pictures, index, glances.lattice)):
+            detections = glance.detections
+            sure = detections.confidence[0] >= DETECTION_SCORE
+            boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
+            hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
+            looks.append(_WindowResult(glance.window, glance.gist, glance.show, hits.any(0)))
+        return cls(glances.lattice, annotation.labels, tuple(looks), least)
+
 
 _Cells = tuple[int, int, int, int]
 """First column and row, and those after the last."""
@@ -57,28 +79,6 @@ def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _Wi
         inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
         if 1 <= steps <= STEPS and (inside or look.level == 0):
             yield place, closer, steps, (x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale))
-
-
-def windows_of(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
-    """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
-    tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
-    slots: Any = [tuple(map(float, tile.slot)) for tile in tiles]
-    return [*half_steps(lattice), *(Window.around(lattice, slot) for slot in slots)]
-
-
-def example_of(pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> ZoomExample:
-    """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`.
-
-    A look finds the objects that it shows with a detection of their class.
-    """
-    annotation, looks = pictures.annotation(index), []
-    for glance in glances.see(windows_of(pictures, index, glances.lattice)):
-        detections = glance.detections
-        sure = detections.confidence[0] >= DETECTION_SCORE
-        boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
-        hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
-        looks.append(_WindowResult(glance.window, glance.gist, glance.show, hits.any(0)))
-    return ZoomExample(glances.lattice, annotation.labels, tuple(looks), least)
 
 
 class Windows(NamedTuple):

@@ -187,9 +187,15 @@ def _looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {what.title()}s</label> '
         f'<label><input type="checkbox" class="names-shown"{names}> Names</label></span>'
     )
+    entries = [("objects", "object that was found")]
+    if data["confirmable"]:
+        entries.append(("sure", "confirmed by the decision or a closer look"))
+    entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
+    entries += [("truth", "true box")] if data["truth"] else []
+    legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in entries)
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
-        f'<div class="panes"><figure class="overview"><figcaption>{_legend(data)}{switches}</figcaption>'
+        f'<div class="panes"><figure class="overview"><figcaption><ul class="key">{legend}</ul>{switches}</figcaption>'
         f'{_picture(data, place)}</figure><section class="found-objects" aria-labelledby="{place}-objects">'
         f'<h4 id="{place}-objects">Objects</h4>{_objects(data, place)}</section></div>'
         f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
@@ -197,19 +203,6 @@ def _looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         f'<div class="looks">{looks}</div>'
         f'<p class="hint">{data["values"]}</p></article>'
     )
-
-
-def _legend(data: Data) -> str:
-    """What the colours of the picture mean."""
-    what = "view" if data["turns"] else "window"
-    entries = [("objects", "object that was found")]
-    if data["confirmable"]:
-        entries.append(("sure", "confirmed by the decision or a closer look"))
-    entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
-    swatches = [f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in entries]
-    if data["truth"]:
-        swatches.append('<li><i class="of-truth"></i> true box</li>')
-    return f'<ul class="key">{"".join(swatches)}</ul>'
 
 
 def _picture(data: Data, place: str) -> str:

@@ -53,6 +53,11 @@ def zoom_data(
         }
         for row in path.object_rows()
     ]
+    reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
+    result = f"{path.objects_in_words()}."
+    if path.decision is not None:
+        what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"
+        result = f"“{path.target_name}” {path.decision.outcome}, {what}: {path.decision.probability:.2f}."
     image = read_region(source, (0, 0, wide, high), path.size, min(width, wide))
     return {
         "name": name,
@@ -60,7 +65,7 @@ def zoom_data(
         "detector": None if settings is None else settings["detector"]["name"],
         "sensor": path.sensor_in_words(),
         "passes": str(path.passes),
-        "decision": _outcome_in_words(path),
+        "decision": f"{result} {reason}".rstrip(),
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
@@ -78,18 +83,6 @@ def zoom_data(
     }
 
 
-def _outcome_in_words(path: Record) -> str:
-    """Tell the result of a search or an exploration, and why it ended if that is known."""
-    reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
-    if path.decision is None:
-        text = f"{path.objects_in_words()}."
-    else:
-        outcome, probability = path.decision.outcome, path.decision.probability
-        what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"
-        text = f"“{path.target_name}” {outcome}, {what}: {probability:.2f}."
-    return f"{text} {reason}".rstrip()
-
-
 def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     (x, y), number, (x1, _, x2, _) = look.fixation, look.number, look.region
@@ -99,7 +92,11 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
     brought = Counter(each["label"] for each in objects if each["look"] == number)
     closer = next((each for each in path.closer if each.number == number), None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
-    turned = None
+    turned, warm, ends = None, False, [each.seconds for each in path]
+    if number == 0 and path.how != "head" and len(ends) >= 3 and None not in ends:
+        # The first look with the warm-up took over three times as long as the others usually did.
+        first, *later = [end - start for start, end in pairwise([0.0, *map(float, ends)])]  # type: ignore[arg-type]
+        warm = first > 3 * median(later)
     if path.how == "head":
         pan, tilt, field = (look.more[name] for name in ("pan", "tilt", "field"))
         turned = f"pan {pan:z.0f}°, tilt {tilt:z.0f}°, field of view {field:.0f}°"
@@ -117,7 +114,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "size": list(view.size),
         "whole": whole,
         "turned": turned,
-        "warm": number == 0 and _warm(path),
+        "warm": warm,
         "magnification": rounded(magnification),
         "value": None if look.value is None else rounded(look.value),
         "seconds": None if look.seconds is None else rounded(look.seconds),
@@ -127,15 +124,6 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "brought": kinds or "none",
         "status": " ".join(sentences),
     }
-
-
-def _warm(path: Record) -> bool:
-    """Whether the first look took over three times as long as the others usually did; of a head it is no time here."""
-    ends = [look.seconds for look in path]
-    if path.how == "head" or len(ends) < 3 or None in ends:
-        return False
-    first, *later = [end - start for start, end in pairwise([0.0, *map(float, ends)])]  # type: ignore[arg-type]
-    return first > 3 * median(later)
 
 
 def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:

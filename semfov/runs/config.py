@@ -126,6 +126,17 @@ class SensorConfig(Settings):
         """Width of the fovea as a fraction of the image's longer side."""
         return self.kind.width(self.whole()) / self.reference
 
+    def level_edges(self, levels: int = 8, width: float = 50.0) -> list[float]:
+        """Borders between levels of distance, in units of the image's longer side: the steps of a sensor that has some.
+
+        A level is `width` pixels wide in an image whose longer side is 640, for a fovea of 100 pixels.
+        """
+        own = self.kind.borders(self.whole())
+        if own is not None:
+            # Farther away than the longer side there is hardly anything.
+            return [edge / self.reference for edge in own if edge < self.reference]
+        return [width / 100.0 * self.fovea * n for n in range(1, levels)]
+
     def record(self) -> dict[str, Any]:
         """List the name, all settings and the reference, as a model folder keeps them."""
         return {"name": self.name, **self.whole(), "reference": self.reference}

@@ -16,14 +16,13 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
-WINDOW_SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
-"""Modules that turn a large picture into glances; all modules that they import count, too."""
-
 
 class GlanceStore(DetectionStore):
     """Glances at pictures by window, on disk."""
 
     width = 12
+    sources = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
+    """Modules that turn a large picture into glances; all modules that they import count, too."""
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
         self.classes = classes
@@ -37,7 +36,7 @@ class GlanceStore(DetectionStore):
             "gist.sizes": Field(("P",), torch.float32, low=0),
             "gist.found": Field(("Q",), torch.int32, low=0),
         }
-        super().__init__(folder, {"settings": settings}, WINDOW_SOURCES, classes + 1)
+        super().__init__(folder, {"settings": settings}, self.sources, classes + 1)
 
     def encode(self, action: Window) -> Sequence[float]:
         """The fixation, the part of the picture, the level and the cells of a window."""

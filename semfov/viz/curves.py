@@ -53,9 +53,26 @@ def plot_curves(
 
     >>> figure = plot_curves({"random": np.linspace(0, 0.8, 31)}, label="targets found (%)", most=102)
     """
+    from matplotlib.ticker import MaxNLocator
+
     check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
-    draw_curves(axes, curves, errors, named=highlighted(curves))
+    named = highlighted(curves)
+    rest = [name for name in curves if name not in named]
+    for number, name in enumerate(rest):
+        others = f"{len(rest)} other{'s' if len(rest) != 1 else ''}" if number == 0 else None
+        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=_REST, linewidth=0.8, label=others, zorder=1)
+    for order, name in enumerate(named):
+        curve, style = curves[name], line_style(order, len(named))
+        shifts = np.arange(len(curve))
+        axes.plot(shifts, 100 * curve, label=name, linewidth=1.6, **style)
+        error = None if errors is None else errors.get(name)
+        if error is not None and np.isfinite(error).all():
+            low, high = 100 * (curve - error), 100 * (curve + error)
+            axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
+    axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3, linewidth=0.5)
     axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     lines, names = axes.get_legend_handles_labels()
     if len(curves) > len(COLOURS):
@@ -72,28 +89,6 @@ def highlighted(curves: _Curves) -> list[str]:
     order = sorted(curves, key=lambda name: (not name.startswith("random"), -float(np.nanmean(curves[name]))))
     chosen = order[: len(COLOURS)]
     return [name for name in curves if name in chosen]
-
-
-def draw_curves(axes: Axes, curves: _Curves, errors: _Curves | None, named: Sequence[str] | None = None) -> None:
-    """Draw curves with bands of one standard error; those that are not in `named` are grey."""
-    from matplotlib.ticker import MaxNLocator
-
-    named = list(curves) if named is None else named
-    rest = [name for name in curves if name not in named]
-    for number, name in enumerate(rest):
-        label = f"{len(rest)} other{'s' if len(rest) != 1 else ''}" if number == 0 else None
-        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=_REST, linewidth=0.8, label=label, zorder=1)
-    for order, name in enumerate(named):
-        curve, style = curves[name], line_style(order, len(named))
-        shifts = np.arange(len(curve))
-        axes.plot(shifts, 100 * curve, label=name, linewidth=1.6, **style)
-        error = None if errors is None else errors.get(name)
-        if error is not None and np.isfinite(error).all():
-            low, high = 100 * (curve - error), 100 * (curve + error)
-            axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
-    axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(alpha=0.3, linewidth=0.5)
 
 
 @styled

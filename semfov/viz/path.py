@@ -43,7 +43,13 @@ class LookPath:
                 (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
                 self._outlines.append((look.number, line))
             if self.gaze is None:
-                middles.append(_free(look.region, middles, room))
+                x1, y1, x2, y2 = look.region
+                left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
+                places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
+                # The corner farthest from other numbers, or the middle. Distances beyond the width of a number count
+                # the same, so that the first free corner is taken.
+                far = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in middles)]) for u, v in places]
+                middles.append(places[far.index(max(far))])
                 text = axes.text(*middles[-1], str(look.number), color="white", fontsize=6, ha="center", va="center",
                                  bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
                 self._numbers.append((look.number, text))
@@ -57,16 +63,6 @@ class LookPath:
             artist.set_visible(number <= last)
         for number, line in self._outlines:
             line.set_linewidth(2.0 if number == last else 0.8)
-
-
-def _free(region: LabelBox, numbers: list[tuple[float, float]], room: float) -> tuple[float, float]:
-    """Position `(x, y)` for the number of a window: the corner farthest from other numbers, or the middle."""
-    x1, y1, x2, y2 = region
-    left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
-    places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
-    # Distances beyond the width of a number count the same, so that the first free corner is taken.
-    far = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in numbers)]) for u, v in places]
-    return places[far.index(max(far))]
 
 
 class GazePath:

@@ -16,7 +16,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
 from semfov.fit.verification import _unverified, verify
 from semfov.fit.windows import _fit_closer, _mosaic_searches
-from semfov.fit.windows_evidence import example_of
+from semfov.fit.windows_evidence import ZoomExample
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
@@ -91,11 +91,11 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
     glances = StoredGlances(eye, mosaics, 0, store)
-    example = example_of(mosaics, 0, glances)
+    example = ZoomExample.of(mosaics, 0, glances)
     glances.save()
     assert sum(look.window.within is not None for look in example.looks) == 4
     eye.detector.propose = None  # any new look would fail
-    same = example_of(mosaics, 0, StoredGlances(eye, mosaics, 0, store))
+    same = ZoomExample.of(mosaics, 0, StoredGlances(eye, mosaics, 0, store))
     assert torch.equal(same.labels, example.labels)
     for one, other in zip(example.looks, same.looks, strict=True):
         assert one.window == other.window

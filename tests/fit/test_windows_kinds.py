@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from semfov.fit.windows_evidence import windows_of
+from semfov.fit.windows_evidence import ZoomExample
 from semfov.zoom.lattice import Lattice
 from tests.small import RedBoxes
 from train.zoom_pictures import PICTURE_KINDS, _compose_pictures
@@ -30,7 +30,7 @@ def test_pictures_of_a_kind_have_its_size_and_objects_and_depend_on_the_seed(kin
 def test_windows_hold_one_for_each_photograph_of_a_mosaic(kind, photographs):
     pictures = _compose_pictures(kind, SCENES, 1, 0, tile=48)
     lattice = Lattice.over(SIZES[kind], (32, 32))
-    assert sum(window.within is not None for window in windows_of(pictures, 0, lattice)) == photographs
+    assert sum(window.within is not None for window in ZoomExample.windows(pictures, 0, lattice)) == photographs
 
 
 def test_objects_of_the_smallest_kinds_have_four_pixels_in_an_overview():

@@ -23,10 +23,10 @@ from semfov.fit.gaze_folds import CENTRE, FoldStore, _folds
 from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, summaries
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
+    Events,
     MapSource,
     ViewingData,
     _grouped,
-    events_of,
     features_of,
     log_centre,
     look,
@@ -113,7 +113,7 @@ def test_scores_equal_the_measures_of_scanpaths(group):
     scored = score(model, group, maps, [2], conditional=False, raster=(52, 39))[0][0]
     log = (maps[0, 0] + model.centre_bias(SIZE)).double()
     log = log - log.logsumexp((0, 1))
-    cell = events_of(group.paths[2], SIZE, cells_of(SIZE)).cell.numpy()
+    cell = Events.of(group.paths[2], SIZE, cells_of(SIZE)).cell.numpy()
     x, y = cell % 52, cell // 52
     expected = [nss(log.exp(), x, y).mean(), auc(log, x, y).mean(), log_likelihood(log, x, y).mean()]
     np.testing.assert_allclose(scored.numpy(), expected, rtol=1e-4)
@@ -125,7 +125,7 @@ def test_views_that_are_all_sharp_show_what_the_sharp_picture_shows(group):
     views = group.some([2, 2, 2])
     seen = partial(so_far, model, views, torch.tensor([[5.0, 5.0], [70.0, 5.0], [40.0, 50.0]]), SIZE)
     sharp = maps_of(model, group, [2])[0]
-    torch.testing.assert_close(seen(events_of(group.paths[2], SIZE, (3, 4)))[5:6], sharp)
+    torch.testing.assert_close(seen(Events.of(group.paths[2], SIZE, (3, 4)))[5:6], sharp)
     one, other = (score(model, group, [each], [2], conditional=True)[0] for each in (sharp, seen))
     torch.testing.assert_close(one, other)
     views.maps["backbone8"].zero_()

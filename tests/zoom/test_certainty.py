@@ -13,7 +13,13 @@ from semfov import Detections, EmbeddedScenes, Objects, WindowEye, ZoomAgent
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.objects import unlike
-from semfov.fit.windows_certainty import _explorations, _fit_unseen, _Numbers, fit_certainty, fit_spread
+from semfov.fit.windows_certainty import (
+    _fit_unseen,
+    _Numbers,
+    explorations_of_kinds,
+    fit_spread,
+    logistic_regression,
+)
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
@@ -191,7 +197,7 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()
     glances = StoredGlances(eye, mosaics, 0, None)
-    _, sought = _explorations(evidence, mosaics, [glances], passes=4, title="")
+    _, sought = explorations_of_kinds(evidence, {"mosaics": (mosaics, [glances])}, 4)["mosaics"]
     looked = [turn.glance for turn in islice(find_everything(glances, evidence, sought.target), 8)]
     right = right_boxes(merge_with_facts(looked, glances.lattice, sought.target)[0], mosaics.annotation(0))
     assert sought.held == int((mosaics.annotation(0).labels == sought.target).sum())
@@ -207,16 +213,14 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
     generator = torch.Generator().manual_seed(0)
     facts = torch.randn(500, len(FACTS), generator=generator)
     right = torch.rand(500, generator=generator) < facts[:, 0].sigmoid()
-    fitted = fit_certainty(facts, right)
-    parameters = torch.tensor([fitted.offset, *fitted.weights], dtype=torch.float64, requires_grad=True)
+    parameters = torch.tensor(logistic_regression(facts, right), dtype=torch.float64, requires_grad=True)
     inputs = torch.cat([torch.ones(500, 1), facts], -1).double()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(inputs @ parameters, right.double(), reduction="sum")
     empty = parameters[0].sigmoid()
     loss = loss + 0.5 * parameters[1:].square().sum() - 0.5 * (empty * (1 - empty)).log()
     (gradient,) = torch.autograd.grad(loss, parameters)
     assert gradient.abs().max() < 1e-3
-    everywhere = fit_certainty(facts, torch.ones(500, dtype=torch.bool))
-    assert math.isfinite(everywhere.offset)
+    assert all(map(math.isfinite, logistic_regression(facts, torch.ones(500, dtype=torch.bool))))
 
 
 def test_what_no_look_has_shown_is_negative_binomial():
