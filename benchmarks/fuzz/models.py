@@ -15,7 +15,7 @@ from torch import Tensor
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov import DirichletStatistics, FovealObservationModel
 from semfov.belief import TargetEvidence
-from semfov.detection.darknet import Darknet, read_weights
+from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.errors import DataError
 from semfov.io import storage
@@ -84,7 +84,7 @@ def darknet_files(draw: Draw, folder: Path) -> Case:
 
     def load() -> Darknet:
         network = Darknet(read_cfg(cfg))
-        read_weights(network, weights)
+        network.read_weights(weights)
         return network.eval()
 
     def check(network: Darknet) -> None:

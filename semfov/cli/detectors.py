@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from os import fspath
 
 from semfov.belief.map_evidence import MapEvidence
@@ -26,6 +25,8 @@ _PURPOSES: dict[str, type[Pretrained]] = {
 }
 """Models that are shipped for some detectors, by what they are for."""
 
+_WIDTH = 100  # characters of a line of names
+
 
 def show(options: DetectorsOptions) -> int:
     """List the detectors, or the classes of one."""
@@ -34,7 +35,11 @@ def show(options: DetectorsOptions) -> int:
         folder = options.name.is_dir()
         classes = Manifest.read(options.name).classes if folder else check_detector(name)
         classes = load_detector(name).classes if classes is None else classes
-        print(f"{name} knows {len(classes)} classes:\n{_columns(classes)}")
+        print(f"{name} knows {len(classes)} classes:")
+        wide = max(map(len, classes)) + 2
+        down = -(-len(classes) // max(1, _WIDTH // wide))
+        for row in range(down):  # in order down each column
+            print("".join(each.ljust(wide) for each in classes[row::down]).rstrip())
         return 0
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
@@ -47,15 +52,3 @@ def show(options: DetectorsOptions) -> int:
     print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")
     print("A detector without shipped models runs with --agent raw, or after semfov fit.")
     return 0
-
-
-def _columns(names: Sequence[str], width: int = 100) -> str:
-    r"""Names in columns, in order down each column.
-
-    >>> _columns(["cup", "fork", "oven"], 12)
-    'cup   oven\nfork'
-    """
-    wide = max(map(len, names)) + 2
-    across = max(1, width // wide)
-    down = -(-len(names) // across)
-    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))

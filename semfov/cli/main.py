@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
@@ -15,7 +16,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, TextIO
 
-from semfov.cli import help as texts
+from semfov.cli.help import HELP, OVERVIEW
 from semfov.version import __version__
 from semfov.words import OTHER_WORDS
 
@@ -77,14 +78,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     options, positional, program = _options_of(name), _SUBCOMMANDS[name][0], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
-        usage = texts.HELP[name].partition("\nusage:")[0]
+        usage = HELP[name].partition("\nusage:")[0]
         make_parser(options, usage, positional, program).print_help()
         return 0
     dotted = ["detector.classes"] if name == "fit" else []
-    words = partial(texts.in_command_words, options=[*dotted, *(field.name for field in fields(options))])
+    words = partial(_in_command_words, options=[*dotted, *(field.name for field in fields(options))])
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with _plain_warnings(words):
-        return run_command(partial(_run, name), options, texts.HELP[name], rest, words=words, **names)
+        return run_command(partial(_run, name), options, HELP[name], rest, words=words, **names)
 
 
 def _text(name: str, rest: Sequence[str]) -> str | None:
@@ -92,12 +93,53 @@ def _text(name: str, rest: Sequence[str]) -> str | None:
     if name in ("--version", "-V", "version"):
         return f"semfov {__version__}\n"
     if name in ("--help", "-h", "--help-all"):
-        return texts.OVERVIEW
+        return OVERVIEW
     if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
-        return texts.HELP[name]
+        return HELP[name]
     if name == "completion":
-        return texts.completion(rest[0] if rest else None, {each: _option_names(each) for each in _SUBCOMMANDS})
+        return _completion(rest[0] if rest else None, {each: _option_names(each) for each in _SUBCOMMANDS})
     return None
+
+
+_SHELLS = {
+    "bash": """\
+_semfov() {{
+  local words=""
+  case "${{COMP_WORDS[1]}}" in
+{cases}
+  esac
+  if [ "$COMP_CWORD" -eq 1 ]; then words="{commands}"; fi
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o bashdefault -o default -F _semfov semfov
+""",
+    "fish": """\
+complete -c semfov -n __fish_use_subcommand -a "{commands}"
+{lines}
+""",
+}
+"""Scripts of shells that complete commands and options; that of zsh is that of bash."""
+
+
+def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
+    """The script with which a shell completes the command, from the options of each subcommand.
+
+    >>> print(_completion("fish", {"find": ["give_up"]}), end="")
+    complete -c semfov -n __fish_use_subcommand -a "find"
+    complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up
+    """
+    script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
+    if script is None:
+        return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
+    named = {name: [each.replace("_", "-") for each in several] for name, several in options.items()}
+    cases = "\n".join(f'    {name}) words="{" ".join(f"--{each}" for each in some)}";;' for name, some in named.items())
+    lines = "\n".join(
+        f'complete -c semfov -n "__fish_seen_subcommand_from {name}" -l {each}'
+        for name, some in named.items()
+        for each in some
+    )
+    start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
+    return start + script.format(cases=cases, commands=" ".join(named), lines=lines)
 
 
 def _unknown(name: str) -> str:
@@ -136,6 +178,45 @@ def _of_others(own: str, rest: Sequence[str]) -> str | None:
         if having:
             return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
+
+
+_RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"
+
+_COMMANDS = {
+    "agent.classes lists": "`semfov detectors NAME` lists",
+    "ActivePerception.from_pretrained('mymodels')": "--models mymodels",
+    "ActivePerception.recommended": "--agent recommended",
+    "ActivePerception.raw": "--agent raw",
+    " or semfov.fit_detector": "",
+    "find_all": "`semfov find`",
+    "name them by columns={…}": _RENAME,
+    "use read_table with columns={…}": f"name its columns picture, subject, x, y, width and height: {_RENAME}",
+}
+"""What the command calls that messages name as Python does."""
+
+
+def _in_command_words(message: str, options: Iterable[str]) -> str:
+    """Say a message of the library in the words of the command: arguments become options.
+
+    >>> _in_command_words("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"])
+    'use --how windows or --give-up 0.1, or `semfov find`'
+    >>> _in_command_words("give its path as weights=", ["weights"])
+    'give its path as --weights'
+    >>> _in_command_words("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"])
+    '--recursive, or --detector.classes cat,dog'
+    >>> _in_command_words("name them by columns={…} or give size=", ["size"])
+    'give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too) or give --size'
+    """
+    for python, command in _COMMANDS.items():
+        message = message.replace(python, command)
+    by_name = {name.rpartition(".")[2]: name for name in options}
+    names = "|".join(map(re.escape, by_name))
+
+    def option(match: re.Match[str]) -> str:
+        value = (match[2] or "").strip("'\"").removeprefix("True")
+        return f"--{by_name[match[1]].replace('_', '-')}{' ' if value else ''}{value}"
+
+    return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)
 
 
 @contextmanager

@@ -145,6 +145,50 @@ class PictureOutcome:
     figures: Mapping[str, bytes] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
 
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        opened: PictureLike,
+        source: PictureSource,
+        options: PictureOptions,
+        seconds: float,
+        settings: Mapping[str, Any],
+        truth: Truth | None,
+    ) -> PictureOutcome:
+        """Make the text, the row, the part of a page and the figures of a record, as the options say."""
+        usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
+        drawings = usual if options.draw is None else options.draw
+        text = _outcome_text(record, source.name, seconds)
+        boxes = None if source.scene is None else source.scene.boxes
+        episode = None
+        kind = None if options.out is None else kind_of(options.out)
+        row = _result_row(record, source.name, seconds, kind, source.file, truth)
+        if options.report is not None:
+            name = Path(source.name).name
+            # Others have no more pixels than the record keeps.
+            shown = opened if record.how == "windows" else None
+            episode = record.page_data(shown, name=name, settings=settings, boxes=boxes)
+        figures = _draw_episode(record, boxes, drawings)
+        files = {}
+        if options.labels is not None:
+            files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
+        if options.crops is not None:
+            picture: Any = source.opened("auto")
+            crops = record.crops(picture)
+            for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
+                folder = options.crops / plain_name(record.classes[label]) / source.place.parent
+                files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
+        return cls(
+            ended="looked at" if record.decision is None else record.decision.outcome,
+            text=f"{text}\n{_looks_text(record)}" if options.looks else text,
+            row=row,
+            episode=episode,
+            names=tuple(figures),
+            figures=figures,
+            files=files,
+        )
+
 
 def _result_row(
     record: Record, name: str, seconds: float, kind: str | None, file: Path | None = None, truth: Truth | None = None
@@ -177,49 +221,6 @@ def _result_row(
             for each in record.to_coco(0, row["categories"])
         ]
     return row
-
-
-def picture_outcome(
-    record: Record,
-    opened: PictureLike,
-    source: PictureSource,
-    options: PictureOptions,
-    seconds: float,
-    settings: Mapping[str, Any],
-    truth: Truth | None,
-) -> PictureOutcome:
-    """Make the text, the row, the part of a page and the figures of a record, as the options say."""
-    usual = ALL_DRAWINGS if options.out is not None and kind_of(options.out) is None else ()
-    drawings = usual if options.draw is None else options.draw
-    text = _outcome_text(record, source.name, seconds)
-    boxes = None if source.scene is None else source.scene.boxes
-    episode = None
-    kind = None if options.out is None else kind_of(options.out)
-    row = _result_row(record, source.name, seconds, kind, source.file, truth)
-    if options.report is not None:
-        name = Path(source.name).name
-        # Others have no more pixels than the record keeps.
-        shown = opened if record.how == "windows" else None
-        episode = record.page_data(shown, name=name, settings=settings, boxes=boxes)
-    figures = _draw_episode(record, boxes, drawings)
-    files = {}
-    if options.labels is not None:
-        files[str(options.labels / source.place.with_suffix(".txt"))] = record.to_yolo().encode()
-    if options.crops is not None:
-        picture: Any = source.opened("auto")
-        crops = record.crops(picture)
-        for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
-            folder = options.crops / plain_name(record.classes[label]) / source.place.parent
-            files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
-    return PictureOutcome(
-        ended="looked at" if record.decision is None else record.decision.outcome,
-        text=f"{text}\n{_looks_text(record)}" if options.looks else text,
-        row=row,
-        episode=episode,
-        names=tuple(figures),
-        figures=figures,
-        files=files,
-    )
 
 
 def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

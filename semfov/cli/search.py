@@ -33,7 +33,7 @@ from semfov.cli.options import (
     SearchOptions,
     start_of,
 )
-from semfov.cli.outcome import PictureOutcome, picture_outcome
+from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.truth import Truth
@@ -120,7 +120,7 @@ class _PictureJob(ABC):
                 record = self.look(picture, self._shared(picture, source), source)
                 seconds = time.perf_counter() - began
                 settings = self.agent.eye.settings()
-                return picture_outcome(record, picture, source, self.options, seconds, settings, self.truth)
+                return PictureOutcome.of(record, picture, source, self.options, seconds, settings, self.truth)
         except SemfovError as error:
             return error
         except Exception as error:
@@ -311,16 +311,6 @@ def _outcomes(
     )
 
 
-def _start_beside(agent: ActivePerception, source: PictureSource, seed: int) -> int | None:
-    """A random first cell off the target of an embedded scene; None for other pictures."""
-    if source.scene is None or source.scene.boxes is None:
-        return None
-    grid = Grid(agent.columns, agent.rows, (source.scene.image.shape[-1], source.scene.image.shape[-2]))
-    free = (~grid.footprint(source.scene.boxes).any(0)).nonzero()[:, 0]
-    generator = torch.Generator().manual_seed(seed)
-    return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
-
-
 class _SearchJob(_PictureJob):
     """Searches pictures for a class."""
 
@@ -347,8 +337,14 @@ class _SearchJob(_PictureJob):
             print(f"large pictures and scenes are searched only for the most likely class: {next(iter(weights))}",
                   file=sys.stderr)  # fmt: skip
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
-        beside = self.start is None and kind == "fovea"
-        start = _start_beside(agent, source, options.seed) if beside else self.start
+        start = self.start
+        if start is None and kind == "fovea" and source.scene is not None and source.scene.boxes is not None:
+            # A random first cell off the target of an embedded scene.
+            height, width = source.scene.image.shape[-2:]
+            grid = Grid(agent.columns, agent.rows, (width, height))
+            free = (~grid.footprint(source.scene.boxes).any(0)).nonzero()[:, 0]
+            generator = torch.Generator().manual_seed(options.seed)
+            start = int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
         return agent.search(picture, aim, start=start, **settings, **shared)
 
 

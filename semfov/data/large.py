@@ -320,23 +320,6 @@ class _ArrayPicture(LargePicture):
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
 
 
-class _MemoryPicture(_ArrayPicture):
-    """A picture of any common type (`semfov.as_image`), kept in memory as bytes."""
-
-    def __init__(self, image: ImageLike, *, color: Color = "rgb", white: White | None = None) -> None:
-        if (
-            white is None
-            and isinstance(image, Tensor | np.ndarray)
-            and image.dtype in (torch.uint8, np.dtype(np.uint8))
-        ):
-            # Bytes are not converted to floats in between, which would take four times the memory.
-            pixels = as_pixels(image, argument="picture", color=color)
-            check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
-            super().__init__(to_bytes(pixels[0]))
-        else:
-            super().__init__(to_bytes(as_image(image, argument="picture", color=color, white=white).detach()))
-
-
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
@@ -367,7 +350,16 @@ def open_large(
         swap = lookup(color, get_args(Color), "order of channels") == "bgr" and source.ndim == 3
         return _ArrayPicture(source[..., ::-1] if swap else source)
     if not isinstance(source, str | PathLike):
-        return _MemoryPicture(source, color=color, white=white)
+        if (
+            white is None
+            and isinstance(source, Tensor | np.ndarray)
+            and source.dtype in (torch.uint8, np.dtype(np.uint8))
+        ):
+            # Bytes are not converted to floats in between, which would take four times the memory.
+            pixels = as_pixels(source, argument="picture", color=color)
+            check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
+            return _ArrayPicture(to_bytes(pixels[0]))
+        return _ArrayPicture(to_bytes(as_image(source, argument="picture", color=color, white=white).detach()))
     check_local(source, "picture")
     if kind in BY_WINDOWS:
         picture = (_raster if kind in RASTERS else _tiff)(source, white, bands)

@@ -288,6 +288,10 @@ def _activation(section: Section, default: str) -> str:
     return name
 
 
+_EPSILON = 1e-5
+"""Constant ε that batch norm adds to the variance."""
+
+
 class Darknet(nn.Module):
     """A network from the sections of a cfg, with random weights: `(B, C, H, W)` → `(B, A (5 + K), H', W')` a head."""
 
@@ -368,49 +372,45 @@ class Darknet(nn.Module):
             outputs = {source: output for source, output in outputs.items() if self._last_reader[source] > index}
         return outputs
 
+    @torch.no_grad()
+    def read_weights(self, path: str | PathLike[str]) -> str:
+        """Load the parameters in a weights file, with batch norm folded in.
 
-_EPSILON = 1e-5
-"""Constant ε that batch norm adds to the variance."""
+        The header of the file holds major version, minor version and revision as int32, then the number of images seen
+        in training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with
+        batch norm also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in
+        float64:
 
-
-@torch.no_grad()
-def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
-    """Load the parameters in a weights file into a network, with batch norm folded in.
-
-    The header of the file holds major version, minor version and revision as int32, then the number of images seen in
-    training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with batch norm
-    also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in float64:
-
-        weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
-    """
-    layers = [layer for layer in network.layers if isinstance(layer, Convolution)]
-    check_regular(path, f"weights {str(path)!r}")
-    try:
-        length = Path(path).stat().st_size
-        longest = 20 + 4 * sum(_count(layer) for layer in layers)
-        # A longer file is refused below, so it is not read to its end.
-        with Path(path).open("rb") as file:
-            data = bytearray(file.read(longest + 1))
-    except OSError as error:
-        raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
-    start = 20
-    if len(data) >= 12:
-        major, minor, _ = struct.unpack_from("<3i", data)
-        start = 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
-    needed = start + 4 * sum(_count(layer) for layer in layers)
-    if length != needed or len(data) != needed:
-        fault = "truncated" if length < needed else "too long"
-        sizes = f"expected {needed} bytes for this network, got {length}"
-        raise DataError(f"weights {str(path)!r}: {sizes}; the file is {fault}, or belongs to another network")
-    numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
-    if not bool(torch.isfinite(numbers).all()):
-        raise DataError(
-            f"weights {str(path)!r}: expected finite numbers, got NaN or infinite ones; the file is damaged or not a "
-            f"weights file"
-        )
-    for layer in layers:
-        numbers = _fill(layer, numbers, str(path))
-    return hashlib.sha256(data).hexdigest()
+            weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
+        """
+        layers = [layer for layer in self.layers if isinstance(layer, Convolution)]
+        check_regular(path, f"weights {str(path)!r}")
+        try:
+            length = Path(path).stat().st_size
+            longest = 20 + 4 * sum(_count(layer) for layer in layers)
+            # A longer file is refused below, so it is not read to its end.
+            with Path(path).open("rb") as file:
+                data = bytearray(file.read(longest + 1))
+        except OSError as error:
+            raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
+        start = 20
+        if len(data) >= 12:
+            major, minor, _ = struct.unpack_from("<3i", data)
+            start = 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
+        needed = start + 4 * sum(_count(layer) for layer in layers)
+        if length != needed or len(data) != needed:
+            fault = "truncated" if length < needed else "too long"
+            sizes = f"expected {needed} bytes for this network, got {length}"
+            raise DataError(f"weights {str(path)!r}: {sizes}; the file is {fault}, or belongs to another network")
+        numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
+        if not bool(torch.isfinite(numbers).all()):
+            raise DataError(
+                f"weights {str(path)!r}: expected finite numbers, got NaN or infinite ones; the file is damaged or not "
+                f"a weights file"
+            )
+        for layer in layers:
+            numbers = _fill(layer, numbers, str(path))
+        return hashlib.sha256(data).hexdigest()
 
 
 def _count(layer: Convolution) -> int:

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.darknet import Darknet, read_weights
+from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
 from semfov.detection.detector import Detector
 from semfov.detection.scores import BackgroundPolicy
@@ -218,7 +218,7 @@ def load_yolo(
         name = lookup(name_or_cfg, ARCHITECTURES, "detector")
         sections = ARCHITECTURES[name]()
     network = Darknet(sections).to(dtype).requires_grad_(False)
-    digest = read_weights(network, fetch(name) if weights is None else weights)
+    digest = network.read_weights(fetch(name) if weights is None else weights)
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,

@@ -15,7 +15,7 @@ from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_clas
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
 from semfov.detection.onnx_file import check_canvas, read_settings, with_input_size
-from semfov.detection.onnx_heads import HEADS, Signature, misplaced, recognise
+from semfov.detection.onnx_heads import HEADS, Signature, misplaced
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
@@ -213,7 +213,11 @@ def load_onnx(
 ) -> OnnxDetector:
     """Load a detector from an ONNX file, or a published one by its name."""
     name = fspath(name_or_path)
-    file = _locate(name, weights)
+    file = Path(name if weights is None else weights)
+    if name in _ONNX_MODELS:
+        file = fetch(name) if weights is None else file
+    elif weights is not None or not name.endswith(".onnx"):
+        lookup(name, _ONNX_MODELS, "ONNX model")
     published_name = name if name in _ONNX_MODELS else NETWORKS.get(sha256(file) if file.is_file() else "")
     path = file
     if published_name in _ONNX_MODELS and input_size is not None:
@@ -240,7 +244,7 @@ def load_onnx(
         count = coco if names is None else len(names)
         grey = torch.full((1, 3, size[1], size[0]), 0.5)
         signature = Signature(session.image, shapes, size, session.producer, count, session.metadata)
-        chosen["head"] = recognise(signature, lambda: session(grey))
+        chosen["head"] = signature.head(lambda: session(grey))
     head_kind = HEADS[lookup(chosen["head"], HEADS, "head")]
     if not isinstance(preprocessing, Preprocessing):
         default = head_kind.preprocessing.merged(stored["preprocessing"])
@@ -310,12 +314,3 @@ def _coco_names(count: int, file: Path) -> Sequence[str]:
 
         return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
     raise UnnamedClasses(count, file)
-
-
-def _locate(name: str, weights: str | PathLike[str] | None) -> Path:
-    """The file of a model that is given by name or path."""
-    if name in _ONNX_MODELS:
-        return Path(fetch(name) if weights is None else weights)
-    if weights is not None or not name.endswith(".onnx"):
-        lookup(name, _ONNX_MODELS, "ONNX model")
-    return Path(name)

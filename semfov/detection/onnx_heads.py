@@ -199,25 +199,24 @@ class Signature:
     classes: int | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
-
-def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -> str:
-    """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes."""
-    task = signature.metadata.get("task", "detect")
-    check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
-    names = list(_fitting(signature))
-    if len(names) > 1 and run is not None:
-        outputs = run()
-        names = [name for name in names if _fits(name, outputs, signature)] or names
-    if len(names) == 1 or names == ["yolox", "yolox-decoded"]:  # YOLOX's own names, and values that do not tell
-        return names[0]
-    shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
-    width, height = signature.canvas
-    count = "" if signature.classes is None else f" with {signature.classes} classes"
-    fits = f"{' and '.join(names)} fit" if names else "no head fits with certainty"
-    raise InputError(
-        f"outputs {shapes} on a {width} x {height} canvas{count}: {fits}; "
-        f"name the head with head=, one of {', '.join(sorted(HEADS))}"
-    )
+    def head(self, run: Callable[[], _Outputs] | None = None) -> str:
+        """Recognise the head of a model by its metadata, by names and shapes, and by where `run` places boxes."""
+        task = self.metadata.get("task", "detect")
+        check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
+        names = list(_fitting(self))
+        if len(names) > 1 and run is not None:
+            outputs = run()
+            names = [name for name in names if _fits(name, outputs, self)] or names
+        if len(names) == 1 or names == ["yolox", "yolox-decoded"]:  # YOLOX's own names, and values that do not tell
+            return names[0]
+        shapes = ", ".join(f"{name} {shape}" for name, shape in self.outputs)
+        width, height = self.canvas
+        count = "" if self.classes is None else f" with {self.classes} classes"
+        fits = f"{' and '.join(names)} fit" if names else "no head fits with certainty"
+        raise InputError(
+            f"outputs {shapes} on a {width} x {height} canvas{count}: {fits}; "
+            f"name the head with head=, one of {', '.join(sorted(HEADS))}"
+        )
 
 
 def _fits(name: str, outputs: _Outputs, signature: Signature) -> bool:

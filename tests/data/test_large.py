@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from semfov import InputError, read_image
-from semfov.data.large import _ArrayPicture, _MemoryPicture, _RasterPicture, _TiffPicture, open_large
+from semfov.data.large import _ArrayPicture, _RasterPicture, _TiffPicture, open_large
 from semfov.data.windowed import LargePicture
 from tests.refusals import refused, unusable
 
@@ -122,7 +122,7 @@ def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
     refused("picture: expected bytes, 16-bit numbers or floats", open_large, np.zeros((4, 4, 3), np.int64))
     with pytest.raises(InputError, match="unknown order of channels 'bgra'; did you mean 'bgr'"):
         open_large(np.zeros((4, 4, 3), np.uint8), color="bgra")
-    refused("box: expected a window inside 4 × 4 pixels", _MemoryPicture(torch.zeros(3, 4, 4)).read, (0, 0, 5, 4))
+    refused("box: expected a window inside 4 × 4 pixels", open_large(torch.zeros(3, 4, 4)).read, (0, 0, 5, 4))
 
 
 @pytest.mark.parametrize("side", [2, 5000])

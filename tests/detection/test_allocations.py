@@ -10,7 +10,7 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from semfov.detection.darknet import Darknet, read_weights
+from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _parse_cfg, read_cfg
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
@@ -59,11 +59,11 @@ def test_pipes_and_too_long_files_are_refused(tmp_path):
     unusable("at most", read_cfg, path)
     os.mkfifo(tmp_path / "pipe")
     network = Darknet(_parse_cfg(NET + HEAD))
-    for read in (read_cfg, lambda path: read_weights(network, path), OnnxSession):
+    for read in (read_cfg, network.read_weights, OnnxSession):
         unusable("expected a file, got a pipe", read, tmp_path / "pipe")
     with (tmp_path / "sparse.weights").open("wb") as file:
         file.truncate(2**40)
-    unusable("too long", read_weights, network, tmp_path / "sparse.weights")
+    unusable("too long", network.read_weights, tmp_path / "sparse.weights")
 
 
 def save(path, nodes, outputs, *, inputs=None, initialisers=(), metadata=None):

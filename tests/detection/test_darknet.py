@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, read_weights
+from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool
 from semfov.detection.darknet_config import ARCHITECTURES, Section, _parse_cfg, _yolov3_tiny, read_cfg
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import DataError
@@ -80,7 +80,7 @@ class PlainDarknet:
 def test_small_network_equals_the_plain_implementation(small_cfg, write_weights, version, dtype):
     weights = write_weights(version)
     network = Darknet(read_cfg(small_cfg)).to(dtype)
-    assert read_weights(network, weights) == hashlib.sha256(weights.read_bytes()).hexdigest()
+    assert network.read_weights(weights) == hashlib.sha256(weights.read_bytes()).hexdigest()
     image = torch.rand(3, 3, 32, 64, dtype=torch.float64)
     expected = PlainDarknet(small_cfg.read_text(), weights, 20 if version == (0, 2) else 16)(image)
     actual = network(image.to(dtype))
@@ -96,7 +96,7 @@ def test_published_yolov3_tiny_equals_the_plain_implementation(tiny_weights):
     sections = _yolov3_tiny()
     lines = [f"[{s.kind}]\n" + "".join(f"{key}={value}\n" for key, value in s.options.items()) for s in sections]
     network = Darknet(sections).eval().requires_grad_(False)
-    read_weights(network, tiny_weights)
+    network.read_weights(tiny_weights)
     image = torch.rand(1, 3, 96, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = PlainDarknet("".join(lines), tiny_weights)(image)
     for a, e in zip(network(image.float()), expected, strict=True):
@@ -105,7 +105,7 @@ def test_published_yolov3_tiny_equals_the_plain_implementation(tiny_weights):
 
 def test_gradient_reaches_the_image_and_the_network_compiles_to_a_single_graph(small_cfg, write_weights):
     network = Darknet(read_cfg(small_cfg)).double()
-    read_weights(network, write_weights())
+    network.read_weights(write_weights())
     image = torch.rand(1, 3, 8, 8, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: tuple(network(x)), (image,), fast_mode=True)
     assert torch.autograd.grad(sum(m.sum() for m in network(image)), network.layers[0].weight)[0].any()
@@ -277,7 +277,7 @@ def test_refuses_damaged_weights_with_an_error_of_one_line(small_cfg, write_weig
     path = write_weights()
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(DataError) as caught:
-        read_weights(Darknet(read_cfg(small_cfg)), path)
+        Darknet(read_cfg(small_cfg)).read_weights(path)
     assert message in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -293,4 +293,4 @@ def test_refuses_what_cannot_be_read_or_has_an_unsuitable_size(small_cfg, tmp_pa
     binary.write_bytes(b"\x9f\xfe\x07\x9f")
     unusable("a file that is not text", read_cfg, binary)
     with pytest.raises(DataError, match=r"cannot read the weights .*missing"):
-        read_weights(Darknet(read_cfg(small_cfg)), tmp_path / "missing.weights")
+        Darknet(read_cfg(small_cfg)).read_weights(tmp_path / "missing.weights")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import onnx_heads as heads
-from semfov.detection.onnx_heads import HEADS, Signature, recognise
+from semfov.detection.onnx_heads import HEADS, Signature
 from semfov.errors import InputError
 from tests.refusals import refused
 
@@ -149,7 +149,7 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
     ],
 )
 def test_unambiguous_signatures_are_recognised(expected, given):
-    assert recognise(given) == expected
+    assert given.head() == expected
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_unambiguous_signatures_are_recognised(expected, given):
 )
 def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
     with pytest.raises(InputError, match=fits) as error:
-        recognise(given)
+        given.head()
     assert all(head in str(error.value) for head in HEADS)
 
 
@@ -178,22 +178,22 @@ def test_models_without_score_vectors_or_of_other_tasks_are_refused():
         signature((1, 300, 7)),
         signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
     ]:
-        refused("export", recognise, outputs)
+        refused("export", outputs.head)
     for task in ["segment", "pose", "obb", "classify"]:
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
-            recognise(signature((1, 116, 8400), classes=80, task=task))
+            signature((1, 116, 8400), classes=80, task=task).head()
 
 
 def test_places_of_a_pass_tell_heads_of_one_shape_apart():
     """Boxes that the other head would put outside the canvas, or into one pixel of it."""
     raw, pixels = noise(1, 84, 8), torch.cat([64 * noise(1, 84, 4).sigmoid(), noise(1, 84, 4).sigmoid()], -1)
     both = signature(("output", (1, 84, 8)), canvas=(64, 64), classes=3)
-    assert recognise(both, lambda: {"output": raw}) == "yolox"
-    assert recognise(both, lambda: {"output": pixels}) == "yolox-decoded"
+    assert both.head(lambda: {"output": raw}) == "yolox"
+    assert both.head(lambda: {"output": pixels}) == "yolox-decoded"
     rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 1.0], [3.0, 2.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
     two = signature((1, 3, 6), canvas=(64, 64), classes=2)
-    assert recognise(two, lambda: {"output0": rows}) == "end2end"
-    assert recognise(two, lambda: {"output0": noise(1, 3, 6).sigmoid()}) == "rtdetr"
+    assert two.head(lambda: {"output0": rows}) == "end2end"
+    assert two.head(lambda: {"output0": noise(1, 3, 6).sigmoid()}) == "rtdetr"
 
 
 def test_end_to_end_rows_are_one_hot_vectors():
