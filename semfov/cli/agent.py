@@ -11,7 +11,7 @@ import torch
 from semfov.agent import ActivePerception
 from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.data.classes import class_index
-from semfov.detection.load import check_detector, class_lines, detector_name
+from semfov.detection.load import check_detector, class_lines
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
@@ -29,7 +29,7 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     named = f"none for {options.detector}, which has its own; --target names the class to look for"
     check(given is None or classes is None, "classes", named, given and ", ".join(given))
     classes = classes or given
-    own = WEIGHTS.get(detector_name(options.detector))
+    own = WEIGHTS.get(options.detector.lower())
     mixed = weights is not None and weights.suffix == ".onnx" and own is not None and not own.file.endswith(".onnx")
     expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
     check(not mixed, "weights", expected, weights)

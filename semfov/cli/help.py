@@ -1,6 +1,6 @@
 """Texts of the command: its help, one screen for each subcommand."""
 
-OVERVIEW = """\
+_OVERVIEW = """\
 semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
 
   semfov search kitchen.jpg --target cup            is there a cup, and where?
@@ -50,6 +50,7 @@ A picture of several that cannot be read is reported and skipped; the exit code 
 stopped, the same command continues with the pictures that are left. --help-all: all options."""
 
 HELP = {
+    "semfov": _OVERVIEW,
     "search": f"""\
 semfov search: is it there, and where?
 
@@ -234,4 +235,4 @@ Weights are downloaded when a detector is first used, into $SEMFOV_CACHE or the 
 shipped models runs with --agent raw, or after semfov fit.
 """,
 }
-"""The help of each subcommand: one screen."""
+"""The help of the command, and that of each subcommand: one screen."""

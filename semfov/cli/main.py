@@ -16,7 +16,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, TextIO
 
-from semfov.cli.help import HELP, OVERVIEW
+from semfov.cli.help import HELP
 from semfov.version import __version__
 from semfov.words import OTHER_WORDS
 
@@ -93,7 +93,7 @@ def _text(name: str, rest: Sequence[str]) -> str | None:
     if name in ("--version", "-V", "version"):
         return f"semfov {__version__}\n"
     if name in ("--help", "-h", "--help-all"):
-        return OVERVIEW
+        return HELP["semfov"]
     if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
         return HELP[name]
     if name == "completion":

@@ -36,7 +36,13 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     annotations `id`, `image_id`, `category_id` and `bbox` = `[x, y, width, height]`; these may have `iscrowd`.
     """
     name = f"annotations {Path(path)}"
-    raw = _read(path, name)
+    check_regular(path, name)
+    try:
+        raw = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise DataError(f"{name}: no such file; check data.annotations") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{name}: cannot be read ({error})") from None
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as error:
@@ -58,16 +64,6 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
 
 class _Fault(Exception):
     """An error in an entry; the message describes it."""
-
-
-def _read(path: str | PathLike[str], name: str) -> bytes:
-    check_regular(path, name)
-    try:
-        return Path(path).read_bytes()
-    except FileNotFoundError:
-        raise DataError(f"{name}: no such file; check data.annotations") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{name}: cannot be read ({error})") from None
 
 
 def _check(data: dict[str, Any]) -> None:

@@ -52,8 +52,9 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
     - A path that ends in `.onnx`: your own ONNX model; options of `semfov.detection.onnx.load_onnx`.
     - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`, `"nanodet-plus-m-1.5x"`: published ONNX models; options of
       `semfov.detection.onnx.load_onnx`. The last one needs `weights=`, a file that you have.
-    - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.load_torchvision`.
-    - `"hf:<owner>/<name>"`: models of Hugging Face's hub; options of `semfov.detection.transformers.load_hub`.
+    - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.TorchvisionDetector.load`.
+    - `"hf:<owner>/<name>"`: models of Hugging Face's hub; options of `TransformersDetector.load` in
+      `semfov.detection.transformers`.
     - A model of torchvision, transformers or Ultralytics: options of `TorchvisionDetector`, `TransformersDetector`
       and `UltralyticsDetector` in the modules of these names in `semfov.detection`.
     - A `Detector`: returned as it is.
@@ -81,7 +82,7 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
         check(not options, "options", "none for a detector that is made already", ", ".join(options))
         return model
     if isinstance(model, str | PathLike):
-        name = detector_name(model)
+        name = _detector_name(model)
         return _load(_loader(name), name, name, options)
     return _load(_wrapper(model), model, f"a {type(model).__name__}", options)
 
@@ -110,13 +111,13 @@ def _loader(name: str) -> Callable[..., Detector]:
 
         return load_onnx
     if name.startswith("torchvision:"):
-        from semfov.detection.torchvision import load_torchvision
+        from semfov.detection.torchvision import TorchvisionDetector
 
-        return load_torchvision
+        return TorchvisionDetector.load
     if name.startswith("hf:"):
-        from semfov.detection.transformers import load_hub
+        from semfov.detection.transformers import TransformersDetector
 
-        return load_hub
+        return TransformersDetector.load
     return load_yolo
 
 
@@ -143,9 +144,9 @@ def _wrapper(model: nn.Module) -> Callable[..., Detector]:
 
 def _options_of(load: Callable[..., Detector]) -> list[str]:
     """Names of the options of a loader, and of the one that it passes further options on to."""
-    from semfov.detection.transformers import TransformersDetector, load_hub
+    from semfov.detection.transformers import TransformersDetector
 
-    loaders = (load, TransformersDetector) if load is load_hub else (load,)
+    loaders = (load, TransformersDetector) if load == TransformersDetector.load else (load,)
     options = (each for loader in loaders for each in signature(loader).parameters.values())
     names = [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
     return [each for name in names for each in (_SELECTING if name == "selection" else [name])]
@@ -154,17 +155,17 @@ def _options_of(load: Callable[..., Detector]) -> list[str]:
 def loader_options() -> list[str]:
     """Names of the options of `load_detector` for any detector."""
     from semfov.detection.onnx import load_onnx
-    from semfov.detection.torchvision import TorchvisionDetector, load_torchvision
-    from semfov.detection.transformers import load_hub
+    from semfov.detection.torchvision import TorchvisionDetector
+    from semfov.detection.transformers import TransformersDetector
     from semfov.detection.ultralytics import UltralyticsDetector
 
-    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, load_torchvision, TorchvisionDetector]
-    return [name for load in [*loaders, load_hub, UltralyticsDetector] for name in _options_of(load)]
+    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, TorchvisionDetector.load, TorchvisionDetector]
+    return [name for load in [*loaders, TransformersDetector.load, UltralyticsDetector] for name in _options_of(load)]
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
     """Check without loading it that a detector exists."""
-    name = detector_name(name_or_path)
+    name = _detector_name(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         if not Path(name).exists():
             raise DataError(f"detector: no such file: {name}; check the path")
@@ -172,7 +173,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
     return COCO_CLASSES if name in WEIGHTS else None
 
 
-def detector_name(name_or_path: str | PathLike[str]) -> str:
+def _detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is."""
     name = fspath(name_or_path)
     check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")

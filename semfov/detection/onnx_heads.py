@@ -365,12 +365,6 @@ def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candid
     return _decode_distances(classes, distances, canvas, strides=strides)
 
 
-def _nanodet_plus(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
-    """Decode NanoDet-Plus: class scores, then distances with 8 bins for each side."""
-    rows = _first(outputs)
-    return _decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
-
-
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode DETRs trained with focal loss (RT-DETR): a sigmoid a class, without "no object"; logits `(B, Q, K)`."""
     if "pred_boxes" in outputs:
@@ -391,9 +385,18 @@ HEADS: dict[str, _DetectionHead] = {
     "end2end": _DetectionHead(lambda outputs, _, count: _decode_end_to_end(_first(outputs), count)),
     "picodet": _DetectionHead(_level_maps, _IMAGENET),
     "nanodet": _DetectionHead(_level_maps, _NANODET),
-    # Nearly every candidate exceeds the usual threshold of hints, as there is no objectness. All classes of a box have
-    # some score, which would dilute that of the best one if only their shares counted.
-    "nanodet-plus": _DetectionHead(_nanodet_plus, _NANODET, "normalised", faint=0.02, least=0.2),
+    # Class scores, then distances with 8 bins for each side. Nearly every candidate exceeds the usual threshold of
+    # hints, as there is no objectness. All classes of a box have some score, which would dilute that of the best one if
+    # only their shares counted.
+    "nanodet-plus": _DetectionHead(
+        lambda outputs, canvas, _: _decode_distances(
+            _first(outputs)[..., :-32], _first(outputs)[..., -32:], canvas, offset=0.0
+        ),
+        _NANODET,
+        "normalised",
+        faint=0.02,
+        least=0.2,
+    ),
     "detr": _DetectionHead(
         lambda outputs, canvas, _: _decode_detr(outputs[_logits(outputs)], outputs["pred_boxes"], canvas),
         _IMAGENET,

@@ -125,67 +125,68 @@ class TorchvisionDetector(ModuleDetector):
         sizes = {"min_size": list(transform.min_size), "max_size": transform.max_size}
         return super().settings() | ({} if self.stretch else sizes)
 
+    @classmethod
+    def load(
+        cls,
+        name: str,
+        *,
+        weights: Any = "DEFAULT",
+        classes: Sequence[str] | None = None,
+        first: int = 1,
+        background: BackgroundPolicy | None = None,
+        selection: Selection | None = None,
+        device: torch.device | str = "cpu",
+        **model: Any,
+    ) -> "TorchvisionDetector":
+        """Load a torchvision detection model by its name."""
+        from torchvision import models
 
-def load_torchvision(
-    name: str,
-    *,
-    weights: Any = "DEFAULT",
-    classes: Sequence[str] | None = None,
-    first: int = 1,
-    background: BackgroundPolicy | None = None,
-    selection: Selection | None = None,
-    device: torch.device | str = "cpu",
-    **model: Any,
-) -> TorchvisionDetector:
-    """Load a torchvision detection model by its name."""
-    from torchvision import models
-
-    name = name.removeprefix(_PREFIX)
-    lookup(name, models.list_models(module=models.detection), "torchvision detection model")
-    enum = _member(models.get_model_weights(name), weights)
-    if enum is not None:
-        if classes is not None:
-            raise InputError("classes: expected None, because torchvision's weights have their own classes, got names")
-        classes = enum.meta["categories"][1:]
-        digest = _download(enum)
-    elif classes is None:
-        raise InputError("classes: expected the names of the model's classes without background, got None")
-    else:
-        model |= {"num_classes": len(classes) + first, "weights_backbone": None}
-        if weights is not None and not Path(weights).is_file():
-            raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
-        digest = "" if weights is None else sha256(weights)
-    try:
-        network = models.get_model(name, weights=enum, **model)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"options of {name}: {error}") from error
-    # The builder and the constructors of its model would silently accept any other option.
-    builders = models.get_model_builder(name), *(each for each in type(network).__mro__ if issubclass(each, nn.Module))
-    for option in model:
-        known = sorted({each for call in builders for each in inspect.signature(call).parameters})
-        lookup(option, known, f"option of {name}")
-    if enum is None and weights is not None:
-        _load_state(network, Path(weights))
-    network.requires_grad_(False).to(device)
-    return TorchvisionDetector(
-        network,
-        digest,
-        classes=classes,
-        name=_PREFIX + name,
-        first=first,
-        background=background,
-        selection=selection,
-    )
-
-
-def _member(enum: Any, weights: Any) -> Any:
-    """The member of a weights enum, or None for a file and for random weights."""
-    if weights is None or isinstance(weights, enum):
-        return weights
-    text = fspath(weights).removeprefix(f"{enum.__name__}.")
-    if isinstance(weights, str) and not Path(text).suffix:
-        return enum[lookup(text, [*enum.__members__], f"{enum.__name__} member")]
-    return None
+        name = name.removeprefix(_PREFIX)
+        lookup(name, models.list_models(module=models.detection), "torchvision detection model")
+        members: Any = models.get_model_weights(name)
+        enum = weights  # a member, or None for a file and for random weights
+        if weights is not None and not isinstance(weights, members):
+            text = fspath(weights).removeprefix(f"{members.__name__}.")
+            named = isinstance(weights, str) and not Path(text).suffix
+            enum = members[lookup(text, [*members.__members__], f"{members.__name__} member")] if named else None
+        if enum is not None:
+            if classes is not None:
+                raise InputError(
+                    "classes: expected None, because torchvision's weights have their own classes, got names"
+                )
+            classes = enum.meta["categories"][1:]
+            digest = _download(enum)
+        elif classes is None:
+            raise InputError("classes: expected the names of the model's classes without background, got None")
+        else:
+            model |= {"num_classes": len(classes) + first, "weights_backbone": None}
+            if weights is not None and not Path(weights).is_file():
+                raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
+            digest = "" if weights is None else sha256(weights)
+        try:
+            network = models.get_model(name, weights=enum, **model)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"options of {name}: {error}") from error
+        # The builder and the constructors of its model would silently accept any other option.
+        builders = (
+            models.get_model_builder(name),
+            *(each for each in type(network).__mro__ if issubclass(each, nn.Module)),
+        )
+        for option in model:
+            known = sorted({each for call in builders for each in inspect.signature(call).parameters})
+            lookup(option, known, f"option of {name}")
+        if enum is None and weights is not None:
+            _load_state(network, Path(weights))
+        network.requires_grad_(False).to(device)
+        return cls(
+            network,
+            digest,
+            classes=classes,
+            name=_PREFIX + name,
+            first=first,
+            background=background,
+            selection=selection,
+        )
 
 
 def _download(enum: Any) -> str:

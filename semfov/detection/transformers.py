@@ -107,6 +107,30 @@ class TransformersDetector(ModuleDetector):
             own["edges"] = [*self.limits.values()] if self.resizes else []
         return super().settings() | own
 
+    @classmethod
+    def load(cls, name: str, *, revision: str | None = None, **options: Any) -> "TransformersDetector":
+        """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
+        repository = name.removeprefix("hf:")
+        check(bool(repository), "detector", "hf:owner/name", repr(name))
+        try:
+            from transformers import AutoImageProcessor, AutoModelForObjectDetection
+        except ImportError:
+            raise InputError(
+                "detector: expected the package transformers, which is not installed; pip install transformers"
+            ) from None
+        try:
+            model = AutoModelForObjectDetection.from_pretrained(
+                repository, revision=revision, use_safetensors=True, trust_remote_code=False
+            )
+            processor = AutoImageProcessor.from_pretrained(repository, revision=revision, trust_remote_code=False)
+        except ImportError as error:
+            raise InputError(f"detector: {name} needs a package that is not installed: {error}") from error
+        except (OSError, ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[:300]
+            raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
+        model.requires_grad_(False)
+        return cls(model, **{"name": name, "processor": processor.to_dict(), **options})
+
 
 def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, int]:
     """The size of an image processor as a mapping, which older settings give as a number or `(height, width)`."""
@@ -123,27 +147,3 @@ def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, in
     wanted = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"
     check(whole and set(size) in kinds, "processor size", wanted, excerpt(settings.get("size")))
     return size
-
-
-def load_hub(name: str, *, revision: str | None = None, **options: Any) -> TransformersDetector:
-    """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
-    repository = name.removeprefix("hf:")
-    check(bool(repository), "detector", "hf:owner/name", repr(name))
-    try:
-        from transformers import AutoImageProcessor, AutoModelForObjectDetection
-    except ImportError:
-        raise InputError(
-            "detector: expected the package transformers, which is not installed; pip install transformers"
-        ) from None
-    try:
-        model = AutoModelForObjectDetection.from_pretrained(
-            repository, revision=revision, use_safetensors=True, trust_remote_code=False
-        )
-        processor = AutoImageProcessor.from_pretrained(repository, revision=revision, trust_remote_code=False)
-    except ImportError as error:
-        raise InputError(f"detector: {name} needs a package that is not installed: {error}") from error
-    except (OSError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
-    model.requires_grad_(False)
-    return TransformersDetector(model, **{"name": name, "processor": processor.to_dict(), **options})

@@ -4,7 +4,7 @@ from torch import nn
 
 from semfov import ActivePerception, DataError, InputError
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.load import check_detector, detector_name, load_detector
+from semfov.detection.load import _detector_name, check_detector, load_detector
 from semfov.detection.placement import resize
 from semfov.detection.yolo import _RUNTIMES
 from tests.refusals import refused, unusable
@@ -135,10 +135,10 @@ def test_a_detector_is_returned_as_it_is(small_cfg, small_weights):
 
 
 def test_names_are_the_same_in_upper_and_lower_case():
-    assert detector_name("YOLOv3-Tiny") == "yolov3-tiny"
-    assert detector_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
-    assert detector_name("HF:Owner/Name") == "hf:Owner/Name"
-    assert detector_name("Folder/Net.cfg") == "Folder/Net.cfg"
+    assert _detector_name("YOLOv3-Tiny") == "yolov3-tiny"
+    assert _detector_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
+    assert _detector_name("HF:Owner/Name") == "hf:Owner/Name"
+    assert _detector_name("Folder/Net.cfg") == "Folder/Net.cfg"
 
 
 @pytest.mark.parametrize("load", [load_detector, check_detector])

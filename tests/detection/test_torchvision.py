@@ -9,7 +9,7 @@ from torchvision.ops import MultiScaleRoIAlign, batched_nms, remove_small_boxes
 
 from semfov import DataError, Selection, load_detector
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.detection.torchvision import TorchvisionDetector, _output_count, load_torchvision
+from semfov.detection.torchvision import TorchvisionDetector, _output_count
 from semfov.io.files import sha256
 from tests.refusals import refused, unusable
 
@@ -155,7 +155,7 @@ def test_boxes_equal_those_of_the_torchvision_model(small, size):
 @pytest.mark.parametrize("name", NAMED)
 def test_boxes_equal_those_of_the_published_architectures(name):
     torch.manual_seed(0)
-    detector = load_torchvision(name, weights=None, classes=NAMES, **NAMED[name])
+    detector = TorchvisionDetector.load(name, weights=None, classes=NAMES, **NAMED[name])
     randomise_heads(detector.model)
     if name == LITE:
         normalise(detector.model)
@@ -210,7 +210,7 @@ def test_settings_contain_the_input_size():
 @pytest.fixture(scope="module")
 def lite() -> TorchvisionDetector:
     torch.manual_seed(0)
-    return load_torchvision(LITE, weights=None, classes=NAMES)
+    return TorchvisionDetector.load(LITE, weights=None, classes=NAMES)
 
 
 def test_coco_classes_of_published_weights(monkeypatch):
@@ -239,7 +239,7 @@ def test_weights_can_be_named_in_several_ways(monkeypatch):
     monkeypatch.setattr("semfov.detection.torchvision._download", stop)
     enum = models.get_model_weights(LITE)
     for weights in ("DEFAULT", "COCO_V1", f"{enum.__name__}.COCO_V1", enum.COCO_V1):
-        unusable("stop", load_torchvision, LITE, weights=weights)
+        unusable("stop", TorchvisionDetector.load, LITE, weights=weights)
     assert chosen == [enum.COCO_V1] * 4
 
 
@@ -254,9 +254,9 @@ def test_published_weights_are_verified_and_hold_only_tensors(monkeypatch, tmp_p
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     path = hub / models.get_model_weights(LITE).DEFAULT.url.split("/")[-1]
     torch.save({"a": torch.zeros(1)}, path)
-    unusable("damaged", load_torchvision, LITE)
+    unusable("damaged", TorchvisionDetector.load, LITE)
     torch.save({"a": Unsafe()}, path)
-    unusable("expected only tensors", load_torchvision, LITE)
+    unusable("expected only tensors", TorchvisionDetector.load, LITE)
 
 
 @pytest.mark.parametrize("kind", ["plain.pth", "nested.pth", "plain.safetensors"])
@@ -268,7 +268,7 @@ def test_weights_can_be_loaded_from_a_state_dict_file(lite, tmp_path, kind):
         from safetensors.torch import save_file
 
         save_file(state, path)
-    detector = load_torchvision(LITE, weights=path, classes=NAMES)
+    detector = TorchvisionDetector.load(LITE, weights=path, classes=NAMES)
     assert detector.digest == sha256(path)
     loaded = detector.model.state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in state.items())
@@ -276,10 +276,10 @@ def test_weights_can_be_loaded_from_a_state_dict_file(lite, tmp_path, kind):
 
 def test_missing_and_unsuitable_files_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(models, "get_model", lambda *_, **__: MODELS["SSD"]())
-    unusable("no such file", load_torchvision, LITE, weights=tmp_path / "missing.pth", classes=NAMES)
+    unusable("no such file", TorchvisionDetector.load, LITE, weights=tmp_path / "missing.pth", classes=NAMES)
     for content in ({"a": torch.zeros(1)}, {"a": Unsafe()}, [1, 2]):
         torch.save(content, tmp_path / "other.pth")
-        unusable(r"other\.pth", load_torchvision, LITE, weights=tmp_path / "other.pth", classes=NAMES)
+        unusable(r"other\.pth", TorchvisionDetector.load, LITE, weights=tmp_path / "other.pth", classes=NAMES)
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -312,7 +312,7 @@ def test_invalid_options_are_refused():
         ("fcos_resnet50_fpn", {"weights": None, "classes": NAMES, "colour": 1}, "colour"),
         (LITE, {"weights": None, "classes": NAMES, "first": 0}, "first"),
     ):
-        refused(message, load_torchvision, name, **options)
+        refused(message, TorchvisionDetector.load, name, **options)
     refused("expected Faster R-CNN", TorchvisionDetector, nn.Linear(1, 1), classes=NAMES)
     detector = TorchvisionDetector(MODELS["FCOS"](), classes=NAMES[:2])
     refused("classes: expected 3 names", detector.propose, torch.rand(1, 3, 64, 64))

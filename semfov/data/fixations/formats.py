@@ -94,7 +94,7 @@ def read_cocosearch(
             subject=str(trial.get("subject", path.stem)),
             size=screen,
             target=trial.get("task"),
-            box=None if box is None else _box(box[0], box[1], box[0] + box[2], box[1] + box[3]),
+            box=None if box is None else tuple(map(float, (box[0], box[1], box[0] + box[2], box[1] + box[3]))),
             found=flag if isinstance(flag, bool) else None,
         )
         if sizes is None:
@@ -252,7 +252,7 @@ def read_ruarte(
             subject=subject if subject is not None else trial.get("subject", path.stem),
             size=(int(trial["image_width"]), int(trial["image_height"])),
             target=trial.get("target_object"),
-            box=None if box is None else _box(box[1], box[0], box[3] + cells, box[2] + cells),
+            box=None if box is None else tuple(map(float, (box[1], box[0], box[3] + cells, box[2] + cells))),
             found=flag,
         )
         if screen is not None:
@@ -356,7 +356,3 @@ def _record(
         raise DataError(f"{path}: {name}.{keys[2]}: expected durations of {count} fixations, got {len(times)}")
     durations = None if times is None else np.asarray(times[:count], dtype=np.float64)
     return Fixations(points=np.array([*zip(x, y, strict=True)], dtype=np.float64), durations=durations, **fields)
-
-
-def _box(x1: float, y1: float, x2: float, y2: float) -> tuple[float, float, float, float]:
-    return float(x1), float(y1), float(x2), float(y2)
