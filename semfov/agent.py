@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, open_picture
+from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -277,7 +277,7 @@ class ActivePerception(nn.Module):
             InputError: the kind is unknown, or does not suit a scene.
         """
         known = not foveal and self.windows is not None and self.windows.photograph is not None
-        return open_picture(picture).kind(how, self.eye.detector.input_size, every=every, photographs=known)
+        return OpenedPicture.of(picture).kind(how, self.eye.detector.input_size, every=every, photographs=known)
 
     @checked_keywords
     def search(
@@ -355,7 +355,7 @@ class ActivePerception(nn.Module):
         # Class numbers may be those of NumPy or a tensor, which have no length.
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
         foveal = start is not None or boxes is not None or len(targets) > 1
-        opened = open_picture(picture, color, white, bands)
+        opened = OpenedPicture.of(picture, color, white, bands)
         kind = self._kind(opened, how, shifts, duration, foveal=foveal)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         only_for(kind, "fovea", "passes", boxes=boxes)
@@ -422,7 +422,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        opened = open_picture(picture, color, white, bands)
+        opened = OpenedPicture.of(picture, color, white, bands)
         kind = self._kind(opened, how, shifts, duration, every=True)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
@@ -486,7 +486,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        opened = open_picture(picture, color, white, bands)
+        opened = OpenedPicture.of(picture, color, white, bands)
         kind = self._kind(opened, how, shifts, duration, foveal=start is not None or policy is not None)
         only_for(kind, "fovea", "none", policy=policy)
         if kind == "fovea":
@@ -529,7 +529,7 @@ class ActivePerception(nn.Module):
             InputError: no model is shipped for the detector, the given one is another's, or the fovea bends it.
             DataError: the file of the picture or of the model cannot be read.
         """
-        image = open_picture(picture, color, white, bands).image(self.eye.sensor.like)[0]
+        image = OpenedPicture.of(picture, color, white, bands).image(self.eye.sensor.like)[0]
         source = fspath(picture) if isinstance(picture, str | PathLike) else None
         return GazePrediction.of(self.eye, image, model=model, source=source, seen=seen)
 

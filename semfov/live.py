@@ -4,7 +4,7 @@ from typing import Any, get_args
 
 from semfov.agents.episode import Episode, without_none
 from semfov.agents.fovea import FoveaAgent, FoveaEpisode
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.agents.windows import ZoomAgent
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.tone import White, check_white
@@ -103,7 +103,7 @@ class LivePerception:
         check(frame is not None, "frame", "a picture", got)
         if self._white is not None:
             frame = as_image(frame, argument="frame", white=self._white)
-        picture = open_picture(frame)
+        picture = OpenedPicture.of(frame)
         check(not picture.scene, "frame", "a picture; search and find_all take scenes", type(frame).__name__)
         if self.how == "auto":
             self.how = picture.kind("auto", self._canvas, photographs=self._photographs)

@@ -23,7 +23,6 @@ from semfov.io.files import inside
 from semfov.io.manifest import PARTS, Manifest, find_file
 from semfov.io.pretrained import fit_command
 from semfov.observation.foveal import FovealObservationModel
-from semfov.sensor.base import Sensor
 from semfov.sensor.named import SENSORS
 from semfov.zoom.evidence import GlimpseEvidence
 
@@ -103,15 +102,14 @@ class ModelFolder:
             )
         return loaded
 
-    @property
-    def _sensor(self) -> type[Sensor]:
-        """The class of the sensor."""
-        return SENSORS[lookup(self.manifest.sensor["name"], SENSORS, "sensor")].make
-
     def eye(self, **source: Any) -> Eye:
         """Load the eye, sensor and detector, with arguments for `load_detector`; checks the models against it."""
-        sensor = self._sensor.from_settings(self.manifest.sensor)
-        eye = Eye(sensor, self.load_detector(**source), reference=self.manifest.sensor["reference"])
+        kind = SENSORS[lookup(self.manifest.sensor["name"], SENSORS, "sensor")].make
+        eye = Eye(
+            kind.from_settings(self.manifest.sensor),
+            self.load_detector(**source),
+            reference=self.manifest.sensor["reference"],
+        )
         for model in self._models.values():
             model.check_compatible(eye.settings())
         return eye
@@ -150,7 +148,7 @@ class ModelFolder:
             searching = Semantic(components, model, footprint=footprint, tempering=tempering)
         explore: tuple[Observer, Policy] = Semantic(components), Policy("random")
         if isinstance(learned, MapEvidence):
-            explore = LearnedMap(learned), Policy("closer-look", fovea=self._sensor.width(sensor) / sensor["reference"])
+            explore = LearnedMap(learned), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])
         return {
             "eye": eye,
             "search": (searching, Policy("non-predictive")),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.fuzz.images import turned
 from benchmarks.fuzz.runner import Case, Draw
 from semfov import as_image
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.data.fixations import Fixations, read_table, suspicions
 from semfov.data.large import open_large
 from semfov.metrics.episodes import area_under_roc
@@ -83,7 +83,7 @@ def tiff_tags(draw: Draw, folder: Path) -> Case:
     def read() -> tuple[NDArray[Any], NDArray[Any]]:
         picture = open_large(path, **given)
         windows = picture.pixels((0, 0, *picture.size))
-        return windows, open_picture(path, **given).image(torch.zeros(1))[0].permute(1, 2, 0).numpy()
+        return windows, OpenedPicture.of(path, **given).image(torch.zeros(1))[0].permute(1, 2, 0).numpy()
 
     def check(both: tuple[NDArray[Any], NDArray[Any]]) -> None:
         windows, fovea = both

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,6 @@ from semfov.agents.episode import Episode, EpisodeLimits, on_cpu
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import (
@@ -83,8 +82,21 @@ class FoveaAgent:
         )  # fmt: skip
         grid = episode.open(image)
         goal = None if boxes is None else _goal_cells(boxes, grid, image)
-        episode.ends = _outcome_of(weights, grid, goal, episode.thresholds, 0.5 if confirm is None else confirm)
-        episode.to_goal = goal is not None
+        first, least = next(iter(weights)), 0.5 if confirm is None else confirm
+
+        def outcome(step: Step) -> Tensor:
+            if goal is not None:
+                return goal[step.cell].long()
+            if episode.thresholds is not None:
+                return decide(step, first, episode.thresholds)
+            hits = [
+                confirms(step.detections, grid, step.cell, number, least / weight)
+                for number, weight in weights.items()
+                if weight > 0
+            ]
+            return torch.stack(hits).any(0).long()
+
+        episode.ends, episode.to_goal = outcome, goal is not None
         return episode.run()
 
     def explore(
@@ -433,27 +445,6 @@ def cell_at(start: Start, cells: tuple[int, int]) -> int | None:
     check_whole(column, "start", 0, cells[0] - 1)
     check_whole(row, "start", 0, cells[1] - 1)
     return int(row) * cells[0] + int(column)
-
-
-def _outcome_of(
-    weights: Mapping[int, float], grid: Grid, goal: Tensor | None, thresholds: Thresholds | None, confirm: float
-) -> Callable[[Step], Tensor]:
-    """Make the function that decides which searches end with a step; goal `(X·Y,)` → `(A,)`."""
-    first = next(iter(weights))
-
-    def outcome(step: Step) -> Tensor:
-        if goal is not None:
-            return goal[step.cell].long()
-        if thresholds is not None:
-            return decide(step, first, thresholds)
-        hits = [
-            confirms(step.detections, grid, step.cell, index, confirm / weight)
-            for index, weight in weights.items()
-            if weight > 0
-        ]
-        return torch.stack(hits).any(0).long()
-
-    return outcome
 
 
 def _goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from contextlib import suppress
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 from torch import Tensor
 
@@ -39,6 +39,13 @@ class OpenedPicture:
         self.scene = is_scene(source)
         made = isinstance(source, World | LargePicture)
         check(not made or white is bands is None, "white", "None for a picture that is open", white)
+
+    @classmethod
+    def of(
+        cls, source: "PictureLike | Self", color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
+    ) -> Self:
+        """Open a picture of any kind; one that is open stays as it is."""
+        return source if isinstance(source, cls) else cls(cast(PictureLike, source), color, white, bands)
 
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
         """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""
@@ -82,10 +89,3 @@ class OpenedPicture:
         """The scene for a head."""
         given = self.white is not None or self.bands is not None
         return open_scene(self.large if given else self.source, self.color)
-
-
-def open_picture(
-    source: "PictureLike | OpenedPicture", color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
-) -> OpenedPicture:
-    """Open a picture of any kind; one that is open stays as it is."""
-    return source if isinstance(source, OpenedPicture) else OpenedPicture(source, color, white, bands)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import check_device, class_names
 from semfov.cli.options import GazeOptions
 from semfov.cli.results import tell_written, unfinished
@@ -95,7 +95,7 @@ class _GazeJob:
     def look(self, number: int) -> None:
         """Predict where people look in a picture, and write the density."""
         source, out = self.sources[number], self.options.out
-        image = open_picture(source.opened("auto")).image(torch.zeros(1))[0]
+        image = OpenedPicture.of(source.opened("auto")).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
         prediction = GazePrediction.of(self.detector, image, model=self.model, source=file)
         outcome = _outcome(prediction, self.options, source.name)

@@ -338,17 +338,12 @@ _DecisionRates = tuple[float, float, float, float, int]
 
 
 def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
-    def share(outcome: str, which: Sequence[bool]) -> float:
+    shares = []
+    for outcome, which in (("found", [True]), ("found", [False]), ("undecided", [True, False])):
         chosen = [each[1] == outcome for each in searches if each[0] in which]
-        return sum(chosen) / len(chosen) if chosen else math.nan
-
-    return (
-        share("found", [True]),
-        share("found", [False]),
-        share("undecided", [True, False]),
-        sum(each[2] for each in searches) / max(len(searches), 1),
-        len(searches),
-    )
+        shares.append(sum(chosen) / len(chosen) if chosen else math.nan)
+    hits, false_alarms, undecided = shares
+    return hits, false_alarms, undecided, sum(each[2] for each in searches) / max(len(searches), 1), len(searches)
 
 
 _Rule = Callable[..., Tensor]

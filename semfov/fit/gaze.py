@@ -199,9 +199,17 @@ def fit_oculomotor(
         centre = model.centre_bias(size).detach()
         losses = []
         for picture in some:
-            chosen, corner = _drawn(events[number][picture], size, generator)
+            # Random events on every second row and column of cells: a quarter of the computation. The likelihood of
+            # a fixation given that it is on these cells has the same parameters.
+            every = events[number][picture]
+            top, left = (int(each) for each in torch.randint(2, (2,), generator=generator))
+            rows, columns = every.cell // cells_of(size)[1], every.cell % cells_of(size)[1]
+            there = ((rows % 2 == top) & (columns % 2 == left)).nonzero()[:, 0]
+            chosen = every.some(there[torch.randperm(len(there), generator=generator)[:_EVENTS]])
             if not len(chosen.cell):
                 continue
+            longest = int((~chosen.before[..., 0].isnan()).sum(1).max())
+            chosen, corner = chosen._replace(before=chosen.before[:, -longest:]), (top, left, 2)
             terms = {"map": _for_events(maps[number][places[number][picture]], chosen), "centre bias": centre[None]}
             log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
             rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
@@ -221,19 +229,6 @@ def _for_events(maps: _MapsOfPicture, events: Events) -> Tensor:
     if not isinstance(maps, Tensor):
         return maps(events)
     return maps if len(maps) == 1 else maps[events.person]
-
-
-def _drawn(events: Events, size: tuple[int, int], generator: torch.Generator) -> tuple[Events, tuple[int, int, int]]:
-    """Random events on every second row and column of cells, and the first of these: a quarter of the computation.
-
-    The likelihood of a fixation given that it is on these cells has the same parameters.
-    """
-    top, left = (int(each) for each in torch.randint(2, (2,), generator=generator))
-    rows, columns = events.cell // cells_of(size)[1], events.cell % cells_of(size)[1]
-    there = ((rows % 2 == top) & (columns % 2 == left)).nonzero()[:, 0]
-    chosen = events.some(there[torch.randperm(len(there), generator=generator)[:_EVENTS]])
-    longest = int((~chosen.before[..., 0].isnan()).sum(1).max()) if len(there) else 1
-    return Events(chosen.before[:, -longest:], chosen.cell, chosen.person), (top, left, 2)
 
 
 @torch.no_grad()

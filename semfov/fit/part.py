@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,6 +28,8 @@ _FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
+_MANY = 100
+"""With at least this many photographs, one in five is held out and training takes all its steps."""
 _LONGEST = 15
 """Maximum number of gaze shifts in the searches and explorations that are compared."""
 
@@ -44,7 +46,14 @@ class PartInputs:
     """The looks that all parts are fitted to, and the parts that are finished."""
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
-        self.config, self.run = config.sized(len(run.scenes)), run
+        share = min(len(run.scenes) / _MANY, 1)
+        self.run = run
+        self.config = replace(
+            config,
+            holdout=config.holdout or (3 if share < 1 else 5),
+            steps=config.steps or max(250, round(500 * share)),
+            map_steps=config.map_steps or max(300, round(1000 * share)),
+        )
         self.components = len(run.scenes.classes) + 1
         self.absent = 2 if self.components <= _FEW else None
         """Number of absent classes to learn from in a photograph; None for as many as present ones."""

@@ -123,7 +123,15 @@ def fit_photographs(
     if numbers:
         spread, told = fit_spread(numbers)
         evidence.certainty = replace(certainty, spread=spread)
-    _fit_whole(evidence, [each for each in searches if not each.spare], held, count)
+    # After the look at the whole, with frequencies in the other photographs.
+    total, some = held.sum(0), [each for each in searches if not each.spare]
+    best = torch.tensor([search.best for search in some], dtype=torch.float64)
+    present = torch.tensor([search.present for search in some])
+    holding = torch.tensor([int(total[search.target - 1]) for search in some])
+    others = _usual(holding - present.long(), count - 1)
+    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), others], -1), present)
+    evidence.whole.weight.copy_(torch.tensor([weights]))
+    evidence.whole.bias.fill_(offset)
     text = _fit_closer(evidence, searches, config, prior)
     model.photograph = evidence
     model.metadata["photograph"] = {"photographs": len(single[: config.photographs]), "frequencies": count}
@@ -149,18 +157,6 @@ def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
 def _usual(held: Tensor, count: int) -> Tensor:
     """Log odds that a photograph holds each class, half a photograph for and against added."""
     return ((held + 0.5) / (count + 1)).double().logit()
-
-
-def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], held: Tensor, count: int) -> None:
-    """Fit the probability after the look at the whole, with frequencies in the other photographs; held `(P, K)`."""
-    total = held.sum(0)
-    best = torch.tensor([search.best for search in searches], dtype=torch.float64)
-    present = torch.tensor([search.present for search in searches])
-    number = torch.tensor([int(total[search.target - 1]) for search in searches])
-    usual = _usual(number - present.long(), count - 1)
-    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), usual], -1), present)
-    evidence.whole.weight.copy_(torch.tensor([weights]))
-    evidence.whole.bias.fill_(offset)
 
 
 def _fit_closer(

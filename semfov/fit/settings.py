@@ -71,10 +71,6 @@ class FitOnLooksConfig(FitOnCellsConfig):
     out: Path = Path("runs/fit")
 
 
-_MANY = 100
-"""With at least this many photographs, one in five is held out and training takes all its steps."""
-
-
 @dataclass(frozen=True)
 class FitDetectorConfig(FitOnCellsConfig):
     """Fit all models that the agent needs to your own detector.
@@ -131,14 +127,3 @@ class FitDetectorConfig(FitOnCellsConfig):
         # Photographs without the target are needed as negative examples.
         data = replace(self.data, max_target_area=None)
         return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
-
-    def sized(self, photographs: int) -> "FitDetectorConfig":
-        """Return these settings, with each None replaced by a default that suits the number of photographs."""
-        few = photographs < _MANY
-        share = min(photographs / _MANY, 1)
-        return replace(
-            self,
-            holdout=self.holdout or (3 if few else 5),
-            steps=self.steps or max(250, round(500 * share)),
-            map_steps=self.map_steps or max(300, round(1000 * share)),
-        )

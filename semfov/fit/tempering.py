@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -60,12 +61,17 @@ def hit_rates(
         if len(annotation.labels) < least or not targets:
             continue
         looks = slice(index * config.fixations, (index + 1) * config.fixations)
+        bounds = torch.searchsorted(samples.look, torch.arange(looks.start, looks.stop + 1)).tolist()
+        detections = Detections.stack(
+            [
+                Detections(samples.boxes[None, a:b], samples.scores[None, a:b], torch.ones(1, b - a, dtype=torch.bool))
+                for a, b in pairwise(bounds)
+            ]
+        )
         grid = Grid(config.columns, config.rows, annotation.size)
         covered = grid.footprint(annotation.boxes)
         goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
-        share = hit_rate(
-            observer, samples.detections_of(looks), samples.fixations[looks], grid, torch.tensor(targets), goal
-        )
+        share = hit_rate(observer, detections, samples.fixations[looks], grid, torch.tensor(targets), goal)
         if share is not None:
             rates[index] = share
     return rates

@@ -88,7 +88,15 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
-    about, several = _about_html(episodes), bool(sections) or len(episodes) > 1
+    rows = []
+    for key, label in _ABOUT.items():
+        if any(key in episode for episode in episodes):
+            hidden = "" if episodes[0].get(key) else " hidden"
+            fact = escape(episodes[0].get(key) or "")
+            rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
+    # Facts about the first episode, which the script updates for other episodes.
+    about = f'<dl id="about" class="facts">{"".join(rows)}</dl>' if episodes else ""
+    several = bool(sections) or len(episodes) > 1
     contents = {
         "title": escape(title),
         "sections": sections,
@@ -119,19 +127,6 @@ def filled(name: str, data: Data, contents: dict[str, str]) -> str:
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     template = text("head.html", f"{name}.html", "foot.html")
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
-
-
-def _about_html(episodes: Sequence[Data]) -> str:
-    """The head of the page: facts about the first episode, which the script updates for other episodes."""
-    if not episodes:
-        return ""
-    rows = []
-    for key, label in _ABOUT.items():
-        if any(key in episode for episode in episodes):
-            hidden = "" if episodes[0].get(key) else " hidden"
-            fact = escape(episodes[0].get(key) or "")
-            rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
-    return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
 
 
 def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:

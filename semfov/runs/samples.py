@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import torch
@@ -42,17 +41,6 @@ class Samples:
     def scene(self) -> Tensor:
         """Index of the scene of each detection, `(M,)`."""
         return self.scenes[self.look]
-
-    def detections_of(self, looks: slice) -> Detections:
-        """The detections of successive looks, as a batch."""
-        numbers = torch.arange(looks.start, looks.stop + 1)
-        bounds = torch.searchsorted(self.look, numbers).tolist()
-        return Detections.stack(
-            [
-                Detections(self.boxes[None, a:b], self.scores[None, a:b], torch.ones(1, b - a, dtype=torch.bool))
-                for a, b in itertools.pairwise(bounds)
-            ]
-        )
 
     @classmethod
     @torch.inference_mode()

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from semfov import DataError, as_image, read_image
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.data.large import _RasterPicture, open_large, picture_size
 from tests.data.test_large import pixels
 from tests.refusals import unusable
@@ -228,5 +228,5 @@ def test_bands_without_colours_that_are_turned_are_refused(tmp_path, planes):
     bands = np.moveaxis(pixels(6, 8), -1, 0) if planes == "separate" else pixels(6, 8)
     given = {"photometric": "minisblack", "planarconfig": planes, "extratags": [(274, "H", 1, 3, True)]}
     tifffile.imwrite(tmp_path / "a.tif", bands, **given)
-    for read in (open_large, lambda path: open_picture(path).image(torch.zeros(1))):
+    for read in (open_large, lambda path: OpenedPicture.of(path).image(torch.zeros(1))):
         unusable("expected orientation 1 of bands without colours, got 3 of 3 bands", read, tmp_path / "a.tif")

@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from semfov import as_image, read_image
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.data.large import open_large
 from tests.data.test_large import pixels
 from tests.refusals import refused, unusable
@@ -43,7 +43,7 @@ def test_values_of_any_kind_are_shown_between_black_and_white(tmp_path, kind, wh
     assert np.abs(got.astype(int) - want).max() <= tolerance
     assert np.abs(whole(open_large(values, white=white)).astype(int) - want).max() <= 1
     assert np.abs(as_image(values, white=white).permute(1, 2, 0).numpy() * 255 - want).max() <= 1
-    seen = open_picture(tmp_path / "a.tif", white=white).image(torch.zeros(1))[0].permute(1, 2, 0) * 255
+    seen = OpenedPicture.of(tmp_path / "a.tif", white=white).image(torch.zeros(1))[0].permute(1, 2, 0) * 255
     assert np.array_equal(seen.round().numpy().astype(np.uint8), got)
 
 

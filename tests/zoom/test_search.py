@@ -8,7 +8,7 @@ import torch
 from torchvision.transforms.functional import to_pil_image
 
 from semfov import Detections, InputError, WindowEye, ZoomAgent
-from semfov.agents.picture import open_picture
+from semfov.agents.picture import OpenedPicture
 from semfov.data.large import open_large
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.glances import Glance, LiveGlances, Window
@@ -92,7 +92,7 @@ def test_a_path_tells_why_it_ended(agent, picture):
 
 def test_zooming_pays_only_for_large_pictures(agent, picture):
     kinds = [
-        open_picture(each).kind("auto", agent.eye.detector.input_size) for each in (picture, picture[:, :200, :300])
+        OpenedPicture.of(each).kind("auto", agent.eye.detector.input_size) for each in (picture, picture[:, :200, :300])
     ]
     assert kinds == ["windows", "fovea"]
 
