@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.machine import use_threads
 from benchmarks.tables import comparison_rows, table
 from benchmarks.timing import Clock, Comparison, clock_for, measure
-from semfov.gaze.saliency.blur import gaussian_blur, gaussian_kernel
+from semfov.gaze.saliency.blur import _gaussian_kernel, gaussian_blur
 from semfov.sensor import foveate, laplacian_pyramid, pyramid
 
 LEVELS = 4
@@ -45,7 +45,7 @@ def blur(image: Tensor) -> Tensor:
     if image.device.type in pyramid._AHEAD:
         blurred = gaussian_blur(image, SIGMA)
     else:
-        taps = len(gaussian_kernel(SIGMA))
+        taps = len(_gaussian_kernel(SIGMA))
         blurred = gaussian_blur2d(image, (taps, taps), (SIGMA, SIGMA), "replicate")
     return blurred.square().sum()
 

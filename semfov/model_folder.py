@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -20,7 +21,7 @@ from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside
-from semfov.io.manifest import PARTS, Manifest, find_file
+from semfov.io.manifest import PARTS, Manifest
 from semfov.io.pretrained import fit_command
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS
@@ -51,6 +52,17 @@ def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
     )
 
 
+def _find_file(place: Mapping[str, str], folder: Path) -> Path:
+    """The file of a detector at its place, relative to the folder of models or as it was."""
+    for path in (folder / place["relative"], Path(place["absolute"])):
+        if path.is_file():
+            return path
+    raise DataError(
+        f"detector: expected {place['absolute']}, the file that {folder} was fitted to, got none; give its new place "
+        "as detector= (on a command line --detector FILE), or put it back"
+    )
+
+
 class ModelFolder:
     """The result of `semfov fit`: models for one detector and one sensor, and which of them the agent uses."""
 
@@ -78,11 +90,11 @@ class ModelFolder:
         if weights is not None:
             options["weights"] = os.fspath(weights)
         elif place is not None:
-            options["weights"] = str(find_file(place, self.path))
+            options["weights"] = str(_find_file(place, self.path))
         if detector is not None:
             return os.fspath(detector), options
         place = record.get("model_file")
-        return (record["model"] if place is None else str(find_file(place, self.path))), options
+        return (record["model"] if place is None else str(_find_file(place, self.path))), options
 
     def load_detector(
         self,

@@ -310,12 +310,12 @@ class _Plane(_Scene):
         got = f"{field} degrees, {width:.0f} × {height:.0f} pixels; give narrower `fields`, or a smaller `degree`"
         largest = f"a window inside the picture of {self.picture[0]} × {self.picture[1]} pixels"
         check(fits, "field", largest, got)
-
-        def middles(length: int, side: float) -> list[float]:
-            steps = 2 * math.ceil(length / side - 1 - 1e-9)
-            return [(length - side) * (n / max(steps, 1) - 0.5) / self.degree for n in range(steps + 1)]
-
-        across, down = (middles(*pair) for pair in zip(self.picture, (width, height), strict=True))
+        sides = [*zip(self.picture, (width, height), strict=True)]
+        steps = [2 * math.ceil(length / side - 1 - 1e-9) for length, side in sides]
+        across, down = (
+            [(length - side) * (n / max(most, 1) - 0.5) / self.degree for n in range(most + 1)]
+            for (length, side), most in zip(sides, steps, strict=True)
+        )
         return [[torch.tensor([x, -y, field]) for x in across] for y in down]
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:

@@ -136,17 +136,6 @@ def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str
     return {"relative": Path(relative).as_posix(), "absolute": str(absolute)}
 
 
-def find_file(place: Mapping[str, str], folder: Path) -> Path:
-    """The file of a detector at its place, relative to the folder of models or as it was."""
-    for path in (folder / place["relative"], Path(place["absolute"])):
-        if path.is_file():
-            return path
-    raise DataError(
-        f"detector: expected {place['absolute']}, the file that {folder} was fitted to, got none; give its new place "
-        "as detector= (on a command line --detector FILE), or put it back"
-    )
-
-
 def _read(path: Path) -> dict[str, Any]:
     check_regular(path)
     try:

@@ -58,21 +58,15 @@ def fit_tables(
         text += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
         warnings.warn(f"levels with fewer than {minimum} objects fall back: {text}", stacklevel=4)
-    prior, expected = _estimate_prior(statistics.count, shrinkage), _expected_table(statistics, fallback, shrinkage)
+    uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
+    parent = shrink(classes.mean, classes.count, uniform, _UNIFORM)
+    expected = shrink(statistics.mean, statistics.count, parent[:, None], shrinkage)
+    for level, source in fallback.items():
+        expected[:, level] = expected[:, source]
+    expected, prior = expected / expected.sum(-1, keepdim=True), _estimate_prior(statistics.count, shrinkage)
     told = {"method": method, "shrinkage": shrinkage, "minimum": minimum, "enough": enough}
     levels = {str(level): source for level, source in fallback.items()}
     return alpha, prior, expected, {"counts": statistics.count.tolist(), "fallback": levels, **told}
-
-
-def _expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
-    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage as in `fit_tables`."""
-    classes = statistics.sum(1)
-    uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
-    parent = shrink(classes.mean, classes.count, uniform, _UNIFORM)
-    table = shrink(statistics.mean, statistics.count, parent[:, None], shrinkage)
-    for level, source in fallback.items():
-        table[:, level] = table[:, source]
-    return table / table.sum(-1, keepdim=True)
 
 
 def _estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:

@@ -484,14 +484,10 @@ def _kept_map(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
     return kept[1]
 
 
-def _in_graph(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """`_kept_map` in memory that a compiled graph may write over."""
-    weight, constant = _kept_map(log_alpha)
-    return weight.clone(), constant.clone()
-
-
-# An operation into which compilation does not look.
+# An operation into which compilation does not look, and whose results a compiled graph may write over.
 _OPERATIONS = torch.library.Library("semfov", "FRAGMENT")
 _OPERATIONS.define("linear_map(Tensor log_alpha) -> (Tensor, Tensor)")
-_OPERATIONS.impl("linear_map", _in_graph, "CompositeExplicitAutograd")
+_OPERATIONS.impl(
+    "linear_map", lambda log_alpha: tuple(map(torch.clone, _kept_map(log_alpha))), "CompositeExplicitAutograd"
+)
 _OPERATIONS.impl("linear_map", lambda log_alpha: _linear_map(log_alpha.exp()), "Meta")

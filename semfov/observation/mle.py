@@ -156,16 +156,12 @@ def inverse_digamma(y: Tensor) -> Tensor:
     """
     x = _guess(y)
     for _ in range(5):
-        x = x - (x.digamma() - y) / _trigamma(x)
+        x = x - (x.digamma() - y) / torch.polygamma(1, x)
     return x
 
 
 def _guess(y: Tensor) -> Tensor:
     return torch.where(y >= _KNEE, y.exp() + 0.5, -1 / (y.clamp(max=_KNEE) + _EULER))
-
-
-def _trigamma(x: Tensor) -> Tensor:
-    return torch.polygamma(1, x)
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:
@@ -174,7 +170,7 @@ def _at_precision(rows: Tensor, precision: float) -> Tensor:
     for _ in range(_ROUNDS):
         alpha = inverse_digamma(level + rows)
         total = alpha.sum(-1, keepdim=True)
-        step = (precision / total).log() * total / _trigamma(alpha).reciprocal().sum(-1, keepdim=True)
+        step = (precision / total).log() * total / torch.polygamma(1, alpha).reciprocal().sum(-1, keepdim=True)
         level = level + step
         if bool((step.abs() <= 1e-12 * level.abs().clamp(min=1)).all()):
             break
@@ -191,7 +187,7 @@ def _first_guess(rows: Tensor) -> Tensor:
         alpha = _guess(level)
         rates = torch.where(level >= _KNEE, alpha - 0.5, alpha.square())
         total = alpha.sum(-1, keepdim=True)
-        slope = precision * _trigamma(precision) * rates.sum(-1, keepdim=True) / total - 1
+        slope = precision * torch.polygamma(1, precision) * rates.sum(-1, keepdim=True) / total - 1
         step = (total.log() - log_precision) / slope.clamp(max=-1e-9)
         log_precision = log_precision - step.clamp(-_LONGEST, _LONGEST)
     return _guess(log_precision.exp().digamma() + rows)
@@ -207,9 +203,9 @@ def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Te
 
     For rows that are `capped` the solution is under the constraint Σ x = 0.
     """
-    rates = _trigamma(alpha).reciprocal()
+    rates = torch.polygamma(1, alpha).reciprocal()
     total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
-    outer = 1 / (1 / _trigamma(precision) - total)
+    outer = 1 / (1 / torch.polygamma(1, precision) - total)
     if capped is not None:
         outer = torch.where(capped[:, None], -1 / total, outer)
     direct = rates * change
@@ -269,7 +265,7 @@ def _fixed_point(rows: Tensor) -> Tensor:
         result[active] = alpha
         total = alpha.sum(-1)
         # Share of an error that is left after the round: d ln(Σ α) / d ln(A).
-        left = precision * _trigamma(precision) * _trigamma(alpha).reciprocal().sum(-1) / total
+        left = precision * torch.polygamma(1, precision) * torch.polygamma(1, alpha).reciprocal().sum(-1) / total
         step = (total / precision).log() / (1 - left).clamp(min=torch.finfo(rows.dtype).eps)
         going = step.abs() > _tolerance(total)
         precision = (precision * step.clamp(-_LONGEST, _LONGEST).exp())[going]
@@ -299,9 +295,9 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
     The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`. Scaling by `across` turns the diagonal into ones.
     `along` is the only direction in which the rank-one part then gives another value than 1.
     """
-    rates = _trigamma(start).reciprocal()
+    rates = torch.polygamma(1, start).reciprocal()
     total = rates.sum(-1, keepdim=True)
-    rest = (1 - _trigamma(start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)
+    rest = (1 - torch.polygamma(1, start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)
     across, along = rates.sqrt() / start, rates / start * (total * rest).rsqrt()
     offset = torch.zeros_like(rows, requires_grad=True)
     shift = torch.zeros_like(total, requires_grad=True)

@@ -79,9 +79,13 @@ class DirichletStatistics:
         cells = self._cells(index, len(scores)).to(self.count.device)
         count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
         self._check_room(count)
-        terms = _quantise(scores.to(self.count.device), self.epsilon)
+        raised = scores.to(self.count.device, torch.float64).clamp(min=self.epsilon).contiguous()
+        # The sum is computed over integers, too: the last bit of a sum of floats can depend on the layout of the batch.
+        total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)
+        shares = raised / (total.to(torch.float64) / 2.0**48)
+        terms = torch.stack([shares.log(), shares, shares.square()]) * 2.0**_FRACTION_BITS
         self.count = count
-        self.sums.view(3, -1, self.components).index_add_(1, cells, terms)
+        self.sums.view(3, -1, self.components).index_add_(1, cells, terms.round().to(torch.int64))
         return self
 
     def merge(self, other: "DirichletStatistics") -> Self:
@@ -219,16 +223,3 @@ class DirichletStatistics:
             raise InputError(
                 f"statistics: expected at most {room} samples in a cell, got {int(count.max())}; fit on fewer samples"
             )
-
-
-def _quantise(scores: Tensor, epsilon: float) -> Tensor:
-    """Round `ln s`, `s` and `s²` of scores `(M, K)` to integers `(3, M, K)` in units of 2^-32.
-
-    The sum that scales the scores is computed over integers, too: the last bit of a sum of floats can depend on the
-    layout of the batch.
-    """
-    raised = scores.to(torch.float64).clamp(min=epsilon).contiguous()
-    total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)
-    shares = raised / (total.to(torch.float64) / 2.0**48)
-    terms = torch.stack([shares.log(), shares, shares.square()])
-    return (terms * 2.0**_FRACTION_BITS).round().to(torch.int64)

@@ -18,7 +18,7 @@ from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
 from semfov.zoom.certainty import SPREAD, number_of, reacts
-from semfov.zoom.closer import SEEN
+from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import shown
@@ -179,8 +179,9 @@ class ZoomPath(Record):
         Returns:
             The sentence; empty if the reason is not known.
         """
-        target, decided = self.target, self.ending == "decision" and self.lattice.levels == 1 and not self.closer
-        if decided and target is not None and all(float(each.show[target - 1]) < SEEN for each in self.glances):
+        target, least = self.target, PhotographPlaces.least
+        decided = self.ending == "decision" and self.lattice.levels == 1 and not self.closer
+        if decided and target is not None and all(float(each.show[target - 1]) < least for each in self.glances):
             return self._sentences["unseen"]
         return super().why_it_ended()
 

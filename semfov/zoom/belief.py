@@ -43,11 +43,6 @@ class _Table(NamedTuple):
         """View of the rows of an array of the look that belong to these windows, `(down, across, ...)`."""
         return values[self.rows].reshape(*self.shape, *values.shape[1:])
 
-    def holding(self, changed: _Box) -> _Place:
-        """Windows that hold one of the changed cells of the gist."""
-        (x1, y1, x2, y2), reach = changed, self.span - 1
-        return slice(max(y1 - reach, 0), min(y2, self.shape[0])), slice(max(x1 - reach, 0), min(x2, self.shape[1]))
-
 
 class _Pooled(NamedTuple):
     """Pooled hints of windows of one level in a look; scores `(n, K)`, summary `(n, 3)`."""
@@ -93,8 +88,11 @@ class _Look:
 
     def pool(self, left: Cells) -> Iterator[_Pooled]:
         """Pool the hints that are left to see, in the windows where they have changed."""
-        before = self.left
-        self.left = self._left_of(left)
+        before, scale, (x1, y1, x2, y2), (rows, columns) = self.left, self.gist.scale, self.box, self.left.shape
+        part = left[y1:y2, x1:x2]
+        if part.shape != (y2 - y1, x2 - x1):
+            part = np.pad(part, ((0, y2 - y1 - part.shape[0]), (0, x2 - x1 - part.shape[1])), constant_values=1)
+        self.left = part.copy() if scale == 1 else part.reshape(rows, scale, columns, scale).mean((1, 3))
         if self.fresh:
             changed, self.fresh = (0, 0, before.shape[1], before.shape[0]), False
             differs = self.left != before
@@ -111,11 +109,15 @@ class _Look:
             np.multiply(self.scores[here], self.left[here][..., None], out=self.visible[here])
         if not self.tables:
             return
-        places = [table.holding(changed) for table in self.tables.values()]
+        x1, y1, x2, y2 = changed
+        places = [  # of the windows that hold one of the changed cells
+            (slice(max(y1 - span + 1, 0), min(y2, down)), slice(max(x1 - span + 1, 0), min(x2, across)))
+            for span, (down, across), *_ in self.tables.values()
+        ]
         # The largest windows, which come first, reach over the cells of all others.
         (below, beside), reach = places[0], next(iter(self.tables.values())).span - 1
-        part = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
-        pools = pool_spans(torch.from_numpy(self.visible[part]), [table.span for table in self.tables.values()])
+        cells = self.visible[below.start : below.stop + reach, beside.start : beside.stop + reach]
+        pools = pool_spans(torch.from_numpy(cells), [table.span for table in self.tables.values()])
         for (level, table), (down, across), maps in zip(self.tables.items(), places, pools, strict=True):
             at = tuple(
                 slice(here.start - start, here.stop - start)
@@ -124,15 +126,6 @@ class _Look:
             top, summary = (values[at].flatten(0, 1) for values in maps)
             facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
             yield _Pooled(level - self.gist.level, top, summary, facts, stale)
-
-    def _left_of(self, left: Cells) -> Cells:
-        """Share of each cell of the gist that is left to see, `(rows, columns)`."""
-        (x1, y1, x2, y2), scale = self.box, self.gist.scale
-        part = left[y1:y2, x1:x2]
-        if part.shape != (y2 - y1, x2 - x1):
-            part = np.pad(part, ((0, y2 - y1 - part.shape[0]), (0, x2 - x1 - part.shape[1])), constant_values=1)
-        rows, columns = self.left.shape
-        return part.copy() if scale == 1 else part.reshape(rows, scale, columns, scale).mean((1, 3))
 
 
 class _WindowOdds:

@@ -24,9 +24,6 @@ USUAL_WINDOW = 0.6, 2.0
 MOST_IN_PHOTOGRAPH = 3
 """Default for the largest number of closer looks in a photograph: more would go to the objects of a crowd."""
 
-SEEN = 0.002
-"""Score from which on a box of a photograph may hold the target."""
-
 _WHOLE = 0.9
 """Share of a photograph from which on a window shows no more than the look at the whole."""
 
@@ -148,7 +145,7 @@ class PhotographPlaces(CandidateBoxes):
     A place whose window is nearly the whole photograph is examined in the look at the whole, without a pass.
     """
 
-    least = SEEN
+    least = 0.002
     by_worth = True
 
     def __init__(

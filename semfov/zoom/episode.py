@@ -146,15 +146,13 @@ def look_for(
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class, look by look, until nothing is left to look at."""
     belief = ZoomBelief(glances.lattice, evidence, target, glances.blank)
-
-    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
-        choice = best_hit(belief, done)
-        return [] if choice is None else [choice]
-
-    def guess(looks: Sequence[Glance], done: set[Window], beside: Window | None) -> WindowChoice | None:
-        return best_hit(belief, done, beside=beside)
-
-    return look_by_look(glances, best, belief, forgetting=forgetting, guess=guess)
+    return look_by_look(
+        glances,
+        lambda _, done: jointly(partial(best_hit, belief), belief, done, 1),
+        belief,
+        forgetting=forgetting,
+        guess=lambda _, done, beside: best_hit(belief, done, beside=beside),
+    )
 
 
 def find_everything(
@@ -173,7 +171,11 @@ def find_everything(
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
-    def guess(looks: Sequence[Glance], done: set[Window], beside: Window | None) -> WindowChoice | None:
-        return best_find(belief, done, belief.foresight, beside=beside)
-
-    return look_by_look(glances, best, belief, hints=False, forgetting=forgetting, guess=guess)
+    return look_by_look(
+        glances,
+        best,
+        belief,
+        hints=False,
+        forgetting=forgetting,
+        guess=lambda _, done, beside: best_find(belief, done, belief.foresight, beside=beside),
+    )

@@ -13,13 +13,9 @@ from semfov.zoom.policy import WindowChoice
 
 def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
     """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
-    width, height = lattice.size
-
-    def starts(length: int) -> list[int]:
-        last = max(length - side, 0)
-        return sorted({*range(0, last, step), last})
-
-    boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in starts(height) for x in starts(width)]
+    (width, height), lasts = lattice.size, (max(length - side, 0) for length in lattice.size)
+    columns, rows = (sorted({*range(0, last, step), last}) for last in lasts)
+    boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in rows for x in columns]
     return [Window.around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
 
 

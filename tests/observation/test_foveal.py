@@ -13,7 +13,7 @@ import torch
 
 from semfov import DirichletStatistics, FovealObservationModel, InputError, dirichlet
 from semfov.io.compatibility import NETWORKS, check_same_detector
-from semfov.observation.fitting import _estimate_prior, _expected_table, fit_tables
+from semfov.observation.fitting import _estimate_prior, fit_tables
 from tests.refusals import refused
 
 CLASSES = ["cup", "cat", "dog"]
@@ -196,7 +196,7 @@ def test_levels_with_few_samples_copy_their_inner_neighbour_and_warn():
 
 def test_expected_scores_and_prior_are_those_of_the_data():
     statistics = draw(table(), torch.full((4, 3), 500))
-    got = _expected_table(statistics, {}, shrinkage=1e-6)
+    got = fit_tables(statistics, shrinkage=1e-6, minimum=0)[2]
     torch.testing.assert_close(got, statistics.mean, rtol=0, atol=1e-6)
     count = torch.tensor([[9000, 900], [1000, 100], [0, 0]])
     prior = _estimate_prior(count).exp()

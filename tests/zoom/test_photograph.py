@@ -11,7 +11,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import SEEN, PhotographPlaces, WindowLook, closer_window
+from semfov.zoom.closer import PhotographPlaces, WindowLook, closer_window
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.slices import ranked, raw, usual_slices
@@ -195,7 +195,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert nothing.decision.outcome == "absent"
     assert nothing.passes == 1
     assert "not something seen" in nothing.why_it_ended()
-    seen = torch.tensor([0.0, 0.0, SEEN + 1e-6])
+    seen = torch.tensor([0.0, 0.0, PhotographPlaces.least + 1e-6])
     shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.

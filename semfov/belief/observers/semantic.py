@@ -115,12 +115,15 @@ class Semantic(Observer):
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
         belief, look = dirichlet_belief(belief), own(look, SemanticLook, "look")
-        closest = torch.minimum(belief.closest, look.distance)
-        if self.memory == "all":
-            return DirichletBelief(self._fuse(belief.beta, look), closest)
-        fresh = self._fuse(torch.full_like(belief.beta, self.prior), look)
-        closer = look.distance < belief.closest
-        return DirichletBelief(torch.where(closer[..., None], fresh, belief.beta), closest)
+        before = belief.beta if self.memory == "all" else torch.full_like(belief.beta, self.prior)
+        fused = fuse_scaled(before, look.likelihood.to(before.dtype), look.footprint, self.fusion)
+        if self.misses is not None:
+            nothing = ~(look.footprint > 0).any(-2)
+            unseen = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
+            fused = torch.where(nothing[..., None], unseen, fused)
+        if self.memory == "closest":
+            fused = torch.where((look.distance < belief.closest)[..., None], fused, belief.beta)
+        return DirichletBelief(fused, torch.minimum(belief.closest, look.distance))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
         r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
@@ -131,14 +134,6 @@ class Semantic(Observer):
         if keep == 1:
             return belief
         return DirichletBelief(self.prior + keep * (belief.beta - self.prior), belief.closest + farther(keep))
-
-    def _fuse(self, beta: Tensor, look: SemanticLook) -> Tensor:
-        fused = fuse_scaled(beta, look.likelihood.to(beta.dtype), look.footprint, self.fusion)
-        if self.misses is None:
-            return fused
-        nothing = ~(look.footprint > 0).any(-2)
-        unseen = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(beta.dtype))
-        return torch.where(nothing[..., None], unseen, fused)
 
     def extra_repr(self) -> str:
         """Prior, fusion rule, footprint and tempering."""

@@ -10,7 +10,7 @@ from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 _TILE = 24
 
 
-def gaussian_kernel(sigma: float) -> Tensor:
+def _gaussian_kernel(sigma: float) -> Tensor:
     r"""Weights of a Gaussian kernel; → `(2r+1,)`.
 
     .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
@@ -53,7 +53,7 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
 @constant
 def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: torch.device) -> Lines:
     """Linear map that blurs lines of `count` pixels and keeps one pixel of every `step`; border pixels are repeated."""
-    kernel = gaussian_kernel(sigma)
+    kernel = _gaussian_kernel(sigma)
     length, reach = max(count // step, 1), len(kernel) // 2
     index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - reach
     taps = Taps(index.clamp(0, count - 1), kernel.expand(length, -1))

@@ -262,14 +262,13 @@ class FixationDensity(Pretrained):
                 raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
             check_shape(maps[name], f"features[{name!r}]", None, channels, None, None)
             shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
-            (top, bottom), (left, right) = map(_needed, _placed(features, shape), shape)
+            (_, top, bottom), (_, left, right) = _placed(features, shape)
             value = F.conv2d(maps[name][..., top:bottom, left:right].to(weight), weight[..., None, None])
             joined[shape] = joined[shape].add_(value) if shape in joined else value
         hidden: Tensor | None = None
         for shape, value in joined.items():
-            for axis, (start, end) in enumerate(_placed(features, shape)):
+            for axis, ((start, end), first, last) in enumerate(_placed(features, shape)):
                 if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
-                    first, last = _needed((start, end), shape[axis])
                     line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
                     line = line[:, first:last]
                     value = value @ line.mT if axis else line @ value
@@ -413,22 +412,18 @@ def cells_of(size: tuple[int, int]) -> tuple[int, int]:
 
 def _placed(
     features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """First and last edge of the picture on a feature map, in rows and in columns of the map."""
+) -> list[tuple[tuple[float, float], int, int]]:
+    """Edges of the picture on a map, and first and last of the pixels between them and one beyond; rows, columns."""
     if not isinstance(features, FeatureMaps):
-        return (0, shape[0]), (0, shape[1])
+        return [((0, length), 0, length) for length in shape]
     placement: Placement = features.placement
-    edges = []
+    placed = []
     for side, length in ((1, shape[0]), (0, shape[1])):
         pixels = features.canvas[side] / length
         start = placement.offset[side] / pixels
-        edges.append((start, start + placement.size[side] * placement.scale[side] / pixels))
-    return edges[0], edges[1]
-
-
-def _needed(edges: tuple[float, float], length: int) -> tuple[int, int]:
-    """First and last pixel, of a line of `length`, of those between two edges and one more at each end."""
-    return max(floor(edges[0] - 0.5), 0), min(ceil(edges[1] + 0.5), length)
+        end = start + placement.size[side] * placement.scale[side] / pixels
+        placed.append(((start, end), max(floor(start - 0.5), 0), min(ceil(end + 0.5), length)))
+    return placed
 
 
 @constant

@@ -56,17 +56,6 @@ def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
     return (kernels / kernels.abs().sum((-2, -1), keepdim=True)).to(device, dtype)[:, None]
 
 
-def _orientation_energy(intensity: Tensor) -> Tensor:
-    """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
-
-    Shapes: intensity `(B, 1, h, w)` → `(B, n, h, w)`.
-    """
-    kernels = _gabor_kernels(intensity.dtype, intensity.device)
-    reach = _TAPS // 2
-    answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels)
-    return answers.abs().unflatten(1, (-1, 2)).sum(2)
-
-
 def _promote(maps: Tensor) -> Tensor:
     r"""Map normalisation of Itti, Koch and Niebur (1998): promote maps with one strong peak, suppress those with many.
 
@@ -110,7 +99,12 @@ def _conspicuity(image: Tensor) -> Tensor:
     """
     levels = max(_CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
-    features = [torch.cat([level, _orientation_energy(level[:, :1])], 1) for level in pyramid[min(_CENTRES) :]]
+    features = []
+    for level in pyramid[min(_CENTRES) :]:
+        intensity = F.pad(level[:, :1], (_TAPS // 2,) * 4, mode="replicate")
+        answers = F.conv2d(intensity, _gabor_kernels(level.dtype, level.device))
+        # The energy of an orientation is |even| + |odd|.
+        features.append(torch.cat([level, answers.abs().unflatten(1, (-1, 2)).sum(2)], 1))
     total = torch.zeros((), dtype=image.dtype, device=image.device)
     for centre in _CENTRES:
         here = features[centre - min(_CENTRES)]

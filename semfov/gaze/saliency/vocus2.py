@@ -109,13 +109,16 @@ def vocus2_saliency(
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
-        maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
+        contrasts = ((twin.centre - twin.surround for twin in twins) for twins in pyramids)
         size = image.shape[-2], image.shape[-1]
         if fusion == "mean":
+            # One of on-off and off-on is 0, so their mean is half the difference. That over channels is taken as well.
+            maps = [torch.cat([each.abs_().mean(1, keepdim=True) / 2 for each in layer], 1) for layer in contrasts]
             # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
             enlarged = (enlarge(layer.mean(1), size) for layer in maps)
             saliency = sum(enlarged, next(enlarged)) / len(maps)
         else:
+            maps = [torch.cat([F.relu(part) for each in layer for part in (each, -each)], 1) for layer in contrasts]
             saliency = torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
@@ -189,15 +192,6 @@ class VOCUS2(nn.Module):
         sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
         settings = f"layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
         return f"{sigmas}, {settings}, color_space={self.color_space!r}"
-
-
-def _contrasts(twin: _Twin, fusion: _Fusion) -> Tensor:
-    """Contrasts to be fused `(B, N, h, w)`."""
-    if fusion == "mean":
-        # One of the two contrasts is 0, so their mean is half the difference. The mean over channels is taken as well.
-        return (twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2
-    difference = twin.centre - twin.surround
-    return torch.cat([F.relu(difference), F.relu(-difference)], 1)
 
 
 def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:
