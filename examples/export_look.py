@@ -23,13 +23,13 @@ from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_spans
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.hints import FINEST, Gist
+from semfov.zoom.hints import Gist
 
 _LOOK_METADATA_KEY = "semfov.look"
 
 
 def export_look(
-    eye: WindowEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = FINEST
+    eye: WindowEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = 32
 ) -> None:
     """Write a look of an eye as one ONNX model, which runs without torch and without semfov.
 
@@ -258,7 +258,7 @@ def main() -> None:
     parser.add_argument("output", type=Path, help="the ONNX file to write")
     parser.add_argument("--weights", help="file of the detector's weights, instead of a download")
     parser.add_argument("--evidence", help="fitted evidence by magnification: a name or a file")
-    parser.add_argument("--cells", type=int, default=FINEST, help="cells along a side of the window, for the evidence")
+    parser.add_argument("--cells", type=int, default=32, help="cells along a side of the window, for the evidence")
     options = parser.parse_args()
     try:
         detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import time
 from dataclasses import asdict, fields, replace
 from os import PathLike, fspath
@@ -28,7 +29,7 @@ from semfov.fit.tempering import TemperingFit
 from semfov.fit.verification import VerificationFit
 from semfov.fit.windows_part import WindowsFit
 from semfov.io.files import sha256, write_text
-from semfov.io.manifest import PARTS, Manifest, Part, place_of
+from semfov.io.manifest import PARTS, Manifest, Part
 from semfov.runs.config import WHERE, DataConfig, DetectorConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
@@ -300,6 +301,16 @@ def _seconds_of_looks(run: Looking) -> float:
     return (time.monotonic() - before) * len(grid) * len(left) / workers
 
 
+def _place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
+    """The path of a file, `relative` to a folder and `absolute`."""
+    absolute = Path(file).resolve()
+    try:
+        relative = os.path.relpath(absolute, Path(folder).resolve())
+    except ValueError:  # on another drive
+        relative = str(absolute)
+    return {"relative": Path(relative).as_posix(), "absolute": str(absolute)}
+
+
 def _manifest_of(folder: _FolderFit) -> Manifest:
     """Build the manifest of the model folder."""
     config, run = folder.inputs.config, folder.inputs.run
@@ -313,8 +324,8 @@ def _manifest_of(folder: _FolderFit) -> Manifest:
             "name": detector.name,
             "sha256": detector.digest,
             "model": None if is_file else config.detector.name,
-            "model_file": place_of(config.detector.name, config.out) if is_file else None,
-            "weights_file": None if weights is None else place_of(weights, config.out),
+            "model_file": _place_of(config.detector.name, config.out) if is_file else None,
+            "weights_file": None if weights is None else _place_of(weights, config.out),
             "options": options,
         },
         sensor=config.sensor.record(),

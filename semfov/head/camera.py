@@ -61,7 +61,7 @@ class PanTiltCamera(Protocol):
     ...
     ...     def look_at(self, direction, field):
     ...         return torch.rand(3, 30, 40)
-    >>> CameraScene(Still()).view(torch.tensor([30.0, 10.0, 60.0]))[0].shape
+    >>> open_scene(Still()).view(torch.tensor([30.0, 10.0, 60.0]))[0].shape
     torch.Size([3, 30, 40])
     """
 
@@ -85,7 +85,7 @@ class PanTiltCamera(Protocol):
         """
 
 
-class CameraScene(Sphere):
+class _CameraScene(Sphere):
     """The scene around a camera that turns.
 
     Pan and tilt have a motor each, which move at the same time. A camera that does not turn all the way round takes the
@@ -206,7 +206,7 @@ def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
         check(color == "rgb", "color", f"rgb for a {type(scene).__name__}, which was made with its own color", color)
         return scene
     if is_scene(scene):
-        return CameraScene(cast(PanTiltCamera, scene), color)
+        return _CameraScene(cast(PanTiltCamera, scene), color)
     opened = open_large(cast(LargePicture | ImageLike, scene), color=color)
     width, height = opened.size
     if width % 2 or abs(width - 2 * height) > 1:

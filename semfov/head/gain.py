@@ -11,7 +11,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers.base import own
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
-from semfov.head.speeds import STILL, Speeds
+from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 
 FORESIGHT = 0.5
@@ -193,5 +193,5 @@ class PerSecond(AcquisitionFunction):
             values = values / views.durations(self.action, self.speeds)
             here = views.poses[self.action // views.cells]
             turn = views.world.turn(here.expand_as(views.poses), views.poses)
-            allowed &= (turn <= STILL) | (turn >= self.speeds.dead_zone)
+            allowed &= (self.speeds.turn(turn) == 0) | (turn >= self.speeds.dead_zone)
         return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]

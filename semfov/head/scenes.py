@@ -18,7 +18,7 @@ from semfov.data.windowed import LargePicture
 from semfov.errors import InputError, check
 from semfov.head.speeds import Speeds
 from semfov.io.schema import is_number
-from semfov.sensor.perspective import even_rows, go_around, sample
+from semfov.sensor.perspective import go_around, sample
 from semfov.sensor.sphere import Boxes, Camera, Regions, panorama_directions, panorama_points
 
 _FIELDS = (60.0,)
@@ -217,7 +217,7 @@ class Panorama(Sphere):
                 )
         super().__init__(image, size, tilt=(-reach, reach), fields=fields, speeds=speeds, cell=cell)
         self.reach = reach
-        self._source = None if pixels is None else go_around(even_rows(pixels)[None])[0]
+        self._source = None if pixels is None else go_around(pixels)
         self._drawn = None if self._source is None else self._source[:, 1:-1, 1:-1]
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from semfov.errors import check_number
 
-STILL = 1e-3  # degrees; smaller angles are rounding errors of 0
+_STILL = 1e-3  # degrees; smaller angles are rounding errors of 0
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Speeds:
         Returns:
             `(...)`, seconds; 0 where the eye stays.
         """
-        return torch.where(angle > STILL, self.eye_start + self.eye * angle, 0.0)
+        return torch.where(angle > _STILL, self.eye_start + self.eye * angle, 0.0)
 
     def turn(self, angle: Tensor) -> Tensor:
         """Duration of turns of the head.
@@ -74,7 +74,7 @@ class Speeds:
         Returns:
             `(...)`, seconds; 0 where the head stays.
         """
-        angle = torch.where(angle > STILL, angle, 0.0)
+        angle = torch.where(angle > _STILL, angle, 0.0)
         fast = self.head**2 / self.acceleration
         short = 2 * (angle / self.acceleration).sqrt()
         return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
@@ -91,5 +91,5 @@ class Speeds:
             `(...)`, seconds.
         """
         slowest = torch.maximum(self.saccade(eye), self.turn(head))
-        moves = (head > STILL) | (octaves.abs() > STILL)
+        moves = (head > _STILL) | (octaves.abs() > _STILL)
         return self.look + torch.maximum(slowest, self.zoom * octaves.abs()) + self.settle * moves

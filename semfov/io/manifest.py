@@ -1,7 +1,6 @@
 """The record of a folder of fitted models: their detector and sensor, the parts, and which of the parts are used."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
@@ -124,16 +123,6 @@ class Manifest:
 
 
 _AGAIN = "run semfov fit again, or copy the folder again"
-
-
-def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
-    """The path of a file, `relative` to a folder and `absolute`."""
-    absolute = Path(file).resolve()
-    try:
-        relative = os.path.relpath(absolute, Path(folder).resolve())
-    except ValueError:  # on another drive
-        relative = str(absolute)
-    return {"relative": Path(relative).as_posix(), "absolute": str(absolute)}
 
 
 def _read(path: Path) -> dict[str, Any]:

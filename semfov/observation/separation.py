@@ -52,14 +52,14 @@ def visibility(model: FovealObservationModel) -> Tensor:
             "model: expected an observation model with miss rates (fit one with `train.fit_fom`), got one without"
         )
     alpha, background = model.alpha, model.alpha[:1]
-    target = _mixed(*log_ratio_moments(alpha, alpha, background), model.miss_rate)
-    nothing = _mixed(*log_ratio_moments(background, alpha, background), model.miss_rate[:1])
+    target = _mixed(*_log_ratio_moments(alpha, alpha, background), model.miss_rate)
+    nothing = _mixed(*_log_ratio_moments(background, alpha, background), model.miss_rate[:1])
     spread = ((target[1] + nothing[1]) / 2).sqrt()
     apart = target[0] - nothing[0]
     return torch.where(spread > 0, apart / spread.clamp(min=torch.finfo(spread.dtype).tiny), 0.0)
 
 
-def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha)."""
     check_shape(target, "target", alpha.shape[-1])
     check_shape(background, "background", alpha.shape[-1])

@@ -17,7 +17,6 @@ from semfov.data.windowed import LargePicture
 from semfov.detection.objects import Objects
 from semfov.detection.placement import resize
 from semfov.errors import InputError, check
-from semfov.head.camera import CameraScene
 from semfov.head.scenes import Flat, Panorama, Sphere, World
 from semfov.head.views import Views
 from semfov.io.schema import Array, Field, Number, Object, Text
@@ -298,7 +297,7 @@ class HeadPath(Record):
 
 def _settings(world: World) -> dict[str, Any]:
     """The geometry of a scene as JSON values."""
-    what = Sphere if isinstance(world, CameraScene) else type(world)
+    what = type(world) if world.still else Sphere  # that of a camera
     for kind, (made, names) in _WORLDS.items():
         if what is made:
             return {"kind": kind, **{name: getattr(world, name) for name in names}}

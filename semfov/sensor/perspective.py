@@ -20,7 +20,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
 
     Where a view shrinks the panorama, `antialias` takes the mean of k × k samples for each pixel; k is the number of
     panorama pixels that a pixel in the middle of the view covers along each axis, rounded up. Towards the poles a row
-    of the panorama oversamples the sphere, so `antialias` first smooths all rows to one resolution (`even_rows`).
+    of the panorama oversamples the sphere, so `antialias` first smooths all rows to one resolution (`go_around`).
 
     The result is differentiable in the panorama and in yaw, pitch and field of view.
 
@@ -48,7 +48,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     fits = pose.ndim in (2, 3) and pose.shape[0] == batch
     check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
     poses = as_positions(pose if pose.ndim == 3 else pose[:, None], panorama)
-    source = go_around(even_rows(panorama) if antialias else panorama)
+    source = go_around(panorama, even=antialias)
 
     result = stacked_views(
         lambda b, g: sample(source[b], poses[b, g], size, antialias=antialias),
@@ -59,15 +59,16 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     return result if pose.ndim == 3 else result[:, 0]
 
 
-def go_around(panorama: Tensor) -> Tensor:
-    """A panorama `(B, C, H, W)` with a border of one pixel that continues it beyond its sides and its poles."""
+def go_around(panorama: Tensor, *, even: bool = True) -> Tensor:
+    """A panorama `(..., H, W)`, smoothed (`_even_rows`), with a border that continues it beyond sides and poles."""
+    panorama = _even_rows(panorama) if even else panorama
     half = panorama.shape[-1] // 2
     above, below = panorama[..., :1, :].roll(half, -1), panorama[..., -1:, :].roll(half, -1)
     high = torch.cat([above, panorama, below], -2)
     return torch.cat([high[..., -1:], high, high[..., :1]], -1)
 
 
-def even_rows(panorama: Tensor) -> Tensor:
+def _even_rows(panorama: Tensor) -> Tensor:
     r"""Smooth every row of a panorama `(..., H, W)` to the resolution of the horizon.
 
     A pixel at latitude φ covers cos φ times the width of a pixel at the horizon. Each pixel becomes the mean of the row

@@ -14,7 +14,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.zoom.lattice import Lattice
 
-FINEST = 32
+_FINEST = 32
 """Largest number of cells along a side of a gist."""
 
 DETECTION_SCORE = 0.1
@@ -53,7 +53,7 @@ class Gist:
         """Compute the gist of a look at a window of the lattice; action `(level, column, row)`."""
         level, column, row = action
         span = lattice.span(level)
-        scale = max(1, span // FINEST)
+        scale = max(1, span // _FINEST)
         columns = -(-min(span, lattice.columns - column) // scale)
         rows = -(-min(span, lattice.rows - row) // scale)
         width, height = lattice.pitch

@@ -13,7 +13,6 @@ from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.policies import Policy
 from semfov.head import CameraFrame, PanTiltCamera, PerSecond, SearchGain, Speeds, open_scene
 from semfov.head.belief import SceneObserver
-from semfov.head.camera import CameraScene
 from semfov.head.gain import OUT
 from semfov.head.scenes import Sphere
 from semfov.head.views import Views
@@ -174,8 +173,8 @@ def test_motors_turn_together_and_between_their_limits(panorama):
         pan = (-170.0, 170.0)
 
     one, other = torch.tensor([-160.0, 10.0, 60.0]), torch.tensor([150.0, -20.0, 60.0])
-    assert float(CameraScene(Stopped(panorama)).turn(one, other)) == 310
-    assert float(CameraScene(Own(panorama)).turn(one, other)) == 50
+    assert float(open_scene(Stopped(panorama)).turn(one, other)) == 310
+    assert float(open_scene(Own(panorama)).turn(one, other)) == 50
 
 
 def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
@@ -203,7 +202,7 @@ def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
         for make in (Panorama, Flat):
             refused(r"fields: expected one or more angles .*, such as", make, panorama, fields=fields)
     refused("color: expected rgb for a Panorama", agent.explore, Panorama(panorama), color="bgr")
-    refused("tilt: expected limits", CameraScene, type("Upside", (Own,), {"tilt": (10.0, -10.0)})(panorama))
+    refused("tilt: expected limits", open_scene, type("Upside", (Own,), {"tilt": (10.0, -10.0)})(panorama))
 
 
 def test_a_picture_is_a_panorama_if_it_is_twice_as_wide_as_high(agent, panorama, tmp_path):
@@ -281,4 +280,4 @@ def test_limits_in_other_units_are_refused(limits, unit):
         def look_at(self, direction, field):
             return torch.rand(3, 30, 40)
 
-    refused(f"pan: expected .*limits in degrees.*{unit}", CameraScene, Narrow())
+    refused(f"pan: expected .*limits in degrees.*{unit}", open_scene, Narrow())

@@ -8,7 +8,7 @@ from torch.distributions import Dirichlet
 
 from semfov.errors import InputError
 from semfov.observation import FovealObservationModel, visibility
-from semfov.observation.separation import log_ratio_moments
+from semfov.observation.separation import _log_ratio_moments
 
 
 def make_model(dtype=torch.float64, missed=None, levels=3, seed=0):
@@ -29,7 +29,7 @@ def test_moments_of_the_log_ratio_equal_integrals_with_scipy():
 
     mean = expect(lambda s: p.logpdf(s) - q.logpdf(s))
     variance = expect(lambda s: (p.logpdf(s) - q.logpdf(s) - mean) ** 2)
-    got = log_ratio_moments(*(torch.tensor(each, dtype=torch.float64) for each in (source, target, background)))
+    got = _log_ratio_moments(*(torch.tensor(each, dtype=torch.float64) for each in (source, target, background)))
     assert [float(each) for each in got] == pytest.approx([mean, variance], rel=1e-6)
 
 
@@ -63,4 +63,4 @@ def test_a_model_without_miss_rates_is_refused():
     with pytest.raises(InputError, match="model: expected an observation model with miss rates"):
         visibility(FovealObservationModel.identity(["a"], [0.1]))
     with pytest.raises(InputError, match="target"):
-        log_ratio_moments(torch.ones(3), torch.ones(2), torch.ones(3))
+        _log_ratio_moments(torch.ones(3), torch.ones(2), torch.ones(3))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
 from semfov.errors import InputError
-from semfov.sensor.perspective import even_rows, perspective
+from semfov.sensor.perspective import _even_rows, perspective
 from semfov.sensor.sphere import Camera, panorama_directions
 
 
@@ -96,7 +96,7 @@ def test_shrinking_does_not_alias():
 def test_rows_are_averaged_as_by_a_brute_force():
     torch.manual_seed(1)
     panorama = torch.rand(2, 8, 16, dtype=torch.float64)
-    found = even_rows(panorama)
+    found = _even_rows(panorama)
     fine = 4000
     for row in range(8):
         width = min(1 / math.cos((row + 0.5 - 4) / 8 * math.pi), 16)
