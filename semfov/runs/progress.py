@@ -47,6 +47,10 @@ class WholeBar:
         yield
         self._move(before + sum(self.stages[name].values()))
 
+    def task(self, title: str, total: float) -> tqdm[Any]:
+        """A task with this title, which moves the bar."""
+        return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
+
     def _tick(self) -> None:
         """Draw the bar anew each second, so that its clock goes on while a task takes long."""
         while sys.stderr.isatty() and not self._closed.wait(1.0):
@@ -82,7 +86,7 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tq
     """A bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
     whole = _whole.get()
     if whole is not None:
-        return _Task(whole, whole._tasks.pop(title, 0.0) / max(total, 1))
+        return whole.task(title, total)
     return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
 
 
