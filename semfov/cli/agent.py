@@ -21,11 +21,10 @@ from semfov.sensor.named import SENSORS
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     """Names of the detector's classes, or None where they are known only after it is loaded."""
-    check_device(options.device)
+    given = detector_options(options).get("classes")
     if options.models is not None:
         return Manifest.read(options.models).classes
     classes, weights = check_detector(options.detector), options.weights
-    given = class_names(options)
     named = f"none for {options.detector}, which has its own; --target names the class to look for"
     check(given is None or classes is None, "classes", named, given and ", ".join(given))
     classes = classes or given
@@ -36,16 +35,25 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     return classes
 
 
-def class_names(options: AgentOptions | GazeOptions) -> tuple[str, ...] | None:
-    """The class names of `--classes`: words, or the lines of a text file."""
+def detector_options(options: AgentOptions | GazeOptions) -> dict[str, Any]:
+    """What the options give to `load_detector`: weights, a device that PyTorch has, and names or a file of them."""
+    try:
+        torch.empty(0, device=options.device).cpu()  # from `meta` nothing comes back
+    except (RuntimeError, AssertionError):
+        have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
+        expected = f"expected one that PyTorch has here ({', '.join(have)})"
+        raise InputError(f"device: {expected}, got {options.device!r}") from None
     names = options.classes
-    return class_lines(names[0]) if names is not None and len(names) == 1 and Path(names[0]).is_file() else names
+    if names is not None and len(names) == 1 and Path(names[0]).is_file():
+        names = class_lines(names[0])
+    given = {"weights": options.weights, "device": options.device, "classes": names}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def make_agent(options: AgentOptions) -> ActivePerception:
     """The agent that the options name, on the device that they name."""
     device = options.device
-    agent = _load_agent(options, {} if device is None else {"device": device})
+    agent = _load_agent(options, detector_options(options))
     if options.half:
         name = agent.eye.detector.settings()["name"]
         check(
@@ -55,20 +63,8 @@ def make_agent(options: AgentOptions) -> ActivePerception:
     return agent if device is None else agent.to(device)
 
 
-def check_device(name: str | None) -> str | None:
-    """The name of a device, which PyTorch must have."""
-    try:
-        torch.empty(0, device=name).cpu()  # from `meta` nothing comes back
-    except (RuntimeError, AssertionError):
-        have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
-        raise InputError(f"device: expected one that PyTorch has here ({', '.join(have)}), got {name!r}") from None
-    return name
-
-
 def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
-    """The agent that the options name, with further options of `load_detector`."""
-    given = {"weights": options.weights, "classes": class_names(options)}
-    loaded |= {name: value for name, value in given.items() if value is not None}
+    """The agent that the options name, with options of `load_detector`."""
     if options.models is not None:
         check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
         moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}

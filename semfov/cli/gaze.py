@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from semfov.agents.picture import OpenedPicture
-from semfov.cli.agent import check_device, class_names
+from semfov.cli.agent import detector_options
 from semfov.cli.options import GazeOptions
 from semfov.cli.results import tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
@@ -70,8 +70,7 @@ class _GazeJob:
         if options.report is not None:
             check_writable(page_path(options.report))
         check_detector(options.detector)
-        given = {"weights": options.weights, "device": check_device(options.device), "classes": class_names(options)}
-        loaded: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        loaded = detector_options(options)
         own = None if options.model is None else FixationDensity.from_pretrained(options.model)
         self.detector = load_detector(options.detector, **loaded)
         self.model = FixationDensity.for_detector(self.detector) if own is None else own

@@ -88,7 +88,17 @@ class _NetworkGraph(Graph):
     def layer(self, layer: Any, *sources: str) -> str:
         """Add a layer of a Darknet network."""
         if isinstance(layer, Convolution):
-            return self.activation(layer.activation, self._convolution(layer, sources[0]))
+            vertical, horizontal = (int(side) for side in layer.padding)
+            convolved = self.add(
+                "Conv",
+                sources[0],
+                self.constant(layer.weight),
+                self.constant(layer.bias),  # type: ignore[arg-type]
+                strides=list(layer.stride),
+                pads=[vertical, horizontal, vertical, horizontal],
+                group=layer.groups,
+            )
+            return self.activation(layer.activation, convolved)
         if isinstance(layer, MaxPool):
             before, after = layer.padding // 2, layer.padding - layer.padding // 2
             return self.add(
@@ -112,18 +122,6 @@ class _NetworkGraph(Graph):
         if isinstance(layer, Shortcut):
             return self.activation(layer.activation, self.add("Add", *sources))
         return sources[0]
-
-    def _convolution(self, layer: Convolution, source: str) -> str:
-        vertical, horizontal = (int(side) for side in layer.padding)
-        return self.add(
-            "Conv",
-            source,
-            self.constant(layer.weight),
-            self.constant(layer.bias),  # type: ignore[arg-type]
-            strides=list(layer.stride),
-            pads=[vertical, horizontal, vertical, horizontal],
-            group=layer.groups,
-        )
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
         """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
@@ -161,9 +159,17 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
         from onnx import TensorProto, helper
     except ImportError as error:
         raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
-    graph, names = _build(network)
-    for layer in layers:
-        graph.add("Identity", names[layer], output=f"layer_{layer}")
+    graph = _NetworkGraph()
+    names = {-1: "images"}
+    heads = []
+    for index, (layer, sources) in enumerate(zip(network.layers, network.sources, strict=True)):
+        names[index] = graph.layer(layer, *(names[source] for source in sources))
+        if isinstance(layer, Head):
+            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
+    for output, parts in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
+        graph.add("Concat", *parts, output=output, axis=1)
+    for number in layers:
+        graph.add("Identity", names[number], output=f"layer_{number}")
     batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
     boxes, classes = None if size else "boxes", network.heads[0].classes
     shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
@@ -182,20 +188,6 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR_VERSION,
     )
-
-
-def _build(network: Darknet) -> tuple[_NetworkGraph, dict[int, str]]:
-    """The whole graph, from `images` to `_OUTPUTS`, and the names of the outputs of all layers."""
-    graph = _NetworkGraph()
-    names = {-1: "images"}
-    heads = []
-    for index, layer in enumerate(network.layers):
-        names[index] = graph.layer(layer, *(names[source] for source in network.sources[index]))
-        if isinstance(layer, Head):
-            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
-    for name, outputs in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
-        graph.add("Concat", *outputs, output=name, axis=1)
-    return graph, names
 
 
 class _OnnxTwin:

@@ -19,6 +19,9 @@ _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 _BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
 """What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
 
+_DECIMAL = re.compile(r"[+-]*(?=.*\d)\d*,[\deE-]*")
+"""A number with a decimal comma."""
+
 _REMEDIES = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save it as CSV, or give pandas.read_excel(file)"),
     **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "unpack it, or give pandas.read_csv(file)"),
@@ -86,7 +89,7 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
             )
         values = [(value or "").strip() for value in line.values()]
         if separator != ",":
-            values = [value.replace(",", ".") if _is_decimal(value) else value for value in values]
+            values = [value.replace(",", ".") if _DECIMAL.fullmatch(value) else value for value in values]
         rows.append((place, dict(zip(header, values, strict=True))))
     return header, rows
 
@@ -95,9 +98,3 @@ def _check_different(where: str, header: Sequence[str]) -> None:
     again = sorted({name for name in header if header.count(name) > 1 and name})
     if again:
         raise DataError(f"{where}: expected columns of different names, got several named {', '.join(again)}")
-
-
-def _is_decimal(text: str) -> bool:
-    """Whether this is a number with a decimal comma."""
-    whole, comma, rest = text.lstrip("+-").partition(",")
-    return bool(comma) and (whole + rest.replace("e", "").replace("E", "").replace("-", "")).isdecimal()
