@@ -270,9 +270,6 @@ class _RasterPicture(LargePicture):
             grey = int(bytes_between(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]), self._tone)[0])
             self.nothing = grey, grey, grey
 
-    def pixels(self, box: _Box) -> NDArray[np.uint8]:
-        return self._window(box, 1)
-
     def _reduced(self, box: _Box, reduction: int) -> Tensor:
         """A window from the overviews of the file, or from a copy where it has none."""
         if not self._has_overviews:
@@ -280,9 +277,9 @@ class _RasterPicture(LargePicture):
         x1, y1, x2, y2 = box
         right, bottom = (min(-(-n // reduction) * reduction, m) for n, m in zip((x2, y2), self.size, strict=True))
         outwards = x1 // reduction * reduction, y1 // reduction * reduction, right, bottom
-        return torch.from_numpy(self._window(outwards, reduction)).permute(2, 0, 1)
+        return torch.from_numpy(self.pixels(outwards, reduction)).permute(2, 0, 1)
 
-    def _window(self, box: _Box, reduction: int) -> NDArray[np.uint8]:
+    def pixels(self, box: _Box, reduction: int = 1) -> NDArray[np.uint8]:
         pixels = bytes_between(self._values(box, reduction), self._tone)
         if self._masked:
             share = self._values(box, reduction, mask=True).astype(np.uint16)

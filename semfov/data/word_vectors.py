@@ -112,15 +112,14 @@ class WordVectors:
         Returns:
             Similarities `(M, N)`, NaN for names without a known word.
         """
-        first, second = (self._unit(group) for group in (names, others))
-        return first @ second.mT
-
-    def _unit(self, names: Sequence[str]) -> Tensor:
         size = len(next(iter(self.vectors.values())))
         unknown = torch.full((size,), torch.nan, dtype=torch.float64)
-        rows = [self.vector(name).double() if self.knows(name) else unknown for name in names]
-        stacked = torch.stack(rows) if rows else torch.empty(0, size, dtype=torch.float64)
-        return stacked / stacked.norm(dim=-1, keepdim=True)
+        units = []
+        for group in (names, others):
+            rows = [self.vector(name).double() if self.knows(name) else unknown for name in group]
+            stacked = torch.stack(rows) if rows else torch.empty(0, size, dtype=torch.float64)
+            units.append(stacked / stacked.norm(dim=-1, keepdim=True))
+        return units[0] @ units[1].mT
 
 
 def _words_of(name: str) -> list[str]:

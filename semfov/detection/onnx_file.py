@@ -48,19 +48,18 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """Settings in a model's metadata, by semfov or Ultralytics, overridden by those in `model.json` beside it."""
     beside = path.with_suffix(".json")
     inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
-    outside = _parse(_read(beside), str(beside)) if beside.exists() else {}
+    outside: dict[str, Any] = {}
+    if beside.exists():
+        check_regular(beside)
+        if beside.stat().st_size > _MOST_BYTES:
+            raise DataError(f"{beside}: expected at most {_MOST_BYTES:,} bytes, got {beside.stat().st_size:,}")
+        try:
+            text = read_text(beside)
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"cannot read {beside}: {error}") from error
+        outside = _parse(text, str(beside))
     preprocessing = {**inside.get("preprocessing", {}), **outside.get("preprocessing", {})}
     return {**_ultralytics(metadata), **inside, **outside, "preprocessing": preprocessing}
-
-
-def _read(path: Path) -> str:
-    check_regular(path)
-    if path.stat().st_size > _MOST_BYTES:
-        raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}")
-    try:
-        return read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read {path}: {error}") from error
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:

@@ -122,7 +122,7 @@ def test_reduced_copies_are_those_of_the_file(rasterio, private, address, place)
         else:
             picture = _RasterPicture(path)
             assert not picture._has_overviews
-            assert picture._window((0, 0, 64, 64), 2).max() == picture._window((0, 0, 64, 64), 2).min() == 7
+            assert picture.pixels((0, 0, 64, 64), 2).max() == picture.pixels((0, 0, 64, 64), 2).min() == 7
     assert not requests
 
 
