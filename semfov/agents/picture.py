@@ -14,7 +14,7 @@ from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import SemfovError, check, lookup
-from semfov.head.camera import PanTiltCamera, is_scene, open_scene
+from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import World
 from semfov.zoom.lattice import Lattice
 
@@ -36,7 +36,7 @@ class OpenedPicture:
         self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> None:
         self.source, self.color, self.white, self.bands = source, color, white, bands
-        self.scene = is_scene(source)
+        self.scene = hasattr(source, "look_at")  # a `Panorama`, a `Flat` or a camera that turns
         made = isinstance(source, World | LargePicture)
         check(not made or white is bands is None, "white", "None for a picture that is open", white)
 

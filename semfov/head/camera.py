@@ -175,15 +175,6 @@ SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike
 """Anything that a head can look around in: a `Panorama`, a `Flat`, a camera that turns, or a picture."""
 
 
-def is_scene(picture: object) -> bool:
-    """Whether this is a scene to look around in, and not a picture: `Panorama`, `Flat` or a camera that turns.
-
-    >>> is_scene(Flat(torch.rand(3, 48, 64))), is_scene(torch.rand(3, 48, 64)), is_scene("street.jpg")
-    (True, False, False)
-    """
-    return isinstance(picture, World) or hasattr(picture, "look_at")
-
-
 def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
     """Make the scene that a head looks around in.
 
@@ -205,9 +196,9 @@ def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
     if isinstance(scene, World):
         check(color == "rgb", "color", f"rgb for a {type(scene).__name__}, which was made with its own color", color)
         return scene
-    if is_scene(scene):
+    if hasattr(scene, "look_at"):
         return _CameraScene(cast(PanTiltCamera, scene), color)
-    opened = open_large(cast(LargePicture | ImageLike, scene), color=color)
+    opened = open_large(scene, color=color)
     width, height = opened.size
     if width % 2 or abs(width - 2 * height) > 1:
         return Flat(opened)

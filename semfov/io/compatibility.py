@@ -60,13 +60,18 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
     if mine and theirs:
         same = mine == theirs or NETWORKS.get(mine, mine) == NETWORKS.get(theirs, theirs)
     if not same:
-        got, remedy = _describe(detector), "fit a model for this detector, or use the one it was fitted for"
+        own, got = (
+            f"{each.get('name')!r}" + (f" (sha256 {each['digest'][:12]}…)" if each.get("digest") else "")
+            for each in (fitted, detector)
+        )
+        remedy = "fit a model for this detector, or use the one it was fitted for"
         if fitted.get("name") == detector.get("name"):
             known = NETWORKS.get(str(theirs))
             got = f"the file of {'another network' if known is None else repr(known)} under this name"
-            own = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
-            remedy = own if known is None else f"name the detector {known!r}, with this file as weights="
-        raise InputError(f"detector: the {what} was fitted for {_describe(fitted)}, got {got}; {remedy}")
+            remedy = f"name the detector {known!r}, with this file as weights="
+            if known is None:
+                remedy = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
+        raise InputError(f"detector: the {what} was fitted for {own}, got {got}; {remedy}")
     check_background(fitted, detector.get("background"), what)
     others = _others(fitted, detector, _ALIKE)
     if others:
@@ -108,8 +113,3 @@ def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], exempt: set[str]
         # As JSON, where lists and tuples look the same.
         if json.dumps(fitted.get(key), sort_keys=True) != json.dumps(used.get(key), sort_keys=True)
     ]
-
-
-def _describe(detector: Mapping[str, Any]) -> str:
-    digest = detector.get("digest")
-    return f"{detector.get('name')!r}" + (f" (sha256 {digest[:12]}…)" if digest else "")

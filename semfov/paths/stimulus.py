@@ -78,14 +78,6 @@ class Stimulus:
             ]
 
 
-def sensor_in_words(sensor: Mapping[str, Any]) -> str:
-    """Describe a sensor in words."""
-    if "sigma" not in sensor or "growth" not in sensor:
-        settings = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
-        return ", ".join([str(sensor.get("kind", "sensor")), *settings])
-    return f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
-
-
 def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     """Reduce a picture to the bytes that a record keeps for its drawings, `(3, h, w)`."""
     width, height = (picture.shape[-1], picture.shape[-2]) if isinstance(picture, Tensor) else picture.size

@@ -15,7 +15,6 @@ from torch import Tensor
 from semfov.detection.objects import FAINTEST
 from semfov.detection.placement import resize
 from semfov.paths import Scanpath
-from semfov.paths.stimulus import sensor_in_words
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import cell_entropy
@@ -111,12 +110,15 @@ def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
         assert look.cell is not None
         row, column = divmod(look.cell, scanpath.grid.columns)
         decision += f" Closer look at column {column}, row {row}: probability {look.place:.2f}."
-    sensor = None if settings is None else sensor_in_words(settings["sensor"])
-    return {
-        "detector": None if settings is None else settings["detector"]["name"],
-        "sensor": sensor,
-        "decision": decision,
-    }
+    if settings is None:
+        return {"detector": None, "sensor": None, "decision": decision}
+    sensor = settings["sensor"]
+    if "sigma" in sensor and "growth" in sensor:
+        words = f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
+    else:
+        numbers = (f"{name} {value:g}" for name, value in sensor.items() if isinstance(value, int | float))
+        words = ", ".join([str(sensor.get("kind", "sensor")), *numbers])
+    return {"detector": settings["detector"]["name"], "sensor": words, "decision": decision}
 
 
 def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:

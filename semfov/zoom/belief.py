@@ -173,7 +173,15 @@ class _WindowOdds:
             for look in self._looks:
                 if look in concerned:
                     self._judge(look)
-                self._write(look)
+                # The predictions of a look stand over those of coarser ones.
+                (x, y), scale = look.gist.first, look.gist.scale
+                for level, table in look.tables.items():
+                    values = table.of(look.odds)
+                    if scale > 1:
+                        # A gist of large cells has no windows that start inside a cell: they get the odds before.
+                        values = values.repeat(scale, 0).repeat(scale, 1)
+                    place = self._odds[level][y : y + values.shape[0], x : x + values.shape[1]]
+                    place[:] = values[: place.shape[0], : place.shape[1]]
         return self._odds
 
     def _read(self, looks: Sequence[_Look]) -> None:
@@ -202,17 +210,6 @@ class _WindowOdds:
             before = None if coarsest else torch.from_numpy(look.before[rows])
             look.odds[rows] = self._evidence.odds(torch.from_numpy(look.facts[rows]), before).numpy()
             look.stale[:] = False
-
-    def _write(self, look: _Look) -> None:
-        """Write the predictions of a look over those of coarser ones."""
-        (x, y), scale = look.gist.first, look.gist.scale
-        for level, table in look.tables.items():
-            odds = table.of(look.odds)
-            if scale > 1:
-                # A gist of large cells has no windows that start inside a cell: they get the odds of the one before.
-                odds = odds.repeat(scale, 0).repeat(scale, 1)
-            place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
-            place[:] = odds[: place.shape[0], : place.shape[1]]
 
 
 _SLIVER = 0.25

@@ -92,7 +92,7 @@ def merge_with_facts(
     """Merge the detections of several looks as `merge` does, and list the facts about each object.
 
     A cut box is the same object as one of another look from half of its area on, and the box of an object is the mean
-    over the looks that show it (`fused`), except in a stream.
+    over the looks that show it (`_fused`), except in a stream.
     """
     if not glances:
         return Objects.none(), torch.zeros(0, len(FACTS))
@@ -105,11 +105,11 @@ def merge_with_facts(
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
     finest = lattice.magnifications[-1]
     facts = _object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
-    own = boxes[index] if latest else fused(index, boxes, scores, labels, cut, sharpness)
+    own = boxes[index] if latest else _fused(index, boxes, scores, labels, cut, sharpness)
     return Objects(own, scores[index], labels[index], looks[index]), facts
 
 
-def fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Tensor, magnifications: Tensor) -> Tensor:
+def _fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Tensor, magnifications: Tensor) -> Tensor:
     r"""Mean box of each object over the looks that show it whole, as in weighted boxes fusion.
 
     The box j of its class counts if it overlaps that of the object by half, with its score s and the number of canvas

@@ -41,8 +41,11 @@ def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reductio
     height, width = saliency.shape[-2:]
     if reduction == "mean":
         return (_shares(height, rows, saliency) @ saliency @ _shares(width, columns, saliency).mT).flatten(1)
-    down = torch.stack([saliency[:, start:stop].amax(1) for start, stop in _covered(height, rows)], 1)
-    return torch.stack([down[..., start:stop].amax(-1) for start, stop in _covered(width, columns)], -1).flatten(1)
+    for pixels, cells in ((height, rows), (width, columns)):
+        # For each cell, the first and the end index of the pixels that overlap it.
+        ends = [(cell * pixels // cells, -(-(cell + 1) * pixels // cells)) for cell in range(cells)]
+        saliency = torch.stack([saliency[:, start:stop].amax(1) for start, stop in ends], -1)
+    return saliency.flatten(1)
 
 
 def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
@@ -52,8 +55,3 @@ def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
     cell = torch.arange(cells, device=like.device)[:, None] * pixels
     overlap = torch.minimum(pixel + cells, cell + pixels) - torch.maximum(pixel, cell)
     return overlap.clamp(min=0).to(like.dtype) / pixels
-
-
-def _covered(pixels: int, cells: int) -> list[tuple[int, int]]:
-    """For each cell, the first and the end index of the pixels that overlap it."""
-    return [(cell * pixels // cells, -(-(cell + 1) * pixels // cells)) for cell in range(cells)]
