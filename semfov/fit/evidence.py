@@ -337,15 +337,6 @@ _DecisionRates = tuple[float, float, float, float, int]
 """Shares of searches that find a present class, find an absent one, and decide nothing; mean looks; searches."""
 
 
-def _rates(searches: Sequence[tuple[bool, str, int]]) -> _DecisionRates:
-    shares = []
-    for outcome, which in (("found", [True]), ("found", [False]), ("undecided", [True, False])):
-        chosen = [each[1] == outcome for each in searches if each[0] in which]
-        shares.append(sum(chosen) / len(chosen) if chosen else math.nan)
-    hits, false_alarms, undecided = shares
-    return hits, false_alarms, undecided, sum(each[2] for each in searches) / max(len(searches), 1), len(searches)
-
-
 _Rule = Callable[..., Tensor]
 """Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
 
@@ -376,7 +367,21 @@ def _decisions(
                     steps = search_steps(looks, way, target, search.start, search.noise, ends)
                     outcome = OUTCOMES[int(ends(steps[-1]))]
                 results[name].append((there, outcome, len(steps)))
-    return {name: _rates(each) for name, each in results.items()}
+    rates: dict[str, _DecisionRates] = {}
+    for name, ended in results.items():
+        shares = []
+        for outcome, which in (("found", [True]), ("found", [False]), ("undecided", [True, False])):
+            chosen = [each == outcome for there, each, _ in ended if there in which]
+            shares.append(sum(chosen) / len(chosen) if chosen else math.nan)
+        hits, false_alarms, undecided = shares
+        rates[name] = (
+            hits,
+            false_alarms,
+            undecided,
+            sum(number for *_, number in ended) / max(len(ended), 1),
+            len(ended),
+        )
+    return rates
 
 
 class EvidenceFit(PartFit):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -78,8 +78,17 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     drawn = [picture for each in stepped for picture in (each["image"], *(look["view"] for look in each["fixations"]))]
     different = dict.fromkeys(picture for picture in drawn if picture is not None)
     numbers = {picture: number for number, picture in enumerate(different)}
+    read_by_script: list[Data] = []
+    for number, episode in enumerate(episodes):
+        if "looks" not in episode:
+            fixations = [{**each, "view": numbers.get(each["view"])} for each in episode["fixations"]]
+            read_by_script.append({**episode, "image": numbers.get(episode["image"]), "fixations": fixations})
+        else:
+            looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
+            own = {key: episode[key] for key in (*_ABOUT, "summary")}
+            read_by_script.append({**own, "article": f"large-{number}", "looks": looks})
     data = {
-        "episodes": [_scripted(episode, number, numbers) for number, episode in enumerate(episodes)],
+        "episodes": read_by_script,
         "pictures": list(numbers),
         "colours": {
             "time": colour_steps(TIME),
@@ -127,16 +136,6 @@ def filled(name: str, data: Data, contents: dict[str, str]) -> str:
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     template = text("head.html", f"{name}.html", "foot.html")
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
-
-
-def _scripted(episode: Data, number: int, pictures: Mapping[str, int]) -> Data:
-    """The data of an episode that the page's script reads, as JSON values; each picture is on the page once."""
-    if "looks" not in episode:
-        fixations = [{**each, "view": pictures.get(each["view"])} for each in episode["fixations"]]
-        return {**episode, "image": pictures.get(episode["image"]), "fixations": fixations}
-    looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
-    about = {key: episode[key] for key in (*_ABOUT, "summary")}
-    return {**about, "article": f"large-{number}", "looks": looks}
 
 
 _STEPS = 33  # of a colour map

@@ -173,10 +173,13 @@ def _signals(goes_on: str) -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         for each in _ENDINGS:
             signal.signal(each, _leave)
-        if _importing(frame):
-            # An exception from here would pass through the start of a native module, and some abort the process.
-            os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{goes_on}\n".encode())
-            _leave(number, frame)
+        below = frame
+        while below is not None and below.f_code is not run_command.__code__:
+            if below.f_code.co_filename.startswith("<frozen importlib"):
+                # An exception from here would pass through the start of a native module, and some abort the process.
+                os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{goes_on}\n".encode())
+                _leave(number, frame)
+            below = below.f_back
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated(number)
 
     signals = [number for number in _ENDINGS if signal.getsignal(number) != signal.SIG_IGN]
@@ -186,15 +189,6 @@ def _signals(goes_on: str) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported somewhere below `run_command` on the call stack."""
-    while frame is not None and frame.f_code is not run_command.__code__:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
 
 
 def _leave(number: int, _: object) -> None:
