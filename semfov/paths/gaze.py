@@ -169,8 +169,9 @@ class GazePrediction:
 
         Returns:
             For each place `x` and `y` in pixels of the picture, and `share`, the probability of a fixation within 5 %
-            of the longer side around it. Places are at least twice as far apart. Near fixations count more in their
-            choice, so that a place is where the density is high.
+            of the longer side around it, by which they are ordered. Places are at least twice as far apart. Near
+            fixations count more in their choice, so that a place is where the density is high. Fewer places are the
+            first of more.
 
         Raises:
             InputError: `count` is out of range.
@@ -186,12 +187,12 @@ class GazePrediction:
         value = (1 - distance).clamp(min=0).to(self.cells) @ self.cells.flatten()
         free = torch.ones(len(places), dtype=torch.bool)
         found: list[dict[str, float]] = []
-        while len(found) < count and bool(free.any()):
+        while bool(free.any()):  # all of them, since a later place can have a larger share
             best = int(torch.where(free, value, -1.0).argmax())
             at = places[best].tolist()
             found.append({"x": at[0] - 0.5, "y": at[1] - 0.5, "share": float(share[best])})
             free &= distance[best] > 2
-        return sorted(found, key=lambda place: -place["share"])
+        return sorted(found, key=lambda place: -place["share"])[:count]
 
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.

@@ -1,6 +1,7 @@
 """The record of where people look: density, terms, places and drawn scanpaths."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,11 +59,18 @@ def test_places_are_the_peaks_in_order(gaze):
     assert sum(shares) < 1
     near = (torch.arange(104) - first["x"]) ** 2 + (torch.arange(78)[:, None] - first["y"]) ** 2 <= 5.2**2
     assert first["share"] == pytest.approx(float(gaze.density[near].sum()), rel=0.1)
+    assert gaze.peaks(100)[:6] == gaze.peaks(6)
     refused("count", gaze.peaks, 0)
     # A place is on what is looked at, where a disc of equal weight may hold it anywhere.
     log = (0.001 * rand(39, 52) + bump(30, 20, width=0.4)).log()
     (sharp,) = GazePrediction(gaze.model, {"map": log[None]}, gaze.size, gaze.photograph, gaze.source).peaks(1)
     assert (sharp["x"], sharp["y"]) == (60.5, 40.5)
+    # More fixations are around a broad peak than around a high one, and the description names it.
+    log = (0.001 + 6 * bump(10, 8, width=0.3) + 0.5 * bump(40, 30, width=4.0)).log()
+    broad = replace(gaze, terms={"map": log[None]})
+    assert [round(each["x"]) for each in broad.peaks(2)] == [80, 20]
+    assert broad.peaks(1) == broad.peaks(2)[:1]
+    assert broad.describe().startswith(f"{broad.peaks(2)[0]['share']:.0%} of fixations")
 
 
 def test_scanpaths_last_as_long_as_people_view(gaze):
