@@ -242,7 +242,11 @@ class FoveaEpisode(Episode[Scanpath]):
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
         if self.forgetting is None:
             self._trace = Trace(grid, self.classes, self.target, self._beside, self.eye.detector.least)
-            self._kept = {"stimulus": Stimulus.of(self.eye, image), "photograph": reduced_copy(image[0])}
+            self._kept = {
+                "stimulus": Stimulus.of(self.eye, image),
+                "photograph": reduced_copy(image[0]),
+                "detector": self.eye.detector.name,
+            }
         return grid
 
     def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
@@ -414,6 +418,7 @@ class FoveaEpisode(Episode[Scanpath]):
             closer=() if closer is None else (replace(closer, fixation=0, number=0),),
             found=decision is not None and decision.outcome == "found",
             photograph=photograph,
+            detector=self.eye.detector.name,
         )
 
     @property

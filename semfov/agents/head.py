@@ -254,6 +254,7 @@ class _HeadEpisode(Episode[HeadPath]):
         first = views.ahead if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
         self.thresholds, self.duration, self.least = thresholds, duration, agent.eye.detector.least
+        self._detector = agent.eye.detector.name
         self._steps = look_around(
             views, live(agent.eye, views), observer, lambda action: PerSecond(gain, views.world.speeds, action), first,
             target=self.target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
@@ -312,6 +313,7 @@ class _HeadEpisode(Episode[HeadPath]):
             ending=self.ending,
             targets=self.targets,
             photograph=None if picture is None else reduced_copy(picture),
+            detector=self._detector,
         )
 
 

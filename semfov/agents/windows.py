@@ -492,6 +492,7 @@ class WindowEpisode(Episode[ZoomPath]):
             "unseen": unseen,
             "spread": SPREAD if self.certainty is None else self.certainty.spread,
             "least": self.least,
+            "detector": None if self.eye is None else self.eye.detector.name,
             "closer": tuple(replace(look, number=places[look.number]) for look in closer if look.number in places),
         }
 

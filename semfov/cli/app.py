@@ -131,7 +131,7 @@ class _Calls:
                     record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
                 else:
                     record = agent.explore(picture, passes=passes)
-                data = record.page_data(picture if record.how == "windows" else None, settings=agent.eye.settings())
+                data = record.page_data(picture if record.how == "windows" else None)
                 words, page = record.summary(), page_html(record.describe(), [data])
             # A frame that shares nothing with the page around it.
             source = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'

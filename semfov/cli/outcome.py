@@ -153,7 +153,6 @@ class PictureOutcome:
         source: PictureSource,
         options: PictureOptions,
         seconds: float,
-        settings: Mapping[str, Any],
         truth: Truth | None,
     ) -> PictureOutcome:
         """Make the text, the row, the part of a page and the figures of a record, as the options say."""
@@ -168,7 +167,7 @@ class PictureOutcome:
             name = Path(source.name).name
             # Others have no more pixels than the record keeps.
             shown = opened if record.how == "windows" else None
-            episode = record.page_data(shown, name=name, settings=settings, boxes=boxes)
+            episode = record.page_data(shown, name=name, boxes=boxes)
         figures = _draw_episode(record, boxes, drawings)
         files = {}
         if options.labels is not None:

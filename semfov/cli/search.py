@@ -119,8 +119,7 @@ class _PictureJob(ABC):
                 picture = source.opened(self.options.how)
                 record = self.look(picture, self._shared(picture, source), source)
                 seconds = time.perf_counter() - began
-                settings = self.agent.eye.settings()
-                return PictureOutcome.of(record, picture, source, self.options, seconds, settings, self.truth)
+                return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
         except SemfovError as error:
             return error
         except Exception as error:

@@ -58,6 +58,7 @@ class Record(Conversion):
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
         source: file of the picture; None if it does not come from a file.
         shown: the `white` and the `bands` that were shown of the file; None for neither.
+        detector: name of the detector; None if it is not known.
 
     Example::
 

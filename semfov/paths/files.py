@@ -60,11 +60,12 @@ _SHARED = {
     "least": CHANCE,
     "source": Maybe(Text()),
     "shown": Maybe(Object({"white": Json(), "bands": Json()})),
+    "detector": Maybe(Text()),
     "ending": Maybe(Text(get_args(Ending))),
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = "target", "found", "least", "source", "shown", "ending"
+_PLAIN = "target", "found", "least", "source", "shown", "detector", "ending"
 
 
 _OTHERS = {

@@ -40,6 +40,7 @@ class Outcome(ABC):
     photograph: Tensor | None = None
     source: str | None = None
     shown: Mapping[str, Any] | None = None
+    detector: str | None = None
 
     how: ClassVar[Literal["fovea", "windows", "head"]]
     """Kind of look: of a fovea, at windows, or of a head that turns."""

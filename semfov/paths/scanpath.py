@@ -269,8 +269,6 @@ class Scanpath(_CellRecord):
 
         image = self.image if picture is None else as_image(picture)
         views = None if self.stimulus is None else self.views()
-        if self.stimulus is not None:
-            options.pop("settings", None)
         return episode_data(self, image, views, name=name or self._picture_name, **options)
 
     def _repr_html_(self) -> str:

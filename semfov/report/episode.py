@@ -14,12 +14,15 @@ from torch import Tensor
 
 from semfov.detection.objects import FAINTEST
 from semfov.detection.placement import resize
-from semfov.paths import Scanpath
+from semfov.paths import Record, Scanpath
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import cell_entropy
 
 Data = dict[str, Any]
+
+_DRAWN = 500
+"""Largest number of objects that are drawn in the picture and listed."""
 
 _MOST, _SCORES = 10, 5  # detections of a look, and classes of each, that are told
 
@@ -78,6 +81,7 @@ def episode_data(
     ]
     return {
         "name": name,
+        **object_data(scanpath),
         **_about_data(scanpath, settings),
         "summary": scanpath.describe(),
         "outcome": {
@@ -85,7 +89,7 @@ def episode_data(
             "cell": None if found is None else found.cell,
             "box": None if found is None or found.box is None else [round(x, 1) for x in found.box.tolist()],
         },
-        "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
+        "presence": None if scanpath.presence is None else [rounded(p, 9) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
         "image": None if image is None else jpeg_uri(image, width * 3 // 2, quality),
@@ -95,6 +99,29 @@ def episode_data(
         "fixations": fixations,
         "maps": _map_data(scanpath, classes),
         "entropy": _quantised(cell_entropy(scanpath)),
+    }
+
+
+def object_data(record: Record) -> Data:
+    """Picture, detector, passes and objects of a record, not rounded, since the page rounds what it tells."""
+    (width, height), rows = record.size, record.object_rows()
+    told = "score", "look", "confirmed", "pan", "tilt"
+    return {
+        "pixels": f"{width} × {height} px",
+        "detector": record.detector,
+        "passes": str(record.passes),
+        "objects": [
+            {
+                "box": [row[side] for side in ("x1", "y1", "x2", "y2")],
+                "label": row["class"],
+                **{name: row[name] for name in told if name in row},
+            }
+            for row in rows[:_DRAWN]
+        ],
+        "count": len(rows),
+        "listed_by_score": record.listed_by_score.tolist()[:_DRAWN],
+        "confirmable": record.confirmable,
+        "turns": record.how == "head",
     }
 
 
@@ -111,7 +138,7 @@ def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
         row, column = divmod(look.cell, scanpath.grid.columns)
         decision += f" Closer look at column {column}, row {row}: probability {look.place:.2f}."
     if settings is None:
-        return {"detector": None, "sensor": None, "decision": decision}
+        return {"detector": scanpath.detector, "sensor": None, "decision": decision}
     sensor = settings["sensor"]
     if "sigma" in sensor and "growth" in sensor:
         words = f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
@@ -129,7 +156,7 @@ def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
         if float(vector[1:].max()) >= FAINTEST:
             best = vector.topk(min(_SCORES, len(vector)))
             pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
-            top = [[classes[index], rounded(score)] for score, index in pairs]
+            top = [[classes[index], rounded(score, 9)] for score, index in pairs]
             label = classes[int(vector[1:].argmax()) + 1]
             detections.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
     width, height = scanpath.grid.extent.tolist()
@@ -177,6 +204,6 @@ def _quantised(values: Tensor) -> Data:
     return {"max": rounded(greatest), "data": base64.b64encode(np.ascontiguousarray(steps.numpy()).tobytes()).decode()}
 
 
-def rounded(value: float) -> float | None:
-    """A number rounded to four digits; None if it is not finite."""
-    return float(f"{value:.4g}") if np.isfinite(value) else None
+def rounded(value: float, digits: int = 4) -> float | None:
+    """A number rounded to some digits, of which 9 keep a float32; None if it is not finite."""
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None

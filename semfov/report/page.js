@@ -46,6 +46,7 @@
     target.replaceChildren();
     if (picture !== null) {
       const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none", class: grey ? "grey" : "" };
+      if (id === "path") source.id = "episode-picture"; // of which the list of objects shows parts
       target.append(svg("image", source));
     }
     return target;
@@ -221,7 +222,7 @@
     if (episode?.maps) wantedClass = episode.maps[chosenClass].label;
     episode = report.episodes[number];
     find("episode-views").hidden = Boolean(episode.looks);
-    for (const article of document.querySelectorAll(".large")) article.hidden = article.id !== episode.article;
+    for (const article of document.querySelectorAll(".large, .of-episode")) article.hidden = article.id !== episode.article;
     if (episode.maps) {
       chosenClass = Math.max(0, episode.maps.findIndex((map) => map.label === wantedClass));
       find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));

@@ -82,7 +82,9 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     for number, episode in enumerate(episodes):
         if "looks" not in episode:
             fixations = [{**each, "view": numbers.get(each["view"])} for each in episode["fixations"]]
-            read_by_script.append({**episode, "image": numbers.get(episode["image"]), "fixations": fixations})
+            own = {key: value for key, value in episode.items() if key not in ("objects", "listed_by_score")}
+            own |= {"image": numbers.get(episode["image"]), "fixations": fixations, "article": f"objects-{number}"}
+            read_by_script.append(own)
         else:
             looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
             own = {key: episode[key] for key in (*_ABOUT, "summary")}
@@ -116,6 +118,13 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             _looks_html(episode, f"large-{number}", headed=number == 0)
             for number, episode in enumerate(episodes)
             if "looks" in episode
+        ),
+        "objects": "".join(
+            f'<section class="found-objects of-episode" id="objects-{number}" aria-labelledby="objects-{number}-title">'
+            f'<h3 id="objects-{number}-title">Objects in {escape(episode["name"])}</h3>'
+            f"{_objects(episode, 'episode')}</section>"
+            for number, episode in enumerate(episodes)
+            if "looks" not in episode
         ),
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
@@ -292,7 +301,8 @@ def _objects(data: Data, place: str) -> str:
     count = data["count"]
     if not count:
         return "<p>No objects were found.</p>"
-    heads = ["#", "", "class", "score", *(["pan, tilt"] if data["turns"] else []), "look"]
+    look, nearest = ("look", "sharpest look") if "looks" in data else ("fixation", "nearest fixation")
+    heads = ["#", "", "class", "score", *(["pan, tilt"] if data["turns"] else []), look]
     heads += [*(["confirmed"] if data["confirmable"] else []), "box"]
     rows = []
     for order, each in enumerate(data["objects"], 1):
@@ -310,7 +320,7 @@ def _objects(data: Data, place: str) -> str:
         f'<th scope="col"><button type="button" class="sort">{head}</button></th>' if head else "<td></td>"
         for head in heads
     )
-    label = "Objects with boxes x1,y1–x2,y2 in picture pixels and the sharpest look"
+    label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {nearest}"
     table = f"<thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody>"
     lower = ", ".join(str(order) for order, each in enumerate(data["listed_by_score"], 1) if each)
     why = f"<p>Less probable, listed by the score in the whole picture: {lower}.</p>" if lower else ""
@@ -323,10 +333,9 @@ def _objects(data: Data, place: str) -> str:
 def _crop(data: Data, each: Data, place: str) -> str:
     """What the box of an object shows, of the look that shows it most sharply; a part of a picture that is there."""
     x1, y1, x2, y2 = each["box"]
-    look = data["looks"][each["look"]]
-    source, (left, top) = f"{place}-look-{each['look']}-view", look["box"][:2]
-    if data["turns"]:  # views are no parts of the picture
-        source, left, top = f"{place}-picture", 0, 0
+    source, left, top = f"{place}-picture", 0, 0
+    if "looks" in data and not data["turns"]:  # other views are no parts of the picture
+        source, (left, top) = f"{place}-look-{each['look']}-view", data["looks"][each["look"]]["box"][:2]
     margin = 0.1 * max(x2 - x1, y2 - y1, 1)
     across, down = x2 - x1 + 2 * margin, y2 - y1 + 2 * margin
     view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {across:.1f} {down:.1f}"

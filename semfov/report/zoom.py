@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from itertools import pairwise
 from statistics import median
-from typing import Any
 
 from torch import Tensor
 
@@ -16,12 +14,9 @@ from semfov.data.windowed import LargePicture
 from semfov.errors import check
 from semfov.paths import Record, RecordedLook
 from semfov.paths.look import LookView, read_region
-from semfov.report.episode import Data, jpeg_uri, rounded, tagged
+from semfov.report.episode import Data, jpeg_uri, object_data, tagged
 from semfov.viz.drawing import photograph_of
 from semfov.zoom.hints import DETECTION_SCORE
-
-_DRAWN = 500
-"""Largest number of objects that are drawn in the picture and listed."""
 
 _MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
@@ -32,7 +27,6 @@ def zoom_data(
     picture: LargePicture | ImageLike | None,
     *,
     name: str,
-    settings: Mapping[str, Any] | None = None,
     boxes: Tensor | None = None,
     width: int = 1280,
     quality: int = 75,
@@ -44,15 +38,6 @@ def zoom_data(
     reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    objects = [
-        {
-            "box": [round(row[side], 1) for side in ("x1", "y1", "x2", "y2")],
-            "label": row["class"],
-            "score": rounded(row["score"]),
-            **{name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row},
-        }
-        for row in path.object_rows()
-    ]
     reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
     result = f"{path.objects_in_words()}."
     if path.decision is not None:
@@ -61,10 +46,7 @@ def zoom_data(
     image = read_region(source, (0, 0, wide, high), path.size, min(width, wide))
     return {
         "name": name,
-        "pixels": f"{wide} × {high} px",
-        "detector": None if settings is None else settings["detector"]["name"],
         "sensor": path.sensor_in_words(),
-        "passes": str(path.passes),
         "decision": f"{result} {reason}".rstrip(),
         "summary": path.describe(),
         "size": [wide, high],
@@ -72,24 +54,18 @@ def zoom_data(
         "values": f"The value of a look is {path.value_in_words}.",
         "truth": [] if boxes is None else boxes.tolist(),
         "image": jpeg_uri(image, width, quality),
-        "looks": [
-            _look(path, look, view, objects, quality) for look, view in zip(path, path.look_views(source), strict=True)
-        ],
-        "objects": objects[:_DRAWN],
-        "count": len(objects),
-        "listed_by_score": path.listed_by_score.tolist()[:_DRAWN],
-        "confirmable": path.confirmable,
-        "turns": path.how == "head",
+        "looks": [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)],
+        **object_data(path),
     }
 
 
-def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data], quality: int) -> Data:
+def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     (x, y), number, (x1, _, x2, _) = look.fixation, look.number, look.region
     whole = path.is_whole(look.region)
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
     detections = _detections(path, look, view)
-    brought = Counter(each["label"] for each in objects if each["look"] == number)
+    brought = Counter(path.classes[label] for label in path.objects.labels[path.objects.passes == number].tolist())
     closer = next((each for each in path.closer if each.number == number), None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     turned, warm, ends = None, False, [each.seconds for each in path]
@@ -115,9 +91,9 @@ def _look(path: Record, look: RecordedLook, view: LookView, objects: list[Data],
         "whole": whole,
         "turned": turned,
         "warm": warm,
-        "magnification": rounded(magnification),
-        "value": None if look.value is None else rounded(look.value),
-        "seconds": None if look.seconds is None else rounded(look.seconds),
+        "magnification": magnification,
+        "value": look.value,
+        "seconds": look.seconds,
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
@@ -143,8 +119,7 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
             label, score = path.target, float(vector[path.target])
         if score >= DETECTION_SCORE:
             first = label == path.target
-            corners = {"box": [round(n, 1) for n in box], "place": [round(n, 1) for n in place]}
-            rows.append((first, score, {**corners, "label": path.classes[label], "score": rounded(score)}))
+            rows.append((first, score, {"box": box, "place": place, "label": path.classes[label], "score": score}))
     rows.sort(key=lambda row: row[:2], reverse=True)
     entries = [detection for _, _, detection in rows]
     # Names would cover small objects. The table has them.

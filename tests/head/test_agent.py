@@ -54,6 +54,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     explored = agent.explore(world, passes=3)
     assert explored.target is None
     assert len(explored) == 3
+    assert explored.detector == agent.eye.detector.name
     limited = agent.explore(world, duration=1.0)
     assert limited.seconds[-1] <= 1.0
 

@@ -113,6 +113,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         values=(float("inf"), 0.5, 0.25),
         candidates=objects,
         decision=decision,
+        detector=hostile,
     )
 
 
@@ -126,6 +127,5 @@ def large_picture() -> torch.Tensor:
 @pytest.fixture(scope="session")
 def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path_factory) -> Path:
     """The page of a large picture whose names are `hostile`."""
-    settings = {"detector": {"name": hostile}}
-    data = zoom_data(zoom_path, large_picture, name=hostile, settings=settings)
+    data = zoom_data(zoom_path, large_picture, name=hostile)
     return write_page(tmp_path_factory.mktemp("large") / "large.html", hostile, [data])

@@ -297,7 +297,7 @@ def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromi
 
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
     large = zoom_data(zoom_path, large_picture, name="large.jpg")
-    small = episode_data(scanpath, image, [image] * 3, name="small.jpg")
+    small = episode_data(replace(scanpath, least=0.1), image, [image] * 3, name="small.jpg")
     both = write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}])
     with watched(chromium, both) as page:
         for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
@@ -305,9 +305,16 @@ def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, ima
             assert page.locator(".large:visible > h3:first-child").all_inner_texts() == visible
             assert page.locator("#episode-views").is_visible() == (not visible)
             assert page.locator("#word").inner_text() == ("Look" if visible else "Fixation")
-            assert page.locator("#about dd").nth(1).is_visible() == bool(visible)
+            assert page.locator("#about dd").nth(2).is_visible() == bool(visible)
+            assert page.locator(".of-episode").is_visible() == (not visible)
             page.locator("#forward").click()
             assert page.locator("#number").inner_text() == "1 of 2"
+            if not visible:  # an object of fixations is shown by a part of the picture, and goes to its fixation
+                row = page.locator("tr[data-object]:visible").first
+                assert row.locator(".crop").evaluate("crop => crop.firstElementChild.getBBox().width") > 0
+                row.click()
+                assert page.locator("#number").inner_text() == f"{row.get_attribute('data-look')} of 2"
+                assert page.locator("tr.picked:visible").count() == 1
 
 
 def test_without_javascript_all_looks_are_shown(chromium, zoom_page):

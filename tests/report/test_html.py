@@ -11,10 +11,12 @@ import torch
 from PIL import Image
 
 from eval.comparison.curves_html import curves_html
+from semfov import Detections
 from semfov.decision import Decision
 from semfov.report import page_html, write_page
 from semfov.report.episode import episode_data
 from semfov.report.page import table_html
+from tests import small
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -158,6 +160,35 @@ def test_the_head_shows_photograph_settings_and_outcome(scanpath, image, hostile
     assert page.index("found after") < page.index("<main>")
 
 
+def test_a_page_of_fixations_lists_the_objects_that_its_outcome_counts(scanpath, image):
+    """Passes and size stand beside them, and numbers are those of the record, rounded once."""
+    boxes = torch.tensor([[[10.0, 10, 21.46, 30], [40.0, 20, 60, 50]]])
+    scores = torch.tensor([[[0.1, 0.1, 0.1, 0.63499], [0.1, 0.5, 0.2, 0.2]]])
+    looks = (Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool)), *scanpath.detections[1:])
+    explored = replace(scanpath, target=None, posterior=None, detections=looks, least=0.5, detector="net")
+    data = episode_data(explored, image, [image] * 3, name="kitchen")
+    page = page_html("kitchen", [data])
+    rows = re.findall(r'<tr data-object="(\d)" data-look="(\d)">(.*?)</tr>', page)
+    told = [re.findall(r'<td class="number">(.*?)</td>', cells) for *_, cells in rows]
+    assert len(rows) == len(explored.objects) > 1
+    assert told[0] == ["cup", "0.63", "0", "10,10–21,30"]
+    assert f"{len(rows)} objects from score 0.5" in data["decision"]
+    elements = Elements(page)
+    assert {"80 × 60 px", "net"} <= set(elements.texts)
+    assert len(elements.of("crop")) == len(rows)
+    assert data_of(page)["episodes"][0]["article"] in {attributes.get("id") for _, attributes in elements.found}
+
+
+@pytest.mark.parametrize("how", ["fovea", "windows"])
+def test_a_page_names_the_detector_and_so_does_a_page_of_a_file(how, tmp_path):
+    agent = small.agent(small.Fixed(("cup", "bowl")), grid=(4, 3), sigma=10.0, reference=64.0)
+    record = agent.explore(np.zeros((64, 128, 3), np.uint8), how=how, passes=2)
+    record.save(tmp_path / "record.safetensors")
+    for each in (record, type(record).load(tmp_path / "record.safetensors")):
+        page = each.report(tmp_path / "page.html").read_text(encoding="utf-8")
+        assert f'<div><dt>Detector</dt><dd data-about="detector">{agent.eye.detector.name}</dd></div>' in page
+
+
 def test_the_page_contains_the_outcome(scanpath, image):
     """The decision, why the episode ended, and the probability of presence after each look."""
     decision = Decision("found", 0.97, 6, torch.tensor([1.0, 2.0, 30.25, 40.0]))
@@ -165,7 +196,7 @@ def test_the_page_contains_the_outcome(scanpath, image):
     searched = replace(scanpath, decision=decision, ending="decision", presence=presence)
     data = episode_data(searched, image, [image] * 3, name="sought")
     assert data["outcome"] == {"why": searched.why_it_ended(), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
-    assert data["presence"] == [0.25, 0.5, 0.97]
+    assert data["presence"] == pytest.approx([0.25, 0.5, 0.97])
     assert data["outcome"]["why"] != replace(searched, decision=Decision("absent", 0.1)).why_it_ended() != ""
     for ending in ("box", "worth", "shifts", "cells"):
         ended = replace(scanpath, ending=ending)
