@@ -297,7 +297,8 @@ def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromi
 
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
     large = zoom_data(zoom_path, large_picture, name="large.jpg")
-    small = episode_data(replace(scanpath, least=0.1), image, [image] * 3, name="small.jpg")
+    explored = replace(scanpath, target=None, posterior=None, least=0.1)
+    small = episode_data(explored, image, [image] * 3, name="small.jpg")
     both = write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}])
     with watched(chromium, both) as page:
         for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
