@@ -20,6 +20,8 @@ _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
 
 _SAME = 0.5
+_ALIKE = 0.6
+"""Overlap from which on a more probable box stands for one that a look at the whole shows."""
 
 _LEAST, _MOST = 0.01, 0.999
 _SMALLEST = 6.0
@@ -158,13 +160,16 @@ def probable_objects(
 
 
 def shown(objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float) -> Tensor:
-    """Which objects some looks show with a score: the one that a box of its class overlaps most, by half; → `(M,)`."""
+    """Which objects some looks show with a score: one for each box, of its class, that overlaps it by half; → `(M,)`.
+
+    It is the most probable one of those that overlap the box by `_ALIKE`, or else the one that overlaps it most.
+    """
     counts = torch.zeros(len(objects), dtype=torch.bool)
     if len(objects) and glances:
         boxes, scores, labels, *_ = _detected(glances, target)
         sure = scores >= score
         overlap = box_iou(objects.boxes, boxes[sure].to(objects.boxes)) * (objects.labels[:, None] == labels[sure])
-        best, place = overlap.max(0)
+        best, place = torch.where(overlap >= _ALIKE, 1 + objects.scores[:, None], overlap).max(0)
         counts[place[best >= _SAME]] = True
     return counts
 
