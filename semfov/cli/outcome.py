@@ -54,13 +54,7 @@ def _decision_text(record: Record, decision: Decision) -> str:
     if decision.outcome == "absent":
         return f"{name} is not there, {probability}"
     if decision.outcome == "undecided":
-        seen = record.candidates.of([record.target or 0])
-        measured = [(look.place, look.box) for look in record.closer] or list(zip(seen.scores, seen.boxes, strict=True))
-        if not measured:
-            return f"{name} undecided, {probability}"
-        best, at = max(measured, key=lambda each: float(each[0]))
-        of = "probability" if record.closer else record.measure
-        return f"{name} undecided, {probability}; best place: box {box_text(at.tolist())}, {of} {best:.2f}"
+        return "; ".join(filter(None, (f"{name} undecided, {probability}", record.best_place_in_words())))
     point, box = record.found_at, decision.box
     edges = f", box {box_text(box.tolist())}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
@@ -115,8 +109,11 @@ def _looks_text(record: Record) -> str:
     if any(look.value is not None for look in record):
         lines.append(f"  value: {record.value_in_words}")
     for number, close_up in enumerate(record.closer, 1):
-        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere"
+        taken = record.decision is not None and close_up.presence == record.decision.probability
+        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere{', which the decision takes' * taken}"
         lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
+    if record.closer:
+        lines.append("  anywhere: the probability that the picture holds it, by that closer look alone")
     return "\n".join(lines)
 
 

@@ -109,9 +109,8 @@ class Conversion(Outcome):
             values |= {"outcome": decision.outcome, "probability": decision.probability}
             edges = (*(self.found_at or (None, None)), *box)
             values |= dict(zip(("x", "y", "x1", "y1", "x2", "y2"), edges, strict=True))
-        error = dict.fromkeys(self.expected, math.nan) if self.unseen is None else self.expected_error
         values["least"] = self.least
-        for key, numbers in (("expected", self.expected), ("expected_error", error)):
+        for key, numbers in (("expected", self.expected), ("expected_error", self.expected_error)):
             values[key] = {name: None if math.isnan(number) else number for name, number in numbers.items()}
         values["passes"] = self.passes
         return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}

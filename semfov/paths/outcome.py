@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST, Objects
+from semfov.detection.objects import LEAST, Objects, box_text
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
@@ -190,30 +191,29 @@ class Outcome(ABC):
 
     @property
     def expected(self) -> dict[str, float]:
-        """Expected number of objects by the name of their class; without a model of it, the number of `objects`.
+        """Expected number of objects by the name of their class; NaN, and null in files, where it is not known.
 
-        With a model it is the sum of the probabilities of all candidates, and of what further looks are expected to
-        show, of which each class has its share of that sum. It is NaN for a class to which the detector hardly reacts
-        (`semfov.paths.ZoomPath.reacts`), and null in files.
+        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
+        each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
+        or a head, nor of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`).
         """
         return {name: mean for name, (mean, _) in self._claimed().items()}
 
     @property
     def expected_error(self) -> dict[str, float]:
-        r"""Standard deviation of the expected number of objects by the name of their class; 0 without a model of it.
+        r"""Standard deviation of the expected number of objects by the name of their class; NaN where it is not known.
 
-        With a model of the picture the candidates are independent (a Poisson-binomial distribution), and what no look
-        has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a
-        share :math:`\tau` (`spread`) of the expected number E:
+        The candidates are independent (a Poisson-binomial distribution), and what no look has shown has the
+        distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a share
+        :math:`\tau` (`spread`) of the expected number E:
 
         .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
         return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
-        """Mean and variance of the number of objects of each class."""
-        counts = Counter(self.objects.labels.tolist())
-        return {self.classes[label]: (float(counts[label]), 0.0) for label in self._sought or counts}
+        """Mean and variance of the number of objects of each class; NaN for those without one."""
+        return {self.classes[label]: (nan, nan) for label in self._sought or Counter(self.objects.labels.tolist())}
 
     @property
     def _sought(self) -> tuple[int, ...]:
@@ -295,9 +295,25 @@ class Outcome(ABC):
             return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
         return sentences.get(self.ending or "", "")
 
+    def best_place_in_words(self) -> str:
+        """Name the place where the target of an undecided search is most likely, by closer looks or by the detections.
+
+        Returns:
+            A phrase such as `best place: box 10,10–30,30, probability 0.09`; empty otherwise, and without such a place.
+        """
+        if self.decision is None or self.decision.outcome != "undecided":
+            return ""
+        seen, of = self.candidates.of(self._sought), "probability" if self.closer else self.measure
+        places = [(look.place, look.box) for look in self.closer] or list(zip(seen.scores, seen.boxes, strict=True))
+        if not places:
+            return ""
+        best, box = max(places, key=lambda place: float(place[0]))
+        return f"best place: box {box_text(box.tolist())}, {of} {best:.2f}"
+
     def summary(self) -> str:
-        """Describe the outcome, and explain why the search or the exploration ended."""
-        return f"{self.describe()}. {self.why_it_ended()}".rstrip()
+        """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""
+        place = self.best_place_in_words().capitalize()
+        return " ".join(filter(None, (f"{self.describe()}.", self.why_it_ended(), place and f"{place}.")))
 
 
 def _confirm(

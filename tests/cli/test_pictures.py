@@ -355,8 +355,7 @@ def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_pat
     counts = table.groupby(["picture", "class"]).object.count().unstack()
     assert counts["red"].tolist() == [1, 1, 1, 0]
     assert counts["wine glass"].tolist() == [0, 0, 0, 0]
-    assert table.set_index(["picture", "class"]).expected.sum() == 3
-    assert table.expected_error.isna().all()  # a score tells no error
+    assert table[["expected", "expected_error"]].isna().all(axis=None)  # a score tells no number in all
     assert run("find", folder / "d.png", "--out", tmp_path / "none.csv")[0] == 0
     none = pd.read_csv(tmp_path / "none.csv")
     assert (none.columns.tolist(), len(none)) == (table.columns.tolist(), 1)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from semfov import Detections, Flat, Grid, Objects, Panorama
+from semfov.cli.outcome import _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
@@ -71,6 +72,24 @@ def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed():
     assert "(confirmed)" not in repr(unsure)
 
 
+def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has():
+    """That of the most probable place, or without closer looks the best score; other searches name none."""
+    looks = look((LEFT, 1, 0.2), (RIGHT, 2, 0.25)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.12))
+    path = scanpath(*looks, target=1, decision=Decision("undecided", 0.7), least=0.5)
+    assert path.best_place_in_words() == "best place: box 10,10–30,30, score 0.20"
+    places = ((LEFT, 0.1, 0.9), (RIGHT, 0.3, 0.7))
+    closer = tuple(CloseUp(0, 1, 0, torch.tensor(box), place, presence) for box, place, presence in places)
+    path = replace(path, closer=closer)
+    assert path.best_place_in_words() == "best place: box 50,40–70,55, probability 0.30"
+    assert "Best place: box 50,40–70,55, probability 0.30." in repr(path)
+    assert path.to_dict()["summary"].endswith(" Best place: box 50,40–70,55, probability 0.30.")
+    told = _looks_text(path).splitlines()
+    assert [line.endswith(", which the decision takes") for line in told if "closer look " in line][:2] == [False, True]
+    for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
+        assert replace(path, decision=other).best_place_in_words() == ""
+    assert replace(path, closer=(), detections=(look(), look())).best_place_in_words() == ""
+
+
 def test_the_text_form_tells_where_the_objects_are():
     path = scanpath(look((LEFT, 1, 0.8)), look((RIGHT, 1, 0.1)), target=None)
     assert "cup 0.80 at (20, 20)" in repr(path)
@@ -94,9 +113,11 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
     path = scanpath(look((LEFT, 1, 0.4), (RIGHT, 2, 0.9)), look((shifted(LEFT, 40), 2, 0.06)), target=None)
     assert len(path.candidates) == 3
     assert path.objects.labels.tolist() == [2, 1]
-    assert path.expected == {"cat": 1.0, "cup": 1.0}
+    assert set(path.expected) == {"cat", "cup"}
+    assert all(isnan(each) for each in (*path.expected.values(), *path.expected_error.values()))
+    assert path.to_dict()["expected"] == path.to_dict()["expected_error"] == {"cat": None, "cup": None}
     assert replace(path, least=0.5).describe().endswith(": 1 object from score 0.5")
-    assert replace(path, target=1).expected == {"cup": 1.0}
+    assert list(replace(path, target=1).expected) == ["cup"]
     assert replace(path, targets=(1, 2)).objects_in_words() == "1 × cup, 1 × cat from score 0.3"
     rows = path.object_rows()
     json.dumps(rows)
@@ -180,21 +201,26 @@ def test_a_number_is_claimed_class_by_class():
 
 
 def test_objects_that_a_look_at_the_whole_picture_shows_count_too():
-    """From the same number on: the candidate of its class that the box overlaps most, by half. In a search none."""
+    """From the same number on: the most probable candidate of its class that is alike. In a search none."""
     lattice = Lattice.over((80, 60), (80, 60))
     seen = look((LEFT, 1, 0.6), (RIGHT, 2, 0.7), (shifted(RIGHT, 12), 2, 0.9))
     glances = tuple(
         Glance(window, seen, torch.zeros(3).bool(), torch.zeros(2), None)
         for window in (Window.overview(lattice), Window.around(lattice, (0.0, 0.0, 60.0, 60.0)))
     )
-    boxes = torch.tensor([shifted(LEFT, 3), shifted(LEFT, -1), RIGHT, RIGHT])
-    labels, looks = torch.tensor([1, 1, 1, 2]), torch.zeros(4).long()
-    candidates = Objects(boxes, torch.tensor([0.45, 0.4, 0.3, 0.2]), labels, looks)
+    # With the box of the whole picture the first one shares 0.57 of their union, the second one 0.9.
+    boxes = torch.tensor([shifted(LEFT, 3), shifted(LEFT, -1), RIGHT, RIGHT, LEFT])
+    labels, looks = torch.tensor([1, 1, 1, 2, 1]), torch.zeros(5).long()
+    candidates = Objects(boxes, torch.tensor([0.45, 0.4, 0.3, 0.2, 0.1]), labels, looks)
     parts = {"classes": CLASSES, "values": (0.0,), "unseen": (0.0, 0.0), "least": 0.5}
     path = ZoomPath(lattice=lattice, target=None, glances=glances[:1], candidates=candidates, **parts)
     assert path.objects.scores.tolist() == pytest.approx([0.4, 0.2])
-    assert not path.confirmed.any()
+    assert path.listed_by_score.all()
     assert len(replace(path, least=0.65).objects) == 1
+    apart = replace(path, candidates=candidates[torch.tensor([0, 3])])
+    assert apart.objects.scores.tolist() == pytest.approx([0.45, 0.2])
+    sure = replace(path, candidates=replace(candidates, scores=torch.tensor([0.45, 0.9, 0.3, 0.2, 0.1])))
+    assert sure.objects.scores.tolist() == pytest.approx([0.9, 0.2])
     assert len(replace(path, glances=glances[1:]).objects) == 0
     searched = replace(path, target=1, decision=Decision("absent", 0.1, None, None))
     assert len(searched.objects) == 0

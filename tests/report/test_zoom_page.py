@@ -204,6 +204,13 @@ def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, dec
     assert "No objects were found." in texts
 
 
+def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_path, large_picture):
+    path = replace(zoom_path, decision=Decision("undecided", 0.6), ending="passes")
+    place = path.best_place_in_words()
+    assert place
+    assert f" {place.capitalize()}." in zoom_data(path, large_picture, name="field.png")["decision"]
+
+
 def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpath, image):
     small = episode_data(scanpath, image, [image * 0.5] * 3, name="small.jpg")
     large = zoom_data(zoom_path, large_picture, name="large.jpg")

@@ -272,7 +272,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
     assert len(replace(path, least=0.0).objects) == len(path.candidates)
-    assert not any(replace(path, unseen=None).expected_error.values())
+    assert all(math.isnan(each) for each in replace(path, unseen=None).expected_error.values())
 
 
 def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
