@@ -144,6 +144,9 @@ def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Ou
         f"{name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
         f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
     )
+    width, height = prediction.size
+    if options.model is None and width <= height:
+        text += "\n  the model was not fitted to pictures that are not landscape, and may be wrong here"
     viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
     part = None if options.report is None else gaze_part(prediction, paths)
     return {"text": text, "size": prediction.size, "viewers": viewers, "part": part}

@@ -101,8 +101,8 @@ def _moment_line(moment: Moment) -> str:
         at, likely = f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}", ""
     else:
         columns = believed[0].columns
-        at = f"({row['column']}, {row['row']})"
-        likely = f", most likely at ({row['highest_cell'] % columns}, {row['highest_cell'] // columns})"
+        at = f"cell ({row['column']}, {row['row']})"
+        likely = f", most likely at cell ({row['highest_cell'] % columns}, {row['highest_cell'] // columns})"
     if moment.examined is None:
         look = f"at {at}: {detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)}"
     else:

@@ -53,7 +53,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     assert any("closely" in line for line in lines)
     left, top, right, bottom = scene.boxes[0].tolist()
     for x, line in zip(places[:14], lines, strict=False):
-        column, row = map(int, re.search(r"most likely at \((\d), (\d)\)", line).groups())
+        column, row = map(int, re.search(r"most likely at cell \((\d), (\d)\)", line).groups())
         # The most likely cell overlaps the annotated box, which moves with the view.
         assert left - x < 32 * (column + 1)
         assert right - x > 32 * column
@@ -85,7 +85,7 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert code == 0
     lines = printed.out.splitlines()
     assert lines[0] == "red.avi: searching for “red”"
-    assert re.match(r"     0  at \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at", lines[1])
+    assert re.match(r"     0  at cell \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at cell \(", lines[1])
     assert re.search(r"\d frames/s$", lines[4])
     assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[5])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
@@ -137,7 +137,7 @@ def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, a
     path = write(tmp_path / "red.avi", frames())
     _, printed = run("live", path, "--target", "red", "--start", 0)
     shown = re.findall(
-        r"^ +(\d)  closely at \((\d), (\d)\): p 0\.98 there +red: found, p .* \(there 0\.98\)", printed.out, re.M
+        r"^ +(\d)  closely at cell \((\d), (\d)\): p 0\.98 there +red: found, p .* \(there 0\.98\)", printed.out, re.M
     )
     assert len(shown) == 1
     assert printed.out.splitlines()[1] == "  found: when a closer look gives p 0.7 there (--confirm)"
