@@ -314,6 +314,7 @@ class _HeadEpisode(Episode[HeadPath]):
             targets=self.targets,
             photograph=None if picture is None else reduced_copy(picture),
             detector=self._detector,
+            duration=self.duration if math.isfinite(self.duration) else None,
         )
 
 

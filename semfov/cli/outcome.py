@@ -37,6 +37,8 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
+    if record.how == "head":  # whose seconds are those of its movements and looks
+        passes += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
     headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
     lines = [f"{name}, {width} × {height} px: {headline}"]

@@ -19,7 +19,7 @@ from semfov.detection.placement import resize
 from semfov.errors import InputError, check
 from semfov.head.scenes import Flat, Panorama, Sphere, World
 from semfov.head.views import Views
-from semfov.io.schema import Array, Field, Number, Object, Text
+from semfov.io.schema import Array, Field, Maybe, Number, Object, Text
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format
@@ -56,6 +56,7 @@ _FORMAT = Format(
         "fields": Array(POSITIVE, least=1, ascending=True),
         "fovea": POSITIVE,
         "seconds": Array(Number(low=0), "n"),
+        "duration": Maybe(Number(low=0)),
     },
 )
 """Format of the files of paths of eye and head."""
@@ -71,10 +72,11 @@ class HeadPath(Record):
         views: the views and fixations that were possible. Those of a path from a file have the geometry of the scene,
             without its picture.
         actions: number of the pose and cell of each look (`Views`).
-        seconds: time at the end of each look.
+        seconds: time at the end of each look, on the clock of eye and head (`semfov.head.Speeds`).
         detections: detections of each look, a batch of one, with boxes in pixels of its view.
         maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
             exploration.
+        duration: time limit of the scene in seconds, on the clock of `seconds`; None for none.
         values: expected gain per second for which each look was chosen, infinite for the first; empty if not known.
         found: whether the last look found the target; the `cell` of the decision is then one of the scene.
 
@@ -90,6 +92,7 @@ class HeadPath(Record):
     seconds: tuple[float, ...]
     maps: Tensor
     values: tuple[float, ...] = ()
+    duration: float | None = None
 
     how = "head"
     _format = _FORMAT
@@ -199,7 +202,14 @@ class HeadPath(Record):
         if self.decision is not None:
             there = f"there with probability {self.decision.probability:.2f}"
             what = f"{self.target_name}: {self.decision.outcome} ({there})"
-        return f"{what} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
+        return f"{what} in {self.seconds[-1]:.1f} s of eye and head: {looks}, {turns}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why it ended, with the time limit of the scene where that ended it."""
+        sentence = super().why_it_ended()
+        if self.ending != "duration" or self.duration is None:
+            return sentence
+        return f"{sentence.removesuffix('.')}, {self.duration:g} s (duration)."
 
     def _looks(self) -> Iterator[RecordedLook]:
         """The looks; regions are the smallest boxes around what they show."""
@@ -268,7 +278,8 @@ class HeadPath(Record):
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         views = self.views
-        record = {"fields": list(views.fields), "fovea": views.fovea, "seconds": list(self.seconds)}
+        record: dict[str, Any] = {"fields": list(views.fields), "fovea": views.fovea, "duration": self.duration}
+        record["seconds"] = list(self.seconds)
         tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
         if self.values:
             tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
@@ -277,12 +288,12 @@ class HeadPath(Record):
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         settings = record["world"]
-        made, names = _WORLDS[settings["kind"]]
+        scene, names = _WORLDS[settings["kind"]]
         for name in names:
             check(name in settings, f"world.{name}", "a value", "nothing")
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
         options: dict[str, Any] = {name: given[name] for name in names[2:]}
-        world = made(given["picture"], given["size"], **options)
+        world = scene(given["picture"], given["size"], **options)
         views = Views(world, record["fields"], fovea=record["fovea"])
         actions, cells = tensors["actions"], len(views.world.scene)
         check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
@@ -292,7 +303,8 @@ class HeadPath(Record):
         check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)
         values = tuple(tensors["values"].tolist()) if "values" in tensors else ()
         seconds = tuple(record["seconds"])
-        return {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": seconds, "values": values}
+        made = {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": seconds, "values": values}
+        return made | {"duration": record.get("duration")}
 
 
 def _settings(world: World) -> dict[str, Any]:

@@ -57,6 +57,7 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     assert explored.detector == agent.eye.detector.name
     limited = agent.explore(world, duration=1.0)
     assert limited.seconds[-1] <= 1.0
+    assert limited.why_it_ended() == "The next look would end after the time limit of the scene, 1 s (duration)."
 
 
 def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):

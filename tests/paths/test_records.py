@@ -102,6 +102,7 @@ def head_path(world=None):
         detections=looks(3),
         maps=torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2)),
         values=(float("inf"), 0.5, 0.25),
+        duration=12.5,
         ending="passes",
     )
 
@@ -139,7 +140,10 @@ WORDS = {
         "A closer look confirmed the target.",
     ),
     "zoom_path": ("cup: found (there with probability 0.90) in 3 passes", "A closer look confirmed the target."),
-    "head_path": ("3 × cat from score 0.3 in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
+    "head_path": (
+        "3 × cat from score 0.3 in 1.2 s of eye and head: 3 looks, 1 turn of the head",
+        "All 3 passes were used.",
+    ),
     "moment": ("cup: undecided, p 0.25", None),
     "window_moment": ("cup: found, p 0.90 (there 0.80)", "A closer look confirmed the target."),
 }
@@ -510,6 +514,7 @@ def test_a_head_path_from_a_file_has_the_geometry_of_its_scene(tmp_path):
         path.save(tmp_path / f"{number}.safetensors")
         loaded = HeadPath.load(tmp_path / f"{number}.safetensors")
         assert loaded.turns == path.turns
+        assert replace(loaded, ending="duration").why_it_ended().endswith("time limit of the scene, 12.5 s (duration).")
         assert same(loaded.gaze(-1), path.gaze(-1))
         regions, labels, scores = loaded.places(-1, 0.0)
         assert len(regions) == len(labels) == len(scores)
