@@ -159,7 +159,7 @@ class LookGraph(Graph):
     def gist(
         self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
-        """Compute the gist of a look, as `semfov.zoom.hints.gist` does; → `(c, c, K)`."""
+        """Compute the gist of a look, as `semfov.zoom.hints.Gist.of` does; → `(c, c, K)`."""
         boxes, vectors = hints
         at, scores, best = self._cells(boxes, start, cells), self._scores(vectors), self._best(vectors)
         nothing = self.constant(torch.zeros(cells * cells, classes))

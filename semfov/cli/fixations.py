@@ -53,7 +53,10 @@ def check_fixations(options: CheckOptions) -> int:
     given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
     given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
     if options.columns is not None:
-        given["columns"] = dict(each.partition("=")[::2] for each in options.columns.split(","))
+        given["columns"] = {
+            ours.strip(): theirs.strip()
+            for ours, _, theirs in (each.partition("=") for each in options.columns.split(","))
+        }
         for ours, theirs in given["columns"].items():
             check(bool(theirs), "columns", f"the file's name of {ours}, as in x=FPOGX,y=FPOGY", "none")
     place = None if options.picture is None else Path(options.picture)

@@ -77,6 +77,12 @@ class _PictureJob(ABC):
         if self.truth is not None:
             for source in self.sources:
                 self.truth.image_id(source.name)
+        check(
+            not self.every or options.start is None,
+            "start",
+            "none for find, which begins with the whole picture",
+            repr(options.start),
+        )
         self.start = _check(options)
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
@@ -354,8 +360,6 @@ class _FindJob(_PictureJob):
 
     def aim(self, classes: Sequence[str] | None) -> None:
         """The classes to find; None for all."""
-        start = self.options.start
-        check(start is None, "start", "none for find, which begins with the whole picture", repr(start))
         self.targets = several_classes(self.options.target, classes)
         self.target = None if self.targets is None else self.targets[0]
         self.title = f"all objects{': ' if self.targets else ''}{', '.join(self.targets or [])}"

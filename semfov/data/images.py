@@ -299,10 +299,11 @@ class PhotographPicture(LargePicture):
                     image.load()
                     whole = _turned(image, stored, _orientation(image), upright=True)
                     width, height = whole.size
-                    self._array = np.empty((height, width, 3), np.uint8)
+                    array = np.empty((height, width, 3), np.uint8)
                     for top in range(0, height, _ROWS):
                         rows = whole.crop((0, top, width, min(top + _ROWS, height)))
-                        self._array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
+                        array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
+                    self._array = array  # only now that it is whole
                 else:
                     self._array = to_bytes(read_image(self.path, white=self._white))
         return self._array[y1:y2, x1:x2]

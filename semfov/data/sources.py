@@ -131,6 +131,8 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         source = Path(source)
     name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
     if isinstance(source, Path) and source.is_dir():
+        if not any(path.suffix.lower() in PHOTOGRAPHS for path in source.iterdir()):
+            raise DataError(f"source: expected frames (.jpg, .png, .tif, …) in {source}, got none")
         files = picture_files(source)[:most]
         return Stream(name, None, (Picture(file.name, read_image(file, white=white)) for file in files))
     try:

@@ -91,7 +91,7 @@ def _decode_distances(
     bins = distances.shape[-1] // 4
     whole = bins > 0 and distances.shape[-1] == 4 * bins
     check(whole, "distances", "4 · bins channels, the same number of bins for each side", tuple(distances.shape))
-    grid = _grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
+    grid = _grid(distances.shape[1], (canvas[0], canvas[1]), strides, offset, distances.dtype, distances.device)
     expected = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     point, reach = grid[:, :2] * grid[:, 2:], expected * grid[:, 2:]
     return Candidates(torch.cat([point - reach[..., :2], point + reach[..., 2:]], -1), classes)
@@ -344,7 +344,7 @@ def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
         low, high = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         check(not 0 <= low < high <= 1, "output of the head", form, "numbers from 0 to 1, as fractions of the canvas")
-    grid = _grid(raw.shape[1], canvas, STRIDES[:3], 0.0, raw.dtype, raw.device)
+    grid = _grid(raw.shape[1], (canvas[0], canvas[1]), STRIDES[:3], 0.0, raw.dtype, raw.device)
     centre = (raw[..., 0:2] + grid[:, :2]) * grid[:, 2:]
     size = raw[..., 2:4].exp() * grid[:, 2:]
     return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])

@@ -314,7 +314,7 @@ def decode_yolo(
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
     cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
     sizes = tuple((width, height) for width, height in anchors)
-    corner, step, halves = _cells((columns, rows), canvas, sizes, raw.dtype, raw.device)
+    corner, step, halves = _cells((columns, rows), (canvas[0], canvas[1]), sizes, raw.dtype, raw.device)
     centre = (cells[..., 0:2].sigmoid() * scale - (scale - 1) / 2 + corner) * step
     half = cells[..., 2:4].exp() * halves
     boxes = torch.cat([centre - half, centre + half], -1)

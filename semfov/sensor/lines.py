@@ -13,6 +13,7 @@ from typing import Any, TypeVar, TypeVarTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch._guards import detect_fake_mode
 
 from semfov.errors import values_known
 
@@ -32,7 +33,7 @@ _Settings = TypeVarTuple("_Settings")
 
 
 def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Settings], _Constant]:
-    """Cache the results of a function of sizes and settings; a compiled graph computes its own."""
+    """Cache the results of a function of sizes and settings; a graph that is compiled or traced computes its own."""
 
     @lru_cache(maxsize=256)
     def remember(*settings: Any) -> Any:
@@ -42,7 +43,7 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
 
     @wraps(function)
     def call(*settings: *_Settings) -> _Constant:
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() or detect_fake_mode() is not None:
             return function(*settings)
         result: _Constant = remember(*settings)
         return result

@@ -36,10 +36,14 @@ class Film:
     hold: float = 2.0
     title: str = ""
 
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frames)
+
     def __repr__(self) -> str:
         """One line on the content."""
         height, width = self.frames[0].shape[:2]
-        return f"Film: {self.title}, {len(self.frames)} frames of {width} × {height} px"
+        return f"Film: {self.title}, {len(self)} frames of {width} × {height} px"
 
     def save(self, path: str | PathLike[str]) -> list[Path]:
         """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""

@@ -21,6 +21,7 @@ REFUSED = {
     "search": "target: expected a class, --target cup, got none; `semfov detectors yolov3-tiny` lists them",
     "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "find --start 5,5": "start: expected none for find",
+    "find --start abc": "start: expected none for find",
     "search nosuch.jpg --target cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "explore film.mp4": "picture: expected photographs; `semfov live` takes videos, got film.mp4",
     "explore http://example.org/a.jpg": "picture: expected a file on this machine",

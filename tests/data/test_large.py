@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 from semfov import InputError, read_image
+from semfov.data import images
 from semfov.data.large import _ArrayPicture, _RasterPicture, _TiffPicture, open_large
 from semfov.data.windowed import LargePicture
 from tests.refusals import refused, unusable
@@ -47,6 +48,24 @@ def test_a_picture_has_the_same_pixels_however_it_is_given(tmp_path, monkeypatch
             assert picture.reduction(9) == (1 if large > 450 * 330 else 4)
             for reduction in (1, 8):
                 assert torch.equal(picture.read(box, reduction), open_large(array).read(box, reduction))
+
+
+def test_a_photograph_whose_decoding_was_interrupted_is_decoded_anew(tmp_path, monkeypatch):
+    array = pixels(600, 20)
+    Image.fromarray(array).save(tmp_path / "a.png")
+    picture, over_white, seen = open_large(tmp_path / "a.png"), images._over_white, []
+
+    def interrupted(rows):
+        seen.append(rows)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return over_white(rows)
+
+    monkeypatch.setattr(images, "_over_white", interrupted)
+    monkeypatch.setattr(images, "_ROWS", 100)
+    with pytest.raises(KeyboardInterrupt):
+        picture.pixels((0, 0, 20, 600))
+    assert np.array_equal(picture.pixels((0, 0, 20, 600)), array)
 
 
 @pytest.mark.parametrize("reader", [_TiffPicture, _RasterPicture])

@@ -101,6 +101,7 @@ def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():
 def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
     unusable("no such file", picture_files, tmp_path / "none.jpg")
     unusable("got none", picture_files, tmp_path)
+    unusable("source: expected frames .* got none", open_stream, tmp_path)
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"no video")
     unusable(r"broken\.mp4: cannot be opened", open_stream, broken)

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -56,6 +57,9 @@ def test_sigma_may_differ_between_images_and_axes(convention, size):
             image[b : b + 1].mT, gaze[b : b + 1].flip(-1), sigma=sigma[b : b + 1].flip(-1), convention=convention
         )
         close(swapped.mT, one)
+        given = sigma[b : b + 1].tolist()
+        close(foveate(image[b : b + 1], gaze[b : b + 1], sigma=given, convention=convention), one)
+        close(foveate(image[b : b + 1], gaze[b : b + 1], sigma=np.array(given), convention=convention), one)
     equal = foveate(image, gaze, sigma=torch.tensor([4.0, 9.0]), convention=convention)
     close(equal[1:], foveate(image[1:], gaze[1:], sigma=9.0, convention=convention))
 

@@ -5,8 +5,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch._subclasses import FakeTensorMode
 
-from semfov.sensor.lines import Taps, banded, separable
+from semfov.sensor.lines import Taps, banded, constant, separable
 from tests.small import rand
 
 
@@ -74,3 +75,13 @@ def test_planes_that_are_filtered_together_do_not_mix():
     for n in (0, 2):
         assert torch.equal(together[n], separable(planes[n], lines, lines))
     assert separable(planes[:0], lines, lines).shape == (0, 200, 200)
+
+
+def test_what_is_made_while_a_graph_is_traced_is_not_kept():
+    made = constant(lambda length: torch.arange(length))
+    with FakeTensorMode():
+        assert made(3).shape == (3,)
+    assert made(3).tolist() == [0, 1, 2]
+    assert made(3) is made(3)
+    with FakeTensorMode() as mode:
+        assert made(3).fake_mode is mode

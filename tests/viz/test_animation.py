@@ -74,7 +74,7 @@ def test_frames_equal_figures_drawn_one_by_one(searched):
 def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_path):
     scanpath, image, views = searched
     film = animate(scanpath, image=image, views=views, seconds=0.5, hold=1)
-    assert len(film.frames) == 3
+    assert len(film) == len(film.frames) == 3
     assert repr(film).startswith(f"Film: {scanpath.describe()}, 3 frames of ")
     inside = re.fullmatch(r'<img [^>]*src="data:image/gif;base64,([^"]+)">', film._repr_html_())
     path = animate(scanpath, tmp_path / "film.gif", image=image, views=views, seconds=0.5, hold=1)

@@ -93,7 +93,7 @@ def test_the_command_says_what_is_in_files_and_exits_with_1_if_anything_is_wrong
     (tmp_path / "other.csv").write_text(text.replace("picture,", "seen by,", 1).replace(",x,", ",FPOGX,", 1))
     assert main(["check", str(tmp_path / "other.csv")]) == 1
     assert "(`semfov check` takes --columns x=THEIRS,y=THEIRS, too)" in capsys.readouterr().err
-    assert main(["check", str(tmp_path / "other.csv"), "--columns", "picture=seen by,x=FPOGX"]) == 0
+    assert main(["check", str(tmp_path / "other.csv"), "--columns", "picture=seen by, x = FPOGX"]) == 0
     assert capsys.readouterr().out == shown.replace("good.csv", "other.csv")
     assert main(["check", str(tmp_path / "other.csv"), "--columns", "picture=seen by,x="]) == 1
     assert "columns: expected the file's name of x, as in x=FPOGX" in capsys.readouterr().err
