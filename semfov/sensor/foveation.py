@@ -291,8 +291,8 @@ def _layout(
 def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
     """σ along x and y for every image, `(B, 2)`."""
     # A number that is filled in on a GPU is not waited for; one that is copied there is.
-    filled = isinstance(sigma, Real)
-    width = as_positions(like.new_full((), sigma, dtype=torch.float64) if filled else torch.as_tensor(sigma), like)
+    number = like.new_full((), float(sigma), dtype=torch.float64) if isinstance(sigma, Real) else torch.as_tensor(sigma)
+    width = as_positions(number, like)
     batch = like.shape[0]
     fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
     check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
