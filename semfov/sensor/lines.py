@@ -13,7 +13,6 @@ from typing import Any, TypeVar, TypeVarTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch._guards import detect_fake_mode
 
 from semfov.errors import values_known
 
@@ -43,7 +42,8 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
 
     @wraps(function)
     def call(*settings: *_Settings) -> _Constant:
-        if torch.compiler.is_compiling() or detect_fake_mode() is not None:
+        # Tensors that are made while a graph is traced are of a kind of their own.
+        if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:
             return function(*settings)
         result: _Constant = remember(*settings)
         return result
