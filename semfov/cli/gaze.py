@@ -146,7 +146,7 @@ def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Ou
     )
     width, height = prediction.size
     if options.model is None and width <= height:
-        text += "\n  the model was not fitted to pictures that are not landscape, and may be wrong here"
+        text += "\n  the model was fitted to pictures that are wider than high, and may be wrong here"
     viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
     part = None if options.report is None else gaze_part(prediction, paths)
     return {"text": text, "size": prediction.size, "viewers": viewers, "part": part}

@@ -149,7 +149,7 @@ usage: semfov gaze [PICTURE ...] [options]
 
 If a command with --out of scanpaths or a folder is stopped, the same command continues with the pictures that are left.
 It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
-pages of text, to interfaces or to pictures that are not landscape. --help-all: all options.
+pages of text, to interfaces or to pictures that are not wider than high. --help-all: all options.
 """,
     "live": f"""\
 semfov live: one look at each frame of a video, a camera or a network stream

@@ -50,7 +50,7 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert (code, err) == (0, "")
     assert out.count("entropy") == out.count("4 viewers drawn") == 2
     wide, high = out.split(f"{photos / '1.png'}: ")
-    assert ("not landscape" in wide, "not landscape" in high) == (False, True)
+    assert ("wider than high" in wide, "wider than high" in high) == (False, True)
     assert str(table) in out
     assert str(page) in out
     people = by_picture(read_table(table))
