@@ -239,8 +239,7 @@ class Eye(StatedModule):
 
 def _on_canvas(fixations: PointLike, view: View) -> Tensor:
     """Fixations as `(F, 2)` in pixels of the canvas, where the canvas is; a single point becomes a batch of one."""
-    points = as_points(fixations, "fixations")
-    points = points.to(torch.promote_types(view.canvas.dtype, torch.float32))
+    points = as_positions(as_points(fixations, "fixations"), view.canvas.dtype)
     points = points[None] if points.ndim == 1 else points
     check_shape(points, "fixations", None, 2)
     # Mapped where they are: the numbers of the placement are copied there, and a GPU would be waited for.

@@ -65,8 +65,7 @@ def glimpse(
         full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
         check(full, "boxes", "windows with a positive width and height", "an empty window")
     # Windows stay where they are: their corners are read, and a GPU would be waited for.
-    windows = boxes if boxes.ndim == 3 else boxes[:, None]
-    windows = windows.to(torch.promote_types(image.dtype, torch.float32))
+    windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image.dtype)
     value = 0.0 if padding_mode == "zeros" else fill_value
 
     result = stacked_views(
