@@ -197,10 +197,9 @@ class _OnnxTwin:
     pool do not survive a fork.
     """
 
-    def __init__(self, digest: str) -> None:
+    def __init__(self, digest: str, versions: tuple[object, ...] | None = None) -> None:
         self.digest = digest
-        self._versions: tuple[object, ...] | None = None
-        self._same = False
+        self._versions, self._same = versions, versions is not None
         self._opened: dict[tuple[int, ...], tuple[tuple[int, int], OnnxSession]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -216,7 +215,7 @@ class _OnnxTwin:
             return f"a network of {dtype}"
         if network.channels != 3:
             return f"a network that takes {network.channels} channels"
-        versions = tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
+        versions = _versions(parameters)
         if versions != self._versions:
             self._versions, self._same = versions, _network_digest(network) == self.digest
         return None if self._same else "weights that were changed after loading"
@@ -248,10 +247,11 @@ class _OnnxTwin:
         key = (os.getpid(), torch.get_num_threads())
         if layers not in self._opened or self._opened[layers][0] != key:
             try:
-                session = OnnxSession(_exported(network, cache_folder() / "exported", layers), open_ended=False)
+                folder = cache_folder() / "exported"
+                session = OnnxSession(_exported(network, self.digest, folder, layers), open_ended=False)
             except DataError:  # the cache cannot be written to
-                with tempfile.TemporaryDirectory() as folder:
-                    session = OnnxSession(_exported(network, Path(folder), layers), open_ended=False)
+                with tempfile.TemporaryDirectory() as own:
+                    session = OnnxSession(_exported(network, self.digest, Path(own), layers), open_ended=False)
             self._opened[layers] = key, session
         return self._opened[layers][1]
 
@@ -264,9 +264,14 @@ def _network_digest(network: Darknet) -> str:
     return digest.hexdigest()
 
 
-def _exported(network: Darknet, folder: Path, layers: Sequence[int] = ()) -> Path:
+def _versions(parameters: Sequence[nn.Parameter]) -> tuple[object, ...]:
+    """What changes with the parameters."""
+    return tuple((p.data_ptr(), None if p.is_inference() else p._version) for p in parameters)
+
+
+def _exported(network: Darknet, digest: str, folder: Path, layers: Sequence[int] = ()) -> Path:
     """Path of the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
-    source = json.dumps([_network_digest(network), _VERSION, torch.__version__, *layers])
+    source = json.dumps([digest, _VERSION, torch.__version__, *layers])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
     for path in sorted(folder.glob(f"{key}.*.onnx")):
         with suppress(OSError):
@@ -359,7 +364,8 @@ class YoloV3(Detector):
         super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)
         self.network = network
         self.runtime = runtime
-        self._twin = None if runtime == "torch" else _OnnxTwin(_network_digest(network))
+        versions = _versions([*network.parameters()])
+        self._twin = None if runtime == "torch" else _OnnxTwin(_network_digest(network), versions)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""

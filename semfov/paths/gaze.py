@@ -177,6 +177,11 @@ class GazePrediction:
             InputError: `count` is out of range.
         """
         check_whole(count, "count", 1, 100)
+        return [{**place} for place in self._places[:count]]
+
+    @cached_property
+    def _places(self) -> list[dict[str, float]]:
+        """All places, as `peaks` orders them."""
         rows, columns = self.cells.shape
         width, height = self.size
         x = (torch.arange(columns) + 0.5) * (width / columns)
@@ -192,7 +197,7 @@ class GazePrediction:
             at = places[best].tolist()
             found.append({"x": at[0] - 0.5, "y": at[1] - 0.5, "share": float(share[best])})
             free &= distance[best] > 2
-        return sorted(found, key=lambda place: -place["share"])[:count]
+        return sorted(found, key=lambda place: -place["share"])
 
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.

@@ -195,27 +195,27 @@ def test_another_number_of_threads_or_process_opens_a_new_session(make_small, th
 @pytest.mark.parametrize("damage", [b"", b"half", None])
 def test_a_damaged_export_is_replaced(make_small, folder, damage):
     network = make_small("torch").network
-    path = _exported(network, folder)
+    path = _exported(network, _network_digest(network), folder)
     whole = path.read_bytes()
     content = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:] if damage is None else damage
     path.write_bytes(content)
-    assert _exported(network, folder) == path
+    assert _exported(network, _network_digest(network), folder) == path
     assert path.read_bytes() == whole
     assert os.listdir(folder) == [path.name]
 
 
 def test_every_network_and_version_has_its_own_export(make_small, folder, monkeypatch):
     network = make_small("torch").network
-    path = _exported(network, folder)
+    path = _exported(network, _network_digest(network), folder)
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
-    assert _exported(network, folder).stat().st_mtime_ns == written
+    assert _exported(network, _network_digest(network), folder).stat().st_mtime_ns == written
     monkeypatch.setattr("semfov.detection.yolo._VERSION", _VERSION + 1)
-    assert _exported(network, folder) != path
+    assert _exported(network, _network_digest(network), folder) != path
     assert _network_digest(copy.deepcopy(network).double()) == _network_digest(network)
     with torch.no_grad():
         network.layers[0].weight.mul_(2)
-    assert _exported(network, folder) != path
+    assert _exported(network, _network_digest(network), folder) != path
     assert len(os.listdir(folder)) == 3
 
 
@@ -243,7 +243,7 @@ def test_exporting_does_not_change_random_state_or_depend_on_default_dtype(make_
     before = torch.get_rng_state()
     detector.propose(canvas)
     assert torch.equal(torch.get_rng_state(), before)
-    whole = _exported(detector.network, folder / "exported").read_bytes()
+    whole = _exported(detector.network, _network_digest(detector.network), folder / "exported").read_bytes()
     torch.set_default_dtype(torch.float64)
     try:
         assert network_model(detector.network, "darknet").SerializeToString() == whole

@@ -60,6 +60,8 @@ def test_places_are_the_peaks_in_order(gaze):
     near = (torch.arange(104) - first["x"]) ** 2 + (torch.arange(78)[:, None] - first["y"]) ** 2 <= 5.2**2
     assert first["share"] == pytest.approx(float(gaze.density[near].sum()), rel=0.1)
     assert gaze.peaks(100)[:6] == gaze.peaks(6)
+    gaze.peaks(1)[0].clear()  # a caller's own
+    assert gaze.peaks(1) == [first]
     refused("count", gaze.peaks, 0)
     # A place is on what is looked at, where a disc of equal weight may hold it anywhere.
     log = (0.001 * rand(39, 52) + bump(30, 20, width=0.4)).log()
