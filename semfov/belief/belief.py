@@ -211,11 +211,9 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Apply a function to each row `(B, ...)` separately, so that no result depends on the other rows of its batch.
+    """Apply a function to each row `(B, ...)` separately: rounding depends on the size of the tensor.
 
-    The rounding of matrix products, exponentials and logarithms depends on the size of the tensor. While a graph is
-    traced, and inside `torch.func.vmap`, all rows are computed at once. On an accelerator as many are as fit: there a
-    row costs as many launches as all of them.
+    While a graph is traced all rows are computed at once, and on an accelerator as many as fit.
     """
     some = 1 if rows[0].device.type == "cpu" else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
     if not values_known(*rows) or len(rows[0]) <= some:

@@ -34,19 +34,14 @@ class Gathered(NamedTuple):
 
 
 class Evidence(PretrainedForEye):
-    r"""Base of learned evidence for a class: one network for a single look, and one for all looks together.
+    r"""Base of learned evidence for a class: one network g for a single look, and one h for all looks together.
 
-    Kaplan's rule treats looks as independent. Looks at a static scene are not: a wrong detection of a blurred object
-    recurs in many looks, and the belief may never recover from it. Here a cell keeps the evidence of its closest look.
-    A small network corrects it, given the strongest evidence of any look, the mean of all looks, and the neighbourhood
-    of the cell. A look without detections is evidence, too: strong at the fovea, weak far from it.
+    Looks at a static scene are not independent, as Kaplan's rule takes them. A cell keeps the evidence of its closest
+    look, corrected by that of all looks and of its neighbourhood. φ are the features of `look_features`.
 
     .. math:: e_f(x) = g(\phi_f(x)), \qquad
               \operatorname{logit} P(k \in x \mid f_1 \ldots f_n) = e_{f^*(x)}(x) + h(\cdot), \qquad
               f^*(x) = \arg\min_i d(x, f_i)
-
-    where φ are the features of `look_features`, and g and h are networks with two hidden layers. The evidence depends
-    on the class through its score and through a prior, one number for each class.
     """
 
     def __init__(

@@ -91,20 +91,11 @@ class Verification(PretrainedForEye):
 def closer_features(
     presence: float, cell: float, evidence: float, closer: Detections, box: Tensor, target: int
 ) -> tuple[Tensor, Tensor]:
-    r"""Describe a closer look at a place `(7,)`, and find the box of the target in it `(4,)`.
+    r"""Features `(7,)` of a closer look at a place, and the box `(4,)` of the target in it.
 
-    Let :math:`s_l` be the scores of detection l of the closer look, :math:`o_l` its overlap (intersection over union)
-    with the examined box, and :math:`m = \arg\max_l s_{lt} o_l`. The features are the logits of
-
-    1. the probability that the image holds the target, before the closer look,
-    2. the probability that the cell holds it,
-    3. the evidence of the looks before, score times `soft` footprint,
-    4. :math:`s_{mt} o_m`, 5. :math:`\max_l s_{lt}`,
-    6. :math:`\max_l o_l \max_{k \ne t} s_{lk}`, the evidence for other classes there,
-    7. :math:`s_{mt}`,
-
-    with probabilities kept between 0.001 and 0.999. The box is that of detection m if they overlap by 0.3 or more,
-    otherwise the examined box.
+    Detection m has the largest score times overlap o with the examined box. The features are the logits, within 0.001,
+    of: the picture and the cell holding the target, and the evidence there, all before; :math:`s_{mt} o_m`,
+    :math:`\max_l s_{lt}`, :math:`\max_l o_l \max_{k \ne t} s_{lk}` and :math:`s_{mt}`.
     """
     real = closer.mask[0]
     boxes, scores = closer.boxes[0][real], closer.scores[0][real]
@@ -129,10 +120,7 @@ def _best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Te
 
 
 def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
-    """Move the box `(4,)` of a target to the middle of the detection that best shows it; it keeps its size.
-
-    A closer look measures the size better than a look of the fovea.
-    """
+    """Move the box `(4,)` of a target to the middle of the detection that best shows it; a closer look sizes better."""
     real = detections.mask[0]
     boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]
     if not len(boxes):

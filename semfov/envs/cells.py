@@ -78,12 +78,9 @@ class _SceneLooks(Looks):
 
 
 class CellGazes(Gazes):
-    """Episodes of the protocols, each with a fovea that moves from cell to cell in a scene of its own; cell `(B,)`.
+    """Episodes with a fovea that moves from cell to cell, each in a scene of its own; cell `(B,)`.
 
-    A search is over when the gaze lands on a cell that an object of the target class overlaps, an exploration when
-    every cell was fixated. The result of an exploration is the fraction of the cells with objects whose most probable
-    class is that of one of these objects. The planes of the belief are the probabilities of the target or of all
-    classes, and two more.
+    A search is over on a cell that an object of the target overlaps, an exploration when every cell was fixated.
     """
 
     coordinates = 2

@@ -24,11 +24,7 @@ _PRICES = {"search": 0.05, "exploration": 0.01}
 
 
 class Gazes(ABC):
-    """A batch of B episodes, each with a gaze of its own; base of `CellGazes` and `WindowGaze`.
-
-    `result` `(B,)` is that of the task so far, from 0 to 1: in a search 1 once the target is found, in an exploration
-    the fraction that is right or found.
-    """
+    """A batch of B episodes; `result` `(B,)` is 1 once the target is found, or the fraction that is right or found."""
 
     coordinates: ClassVar[int]
     """Number of coordinates of a gaze."""

@@ -77,12 +77,7 @@ class _Surroundings:
 
 
 class Scenery(_Surroundings):
-    """Scenes, an eye and a belief, which any number of environments can share; `open_scenery` makes one.
-
-    Episodes and looks are those of the protocols of search and exploration. The looks from all cells of a scene are
-    computed when an episode first enters it, and are kept on disk. Of a scene `episodes` are all its episodes, which
-    `GazeEnv.reset` takes as an option, and `answers` the correct classes of its cells `(X·Y, K+1)`.
-    """
+    """Scenes, an eye and a belief that environments share; the looks at a scene that is entered are kept on disk."""
 
     def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
         check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")

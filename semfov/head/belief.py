@@ -32,12 +32,9 @@ class _SceneLook(Look):
 
 @dataclass(frozen=True)
 class SceneBelief(Belief):
-    """Belief about the S cells of a scene, in one episode.
+    """Belief about the S cells of a scene: a target there `(1, S, 2)`, and if no fixated cell has it; or all classes.
 
-    Of a target the values `(1, S, 2)` are the probability that a cell holds it, and the same if no fixated cell does;
-    of all classes the probability of each, background first. Of each cell `(1, S)`: the distance of its closest
-    fixation (`Views.distances`), infinite where it was never seen; the number of the pose that this was from, else -1;
-    and whether it was fixated. `views` are the beliefs about the view from each pose, None where there was no look.
+    Of each cell `(1, S)`: distance of the closest fixation, number of its pose or -1, and whether it was fixated.
     """
 
     values: Tensor
@@ -66,12 +63,7 @@ class SceneBelief(Belief):
 
 
 class SceneObserver(Observer):
-    """Keeps the belief about a scene that is seen through one window at a time.
-
-    The belief about each view is that of an agent that moves its eye alone. A cell of the scene takes the belief of the
-    view in which the gaze came closest to it. A cell that was never seen has the belief of a cell in which a look from
-    a distance of one longer side detected nothing.
-    """
+    """Keeps the belief about a scene; a cell takes that of the view in which the gaze came closest to it."""
 
     by_target = True
 

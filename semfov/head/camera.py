@@ -86,11 +86,7 @@ class PanTiltCamera(Protocol):
 
 
 class _CameraScene(Sphere):
-    """The scene around a camera that turns.
-
-    Pan and tilt have a motor each, which move at the same time. A camera that does not turn all the way round takes the
-    long way between its limits.
-    """
+    """The scene around a camera that turns, with a motor for pan and one for tilt, which move at the same time."""
 
     still = False
 

@@ -41,11 +41,9 @@ class _HeadLooks(Looks):
 
 
 def live(eye: Eye, views: Views) -> Detect:
-    """Detections of an eye, computed when they are asked for.
+    """Detections of an eye, computed when they are asked for; the view of the last pose of a picture is kept.
 
-    The view of the last pose is kept for the next look at a picture; a camera takes a new frame for each look. If a
-    frame was taken from a pose beside the one that was asked for, the eye fixates the same point of the scene, and the
-    boxes are moved to the smallest ones around them in the view from the right pose.
+    Where a frame was taken from another pose, the eye fixates the same point, and boxes are moved to the right view.
     """
     world = views.world
     opened: tuple[int, View] | None = None

@@ -29,10 +29,7 @@ OUT = -1e6
 
 
 class LookGain(nn.Module):
-    """Base of the expected gains of a look: called with a belief, the present pose `here` and the numbers of `poses`.
-
-    It gives the gains `(A,)` of all actions from these poses; the values of other actions have no meaning.
-    """
+    """Base of the expected gains `(A,)` of looks, called with a belief, the pose `here`, and the `poses` to value."""
 
     def __init__(self, views: Views) -> None:
         super().__init__()

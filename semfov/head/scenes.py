@@ -37,12 +37,7 @@ def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
 
 
 class _Scene:
-    """Base of the scenes that a head looks around in: their geometry, and the view from each pose.
-
-    A pose of the head has three numbers, all in degrees: pan to the right, tilt up, and the field of view across.
-    `scene` are the cells of the whole scene, in pixels of its picture, with centres `(S, D)` and areas `(S,)`, 1 on
-    average. Cameras of your own need less (`semfov.head.PanTiltCamera`).
-    """
+    """Base of the scenes that a head looks around in; the cells `scene` have centres `(S, D)` and areas `(S,)`."""
 
     scene: Grid
     size: tuple[int, int]
@@ -78,11 +73,7 @@ def _angle_between(one: Tensor, other: Tensor) -> Tensor:
 
 
 class Sphere(_Scene):
-    """Directions around a perspective camera (`semfov.sensor.sphere.Camera`), without anything to see.
-
-    A pose is pan (yaw), tilt (pitch) and horizontal field of view in degrees. Points are unit directions, so D is 3.
-    The scene's picture is an equirectangular panorama.
-    """
+    """Directions around a perspective camera, without anything to see; D is 3, and the picture equirectangular."""
 
     closed = True
 
@@ -139,10 +130,7 @@ class Sphere(_Scene):
         return _angle_between(*rays)
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Rings of poses around the viewer, or arcs of them between the limits of pan, half a window apart.
-
-        Every second pose of every second ring tiles the scene.
-        """
+        """Rings of poses, or arcs between limits, half a window apart; every second of every second ring tiles."""
         high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
         middle, reach = (self.tilt[0] + self.tilt[1]) / 2, (self.tilt[1] - self.tilt[0]) / 2
         number = math.floor(reach / (high / 2))
@@ -228,11 +216,7 @@ class Panorama(Sphere):
 
 
 class _Plane(_Scene):
-    """A plane in front of a window that moves over it, without anything to see.
-
-    A pose is the middle of the window, in degrees to the right of and above the middle of the picture, and the window's
-    width in degrees. Points are pixels, so D is 2.
-    """
+    """A plane in front of a window, without anything to see; a pose is its middle and width in degrees, and D is 2."""
 
     def __init__(
         self,

@@ -17,15 +17,11 @@ _POINTS = 10
 
 
 class Views:
-    """The possible poses of a head, and the possible fixations of the eye in the view from each.
+    """The possible poses `(P, 3)` of a head and fixations of its eye, as one grid: `action = pose * 100 + cell`.
 
-    The views are arranged as a strip, one below the other. An action, which is a pose and a cell of its view, is then
-    one cell of a grid, `action = pose * 100 + cell`. So the loop that moves an eye over a picture also moves eye and
-    head.
-
-    `grid` is the strip, `view_grid` the cells of one view. Of the poses `(P, 3)` those of `tiling`, rows of numbers for
-    each field of view, tile the scene. Each action fixates a point `gaze` `(A, D)` in a cell `gaze_cell` `(A,)` of the
-    scene. From each pose the cells `visible` `(V,)` are seen, with their middles at the pixels `points` `(V, 2)`.
+    The views are a strip, one below the other, of cells `grid`; `tiling` are rows of poses that tile the scene for each
+    field of view. An action fixates a point `gaze` `(A, D)` in a cell `gaze_cell` `(A,)` of the scene. From each pose
+    the cells `visible` `(V,)` are seen at the pixels `points` `(V, 2)`.
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
@@ -83,11 +79,9 @@ class Views:
 
     @cached_property
     def distances(self) -> list[Tensor]:
-        """For each pose, distance `(cells, V)` from each cell of its view to the scene's cells that it shows.
+        """Distance `(cells, V)` from each cell of a view to those of the scene that it shows, in longer sides.
 
-        The unit is the longer side of the narrowest view. With σ the width of the fovea, the acuity at a distance d
-        falls as :math:`1 / (1 + d / σ)`. The acuity of a wider view is lower everywhere by the ratio r of the fields. A
-        point at distance d in a wider view is therefore seen as well as one at :math:`r (σ + d) - σ` in the narrowest.
+        In a view wider by r, acuity 1 / (1 + d / σ) is lower by r: d is seen as r (σ + d) - σ in the narrowest.
         """
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []

@@ -69,20 +69,12 @@ def _probabilities(values: Tensor, argument: str) -> Tensor:
 
 
 def surprisal(probability: Tensor) -> Tensor:
-    """Negative logarithm of probabilities, in nats.
-
-    A probability that has underflowed to 0 counts as the smallest positive float32, so that the result stays finite.
-    """
+    """Negative logarithm of probabilities in nats; one that has underflowed counts as the smallest positive float32."""
     return -probability.clamp(min=torch.finfo(torch.float32).tiny).log()
 
 
 def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Tensor:
-    r"""Expected calibration error over equally wide bins of confidence (Naeini, Cooper and Hauskrecht, 2015).
-
-    .. math:: \sum_b \frac{n_b}{n} \, | \mathrm{acc}_b - \mathrm{conf}_b |
-
-    Shapes: confidence `(M,)`, correct `(M,)`.
-    """
+    """Calibration error in bins (Naeini, Cooper and Hauskrecht, 2015), Σ_b n_b / n |acc_b - conf_b|; inputs `(M,)`."""
     return _error_of(reliability(confidence, correct, bins))
 
 
@@ -108,18 +100,9 @@ _RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class BinarySums:
-    r"""Sums over binary predictions, from which their measures follow.
+    """Sums over binary predictions, for the mean log likelihood and Brier score (1950; of one of the two classes).
 
-    For probabilities :math:`p_i` and outcomes :math:`y_i \in \{0, 1\}` the mean negative log likelihood and the mean
-    Brier score (Brier, 1950; here of one of the two classes, from 0 to 1) are
-
-    .. math:: -\frac1n \sum_i \ln \left( y_i p_i + (1 - y_i)(1 - p_i) \right), \qquad
-              \frac1n \sum_i (p_i - y_i)^2
-
-    Where nearly all probabilities are small, the first of 15 equally wide bins holds nearly all predictions. It is
-    therefore divided into 7 bins for reliability diagrams.
-
-    Shapes: bins `(3, 21)`.
+    The first of 15 equally wide bins is divided into 7, as it can hold nearly all predictions; bins `(3, 21)`.
     """
 
     bins: Tensor

@@ -32,12 +32,7 @@ def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def area_under_roc(score: Tensor, present: Tensor) -> float:
-    """Area under the receiver operating characteristic (Hanley and McNeil, 1982); score `(M,)`, present `(M,)`.
-
-    It is the probability that a case with the target scores higher than one without:
-
-    .. math:: P(s_+ > s_-) + P(s_+ = s_-) / 2
-    """
+    """Area under the ROC (Hanley and McNeil, 1982), P(s₊ > s₋) + P(s₊ = s₋) / 2; score and present `(M,)`."""
     hit, miss = scores_by_presence(score, present)
     miss = miss.sort().values
     below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
@@ -52,20 +47,14 @@ def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
 
 
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
-    """The cells, `(B, X·Y)`, whose most probable class, tied with no other, is that of an overlapping object.
-
-    Shapes: beta `(B, X·Y, C)`, answers `(X·Y, C)`.
-    """
+    """Cells `(B, X·Y)` whose most probable class is one of the answers; beta `(B, X·Y, C)`, answers `(X·Y, C)`."""
     best = beta == beta.amax(-1, keepdim=True)
     # Sums of a short dimension take a seventh of the time of `any`.
     return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
 
 
 def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
-    r"""Standard error of the mean along one axis.
-
-    .. math:: \mathrm{SE} = \sqrt{\frac{1}{n (n - 1)} \sum_i (x_i - \bar x)^2}
-    """
+    """Standard error of the mean along one axis, the root of Σ (x - x̄)² / (n (n - 1))."""
     values = np.asarray(values, dtype=np.float64)
     count = values.shape[axis]
     if count < 2:

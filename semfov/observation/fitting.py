@@ -26,18 +26,14 @@ def fit_tables(
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
     r"""Maximum a posteriori α `(K+1, N, K+1)`, `ln π`, expected scores, and a record; warns of fallbacks.
 
-    The mean log scores of a table cell (one class at one level) are shrunk towards those of its class over all levels.
-    The latter are shrunk, with a weight of one sample, towards those of Dir(1, ..., 1) (`semfov.dirichlet.shrink`):
+    The mean log scores of a class at a level are shrunk to those of the class, and these by one sample to Dir(1, …, 1):
 
     .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
               g_k = \frac{n_k \bar g_k + \psi(1) - \psi(K+1)}{n_k + 1}
 
-    A level with fewer than `minimum` objects takes the parameters of its inner neighbour. Level 0 has none: it is
-    recorded as falling back on itself, and keeps its shrunk estimate.
-
-    Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say how they treat
-    cells with few samples or none. Cells with `enough` detections get the maximum of the likelihood; the treatment of
-    the others is our choice.
+    A level with few objects takes the parameters of its inner neighbour; level 0, which has none, is recorded as its
+    own. Cells with `enough` detections get the maximum of the likelihood, as in Luzio, Bernardino and Moreno (2024,
+    section III-C); the treatment of the others is our choice.
     """
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
     classes = statistics.sum(1)
@@ -70,10 +66,7 @@ def fit_tables(
 
 
 def _estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
-    r"""Logarithms of the class frequencies at each level, shrunk towards those over all levels; `(K+1, N)`.
-
-    .. math:: \pi_{k,d} = \frac{n_{k,d} + w \pi_k}{n_d + w}, \qquad \pi_k = \frac{n_k + 1}{n + K + 1}
-    """
+    """Log class frequencies `(K+1, N)`, those of each level shrunk to those over all, π_k = (n_k + 1) / (n + K + 1)."""
     check(shrinkage > 0, "shrinkage", "a positive number of pseudo-counts", shrinkage)
     count = count.to(torch.float64)
     pooled = count.sum(1, keepdim=True) + 1

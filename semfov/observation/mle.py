@@ -199,10 +199,7 @@ def _residual(alpha: Tensor, rows: Tensor) -> Tensor:
 
 
 def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Tensor:
-    """Solve `(diag ψ'(α) - ψ'(A)) x = change`: the change of the maximum for a change of the mean log scores.
-
-    For rows that are `capped` the solution is under the constraint Σ x = 0.
-    """
+    """Solve `(diag ψ'(α) - ψ'(A)) x = change`; for rows that are `capped` under the constraint Σ x = 0."""
     rates = torch.polygamma(1, alpha).reciprocal()
     total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
     outer = 1 / (1 / torch.polygamma(1, precision) - total)
@@ -290,11 +287,7 @@ def _gradient(rows: Tensor) -> Tensor:
 
 
 def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
-    """One run of L-BFGS from `start`.
-
-    The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`. Scaling by `across` turns the diagonal into ones.
-    `along` is the only direction in which the rank-one part then gives another value than 1.
-    """
+    """One run of L-BFGS on ln α, in coordinates in which the Fisher information `diag(α² ψ'(α)) - ψ'(A) α αᵀ` is 1."""
     rates = torch.polygamma(1, start).reciprocal()
     total = rates.sum(-1, keepdim=True)
     rest = (1 - torch.polygamma(1, start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)

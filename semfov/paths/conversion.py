@@ -62,17 +62,11 @@ class Conversion(Outcome):
             return not_there(self, name, _WORDS)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
+        """The looks as a table of plain values, one row for each, whose first columns all kinds of records have.
 
-        `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
-        the picture that it shows, in picture pixels. `detections` is the number of detections, `seen` the class of the
-        most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on the clock of
-        the episode. `value` is that for which the look was chosen. `closer` is the probability that the target is
-        there, by a closer look that this is, or that follows it. `brought` is the number of objects that it shows most
-        sharply. The columns that the kind adds come last.
-
-        Returns:
-            One dictionary for each look.
+        `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of the picture that it shows. `seen`
+        and `score` are of the most confident detection. `closer` is the probability that the target is there, by a
+        closer look that this is, or that follows it. `brought` is the number of objects that it shows most sharply.
         """
         closer = {look.of_look: look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
@@ -96,11 +90,7 @@ class Conversion(Outcome):
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.
-
-        Returns:
-            Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
-        """
+        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, None if not claimed."""
         (width, height), decision = self.size, self.decision
         values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}
         values["targets"] = [self.classes[label] for label in self._sought]
@@ -116,14 +106,7 @@ class Conversion(Outcome):
         return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as a table of plain values, one row for each object, most confident first.
-
-        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
-        number of the look that shows it most sharply.
-
-        Returns:
-            One dictionary for each object.
-        """
+        """The objects as rows of plain values, most confident first; `look` is the one that shows it most sharply."""
         objects = self.objects
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
         return [
@@ -143,17 +126,7 @@ class Conversion(Outcome):
         ]
 
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
-        """A table of the record as a pandas data frame.
-
-        Args:
-            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
-
-        Returns:
-            One row for each look or object.
-
-        Raises:
-            InputError: there is no such table, or pandas is not installed.
-        """
+        """The table of `looks` (`rows`) or `objects` (`object_rows`) as a pandas data frame."""
         rows, columns = self._table(table)
         try:
             import pandas
@@ -164,38 +137,12 @@ class Conversion(Outcome):
         return pandas.DataFrame(rows, columns=columns)
 
     def to_csv(self, path: str | PathLike[str] | None = None, table: _Table = "looks") -> str:
-        """A table of the record as CSV, with a header.
-
-        Args:
-            path: the file to write; None writes none.
-            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
-
-        Returns:
-            The text of the file.
-
-        Raises:
-            InputError: there is no such table.
-            DataError: the file cannot be written.
-
-        Example::
-
-            agent.find_all("harbour.tif", "person").to_csv("people.csv", "objects")
-        """
+        """The table of `looks` or `objects` as CSV with a header, which is written to a file if one is named."""
         rows, columns = self._table(table)
         return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> str:
-        """The record as JSON: the values of `to_dict`.
-
-        Args:
-            path: the file to write; None writes none.
-
-        Returns:
-            The text of the file.
-
-        Raises:
-            DataError: the file cannot be written.
-        """
+        """The values of `to_dict` as JSON, which is written to a file if one is named."""
         return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
 
     def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:
@@ -207,31 +154,14 @@ class Conversion(Outcome):
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
 
-        Supervision numbers classes from 0, without background. `data` has the names of the classes as `class_name`,
-        which its annotators show, the number of the look that each box comes from as `look`, and which of the objects
-        were confirmed as `confirmed`.
-
-        Returns:
-            The objects for Supervision.
-
-        Raises:
-            InputError: Supervision is not installed.
-
-        Example::
-
-            found = agent.find_all("harbour.tif", "person").to_supervision()
-            picture = supervision.LabelAnnotator().annotate(picture, found)
+        Classes are numbered from 0, without background. `data` has `class_name`, `look` and `confirmed` of each box.
         """
         objects = self.objects
         data = {"look": objects.passes.numpy(), "confirmed": self.confirmed.numpy()}
         return named_detections(objects.boxes, objects.labels, objects.scores, self.classes[1:], data)
 
     def to_torchvision(self) -> dict[str, Tensor]:
-        """Convert the objects to the form of torchvision's detectors, which `torchmetrics` also takes.
-
-        Returns:
-            `boxes` `(M, 4)`, `labels` `(M,)` from 1 (0 is background), and `scores` `(M,)`.
-        """
+        """The objects as torchvision's detectors and `torchmetrics` have them: boxes, labels from 1, and scores."""
         objects = self.objects
         return {"boxes": objects.boxes.clone(), "labels": objects.labels.clone(), "scores": objects.scores.clone()}
 
@@ -240,16 +170,8 @@ class Conversion(Outcome):
     ) -> list[dict[str, Any]]:
         """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
 
-        Args:
-            image_id: id of the image in the annotation file.
-            categories: the `categories` of the annotation file, in which classes are found by name, or the category id
-                of each class. None takes COCO's own ids, if all classes of the objects are among COCO's 80.
-
-        Returns:
-            `image_id`, `category_id`, `bbox` as `[x, y, width, height]`, and `score` of each object.
-
-        Raises:
-            InputError: the class of an object has no category.
+        `categories` are those of the annotation file, in which classes are found by name, or the category id of each
+        class. None takes COCO's own ids, if all classes of the objects are among COCO's 80.
         """
         objects, names = self.objects, self.classes[1:]
         if categories is None:
@@ -270,17 +192,7 @@ class Conversion(Outcome):
     def to_yolo(self, path: str | PathLike[str] | None = None) -> str:
         """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
 
-        Classes are numbered from 0, without background. `x` and `y` are the middle of the box, and all four are shares
-        of the width and height of the picture. Boxes end at its borders.
-
-        Args:
-            path: the file to write; None writes none.
-
-        Returns:
-            The text of the file; empty without objects.
-
-        Raises:
-            DataError: the file cannot be written.
+        Classes are numbered from 0, without background. The others are shares of the sides of the picture, inside it.
         """
         width, height = self.size
         lines = []
@@ -290,18 +202,9 @@ class Conversion(Outcome):
         return _written("".join(lines), path)
 
     def crops(self, picture: LargePicture | ImageLike | None = None) -> list[Tensor]:
-        """Cut what the box of each object shows out of the picture.
+        """Cut what the box of each object shows out of the picture, bytes `(3, h, w)` in their order.
 
-        Args:
-            picture: the picture in full size; None takes the file that the record comes from, with the values and
-                bands that were shown.
-
-        Returns:
-            `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.
-
-        Raises:
-            InputError: no picture is given, or the record's is not known, or it has another size.
-            DataError: the file cannot be read.
+        None takes the file that the record comes from, with the values and bands that were shown.
         """
         shown = self.shown if picture is None and self.shown is not None else {}
         picture = self.source if picture is None else picture
@@ -325,24 +228,8 @@ class Conversion(Outcome):
     ) -> dict[str, Any]:
         """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
 
-        For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84). Other pictures have no place on
-        earth: their coordinates are pixels with y down, as the member `coordinates` of the collection says.
-
-        Args:
-            path: the file to write; None writes none.
-            source: the GeoTIFF; None takes the file that the picture of the record comes from, if it is known.
-
-        Returns:
-            The `FeatureCollection`, as JSON values.
-
-        Raises:
-            InputError: the picture has a georeference, and rasterio is not installed.
-            DataError: a file cannot be read or written.
-
-        Example::
-
-            record = agent.find_all("harbour.tif", "boat")
-            record.to_geojson("boats.geojson")
+        For a picture from a GeoTIFF, the `source` or the record's own file, coordinates are longitude and latitude (WGS
+        84). For others they are pixels with y down, as the member `coordinates` of the collection says.
         """
         file = self.source if source is None else fspath(source)
         place = None if file is None else georeference(file)
@@ -381,11 +268,7 @@ def _written(text: str, path: str | PathLike[str] | None) -> str:
 
 
 def coco_categories() -> list[dict[str, Any]]:
-    """The categories of COCO's annotation files, as torchvision has them.
-
-    >>> len(coco_categories()), coco_categories()[11]
-    (80, {'id': 13, 'name': 'stop sign'})
-    """
+    """The categories of COCO's annotation files, as torchvision has them."""
     from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
     names = FasterRCNN_ResNet50_FPN_Weights.DEFAULT.meta["categories"]

@@ -20,12 +20,9 @@ def merge_fixations(
     cut: Sequence[Tensor] | None = None,
     around: float | None = None,
 ) -> Objects:
-    """Merge the detections of several fixations into one box for each object (`merge_looks`).
+    """Merge the detections of fixations and closer looks into one box for each object; distances and cut `(L,)`.
 
-    The nearest fixation sees a box most sharply, and a closer look more sharply still. The score of the box of a closer
-    look is the probability that the target is there, so a place that a closer look has refuted is no candidate.
-
-    Shapes: distances `(L,)`, cut `(L,)`.
+    The nearest fixation sees a box most sharply, and a closer look more sharply still.
     """
     boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []
     for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
@@ -50,11 +47,7 @@ def merge_fixations(
 
 
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
-    """Distance of a point to boxes; 0 inside a box; boxes `(L, 4)`, point `(2,)` → `(L,)`.
-
-    >>> distances_to(torch.tensor([[10.0, 10, 20, 20], [0, 0, 4, 5]]), torch.tensor([6.5, 8.5])).tolist()
-    [3.1622776985168457, 5.0]
-    """
+    """Distance of a point `(2,)` to boxes `(L, 4)`, `(L,)`; 0 inside a box."""
     at = (point + 0.5).to(boxes)
     beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)
     return torch.linalg.vector_norm(beside, dim=-1)

@@ -135,23 +135,15 @@ class Outcome(ABC):
         return None if self.photograph is None else self.photograph.float() / 255
 
     def is_whole(self, region: Sequence[float]) -> bool:
-        """Whether a region is the whole picture, up to a pixel.
-
-        Args:
-            region: `(x1, y1, x2, y2)` in picture pixels.
-
-        Returns:
-            Whether it is.
-        """
+        """Whether a region `(x1, y1, x2, y2)` is the whole picture, up to a pixel."""
         (x1, y1, x2, y2), (width, height) = region, self.size
         return x2 - x1 > width - 1 and y2 - y1 > height - 1
 
     @cached_property
     def candidates(self) -> Objects:
-        """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
+        """Objects merged from the detections of all looks, from score 0.05 on: the box of the nearest fixation of each.
 
-        Of several boxes of one object, the box of the nearest fixation is kept, or that of a closer look. The score of
-        a closer look is the probability that the target is there.
+        A closer look is nearer still; its score is the probability that the target is there.
         """
         looks = [look.detections for look in self]
         distances = [
@@ -163,8 +155,7 @@ class Outcome(ABC):
     def objects(self) -> Objects:
         """The candidates of the targets that have at least the score `least`, or that were confirmed.
 
-        A candidate that was confirmed has the box that confirmed it, and the probability that the target is there as
-        its score, where that is higher. The box that a decision found is always among the objects.
+        One that was confirmed has the box that confirmed it, and that box's probability where it is higher.
         """
         return self._outcome[0]
 
@@ -193,22 +184,13 @@ class Outcome(ABC):
     def expected(self) -> dict[str, float]:
         """Expected number of objects by the name of their class; NaN, and null in files, where it is not known.
 
-        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
-        each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
-        or a head, nor of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`).
+        It is known where scores are probabilities and the detector reacts to the class (`ZoomPath.reacts`).
         """
         return {name: mean for name, (mean, _) in self._claimed().items()}
 
     @property
     def expected_error(self) -> dict[str, float]:
-        r"""Standard deviation of the expected number of objects by the name of their class; NaN where it is not known.
-
-        The candidates are independent (a Poisson-binomial distribution), and what no look has shown has the
-        distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a share
-        :math:`\tau` (`spread`) of the expected number E:
-
-        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
-        """
+        """Standard deviation of the expected numbers by class (`zoom.certainty.number_of`); NaN where not known."""
         return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
@@ -250,22 +232,14 @@ class Outcome(ABC):
         return candidates.scores >= self.least
 
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say from which score on.
-
-        Returns:
-            A phrase such as `2 × person from score 0.3`.
-        """
+        """Count the objects, by class where classes were searched for, such as `2 × person from score 0.3`."""
         labels = self.objects.labels
         names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought]
         every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
         return f"{', '.join(names) or every} from {self.threshold_in_words}"
 
     def classes_in_words(self) -> str:
-        """Count the objects by class, the most frequent first, and say how many of them this detector can show.
-
-        Returns:
-            A phrase such as `3 × person (about 4 ± 1 that this detector can show), 2 × cup`; empty without objects.
-        """
+        """Count the objects by class, the most frequent first, and say how many of them this detector can show."""
         labels = Counter(self.objects.labels.tolist()).most_common()
         return ", ".join(f"{count} × {self.classes[label]}{self._number_in_words([label])}" for label, count in labels)
 
@@ -274,11 +248,7 @@ class Outcome(ABC):
         return ""
 
     def why_it_ended(self) -> str:
-        """Explain in one sentence why the search or the exploration ended.
-
-        Returns:
-            The sentence; empty if the reason is not known.
-        """
+        """Explain in one sentence why the search or the exploration ended; empty if that is not known."""
         sentences, looks = self._sentences, self.passes
         if self.closer and self.found:
             # Windows as large as the picture: the first look is a closer look already.
@@ -296,11 +266,7 @@ class Outcome(ABC):
         return sentences.get(self.ending or "", "")
 
     def best_place_in_words(self) -> str:
-        """Name the place where the target of an undecided search is most likely, by closer looks or by the detections.
-
-        Returns:
-            A phrase such as `best place: box 10,10–30,30, probability 0.09`; empty otherwise, and without such a place.
-        """
+        """Name the most likely place of the target of an undecided search; empty for others and without one."""
         if self.decision is None or self.decision.outcome != "undecided":
             return ""
         seen, of = self.candidates.of(self._sought), "probability" if self.closer else self.measure

@@ -21,12 +21,7 @@ LONGEST = 1280
 
 @dataclass(frozen=True)
 class Stimulus:
-    """The canvas from which foveated views of a photograph are made, as bytes.
-
-    The canvas `(3, H, W)` is the photograph fitted into the detector's input, or into the canvas of the sensor. A view
-    is computed on request, by applying the sensor of the eye to the canvas. A stimulus from a file has no sensor, so
-    the sensor is made from the settings of the eye (`sensor_of`).
-    """
+    """The canvas `(3, H, W)` in bytes from which views are made by the sensor of the eye, or by one of its settings."""
 
     canvas: Tensor
     placement: Placement
@@ -58,10 +53,7 @@ class Stimulus:
         return cls(canvas, placement, values[1])
 
     def views(self, fixations: Tensor) -> list[Tensor]:
-        """Foveated views of the photograph, as the detector received them, without the border of the canvas.
-
-        They equal the result of `Eye.pictures` up to the rounding to bytes.
-        """
+        """Foveated views without the border of the canvas, those of `Eye.pictures` up to the rounding to bytes."""
         check_shape(fixations, "fixations", None, 2)
         settings = self.settings["sensor"]
         sensor = sensor_of(settings) if self.sensor is None else self.sensor

@@ -28,11 +28,7 @@ VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:
-    """Draw what is known at a frame, and where the next look goes, into the frame; image `(3, H, W)` → `(h, w, 3)`.
-
-    Of beliefs in cells, colours show probabilities, a circle the present gaze, a frame a closer look, and a line leads
-    to the next point. Of windows, frames show the present and the next one, and boxes the objects.
-    """
+    """Draw what is known at a frame, and where the next look goes, into the frame `(3, H, W)`; `(h, w, 3)`."""
     from PIL import Image, ImageDraw, ImageFont
 
     (height, width), look, ahead = image.shape[-2:], moment.looks[-1], moment.next_region

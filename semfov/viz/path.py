@@ -66,11 +66,7 @@ class LookPath:
 
 
 class GazePath:
-    """Saccades as thin lines and fixations `(n, 2)` as numbered dots, from dark to bright in the order of time.
-
-    All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown. In a
-    picture that repeats after the width `around`, a saccade takes the short way, across the seam if need be.
-    """
+    """Saccades as lines and fixations `(n, 2)` as numbered dots, laid out once; lines take the short way `around`."""
 
     def __init__(
         self,

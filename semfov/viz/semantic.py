@@ -34,12 +34,7 @@ _NAME_POINTS = 7
 
 
 def cell_entropy(scanpath: Scanpath) -> Tensor:
-    r"""Entropy of the class of every cell after each look, `(n, X·Y)`.
-
-    .. math:: H = -\sum_k p_k \log_2 p_k
-
-    The marginal probabilities of a learned map are first scaled to sum to 1.
-    """
+    """Entropy in bits of the class of every cell after each look, `(n, X·Y)`; marginals are scaled to sum to 1."""
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
 
@@ -141,10 +136,9 @@ def _borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]
 
 
 def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
-    """The objects of the map after a fixation: regions of adjacent cells with the same most probable class.
+    """Regions of adjacent cells with the same most probable class, with name, cells and highest probability.
 
-    A cell has an object if its most probable object class is more probable than background, and more probable than 3
-    over the number of classes, or than 0.5 where that is less.
+    Its class is more probable than background, and than 3 over the number of classes, or 0.5 where that is less.
     """
     grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)

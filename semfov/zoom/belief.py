@@ -55,11 +55,7 @@ class _Pooled(NamedTuple):
 
 
 class _Look:
-    """A look and its predictions for N windows: those of up to three closer levels that lie in it.
-
-    Shapes: left `(rows, columns)`, scores `(rows, columns, K)`, visible `(rows, columns, K)`, facts `(N, 6)`, before
-    `(N,)`, odds `(N,)`, stale `(N,)`.
-    """
+    """A look and its predictions for N windows in it, of up to three closer levels; facts `(N, 6)`, others `(N,)`."""
 
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
         self.gist = gist
@@ -129,16 +125,7 @@ class _Look:
 
 
 class _WindowOdds:
-    r"""Log odds that a look at a window shows a class, for the windows of all levels; left `(rows, columns)`.
-
-    Looks contribute from the coarsest to the closest. A closer look replaces the predictions of coarser ones for the
-    windows inside it, and takes them as an input (`GlimpseEvidence.presence`). With the looks that hold the window w,
-    numbered in this order:
-
-    .. math:: o_i(w) = f(u s_i, w, o_{i-1}(w))
-
-    The hints s of each look count for the share u of their cell that is left to see.
-    """
+    """Log odds that a look at each window shows a class, o_i(w) = f(u s_i, w, o_{i-1}(w)) from the coarsest look on."""
 
     def __init__(
         self, lattice: Lattice, evidence: GlimpseEvidence, target: int, gists: Sequence[Gist], left: Cells
@@ -228,13 +215,7 @@ class Rates(Protocol):
 
 
 class _WindowSums:
-    r"""Weighted sums of the cells of every window; weight `(span,)`, shape `(rows, columns)`.
-
-    .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
-
-    A sum along an axis is a product with a banded matrix. Only the windows that hold a cell which has changed are
-    summed again. A window that reaches beyond the cells sums those that it holds.
-    """
+    """Weighted sums of the cells of every window, by banded matrices, renewed where cells change; weight `(span,)`."""
 
     def __init__(self, weight: Cells, shape: tuple[int, int], cells: Callable[[_Place], Cells]) -> None:
         self._span, self._cells = len(weight), cells
@@ -264,22 +245,11 @@ _EVERYWHERE: _Place = (slice(None), slice(None))
 
 
 class ZoomBelief:
-    r"""What looks at any window of a picture are expected to show, for one class.
+    r"""What looks at any window are expected to show, for one class; source, left and blank `(rows, columns)`.
 
-    Each cell x is predicted from the closest look at it, of level s(x), whose rates are :math:`\lambda_1`,
-    :math:`\lambda_2` and :math:`\lambda_3` for looks one, two and three octaves closer. A look of level k is expected
-    to find this number of objects centred in the cell, where u(x) is 0 once nothing is left to see in it, and 1 before:
-
-    .. math:: n_k(x) = u(x) \, \lambda_{k - s(x)}(x), \qquad \lambda_i = 0 \text{ for other } i
-
-    For a picture with L levels the belief keeps L + 3 numbers for a cell. Hints of all classes are kept for the windows
-    that were looked at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells and six levels:
-    1.8 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep the hints of each look that are left to
-    see and what they predict for its windows, at most 0.41 MB.
-
-    Sums over windows (`WindowSums`) and log odds (`_WindowOdds`) are kept, and computed anew where cells have changed.
-
-    Shapes: source, left and blank `(rows, columns)`.
+    A look of level k is expected to find :math:`n_k(x) = u(x) \, \lambda_{k - s(x)}(x)` objects centred in a cell, by
+    the rates of the closest look at it, of level s(x). u(x) is 0 once nothing is left to see in it. What is known of
+    windows is kept, and computed anew where cells have changed.
     """
 
     def __init__(
@@ -347,11 +317,7 @@ class ZoomBelief:
         self._mark(box, left=False)
 
     def discount(self, window: Window) -> None:
-        """Expect nothing more inside a window, because it was looked at as closely as possible, or is about to be.
-
-        This includes the cells at its borders. Objects that a border cuts are centred in the next window as often as in
-        this one, and looking at borders again finds less than looking elsewhere.
-        """
+        """Expect nothing more inside a window and at its borders, where a second look finds less than one elsewhere."""
         x1, y1, x2, y2 = window.cells
         x1, y1, x2, y2 = max(x1, 0), max(y1, 0), min(x2, self.lattice.columns), min(y2, self.lattice.rows)
         if x1 < x2 and y1 < y2:
@@ -439,16 +405,7 @@ class ZoomBelief:
         return self._sums[level, octaves].update()
 
     def chances(self, level: int) -> Cells:
-        r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
-
-        Looks at a part of a window, from its level or closer, have not shown the class there. If they covered all of
-        the window but the share u (`unseen`), the evidence P counts only for that share, as if the object could be
-        anywhere in the window:
-
-        .. math:: p(w) = u(w) \, P(w)
-
-        Shapes: → `(down, across)`.
-        """
+        """Probability that a look at each window shows the class, times the share that no closer look has shown."""
         probability: Cells = torch.from_numpy(self._level_odds(level)).sigmoid().numpy()
         return probability * self.unseen(level)
 
@@ -460,10 +417,7 @@ class ZoomBelief:
 
 
 def before_of(rate: Cells, look: Gist) -> Tensor:
-    """Logarithms of the rates that earlier looks predicted for a look's cells, one octave closer than the look.
-
-    Shapes: rate `(rows, columns)` → `(rows, columns)`.
-    """
+    """Logarithms of the rates `(rows, columns)` of earlier looks in a look's cells, one octave closer than the look."""
     before = torch.from_numpy(rate)
     rows, columns = look.scores.shape[:2]
     if look.scale > 1:

@@ -12,10 +12,7 @@ _Spans = list[tuple[int, int]]
 
 
 def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
-    """Cells whose pixels have no data, or all have the colour of a corner and lie in one blank area with the border.
-
-    Shapes: → `(rows, columns)` boolean; None where no cell is blank.
-    """
+    """Cells `(rows, columns)` without data, or of a corner's colour up to the border; None where no cell is blank."""
     (width, height), (wide, high) = lattice.size, (min(64, length) for length in lattice.size)
     corners = [(x, y, x + wide, y + high) for y in (0, height - high) for x in (0, width - wide)]
     parts = [picture.pixels(box) for box in corners]

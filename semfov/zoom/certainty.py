@@ -36,22 +36,15 @@ _SURE, _SEVERAL, _PART = 0.5, 5, 0.6
 
 @dataclass(frozen=True)
 class Certainty:
-    r"""A logistic regression from facts f about an object to the probability that its box and class are right.
+    r"""A logistic regression from facts about an object to the probability that its box and class are right.
 
-    .. math:: \operatorname{logit} p = a + \sum_i b_i f_i
+    The number n of objects that looks would still show is negative binomial. The evidence expects :math:`R_1` in cells
+    that clearly promise one and :math:`R_2` in others; looks have shown F new ones where it promised W:
 
-    The number n of objects that looks would still show is about :math:`c R`. The evidence expects :math:`R_1` objects
-    in cells that clearly promise one and :math:`R_2` in others, most of which count less, because many cells promise a
-    little where nothing is. The scale c is learned from the looks that were made: if they showed F new objects where
-    the evidence promised W, its distribution is a Gamma distribution, and n is negative binomial:
+    .. math:: R = R_1 + w R_2, \qquad E[c] = \frac{k c_0 + F}{k + u W}, \qquad
+              E[n] = E[c] R, \qquad \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
 
-    .. math::
-        R = R_1 + w R_2, \qquad
-        E[c] = \frac{k c_0 + F}{k + u W}, \qquad
-        \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
-
-    Pictures differ in how far all this suits them: the `spread` is the standard deviation of the share of the expected
-    number by which it is off for that reason.
+    The `spread` is the standard deviation of the share by which the model is off in a picture.
     """
 
     offset: float
@@ -94,25 +87,15 @@ class Certainty:
 
 
 def reacts(chances: Tensor) -> bool:
-    """Whether a detector reacts to the objects with these probabilities `(M,)`, so that their number can be believed.
-
-    It does where five or more of them have a probability of one half, or where these make up three fifths of the sum
-    of all. Otherwise most of that sum is of faint candidates.
-    """
+    """Whether a detector reacts to objects of these probabilities `(M,)`: several are likely, or most of their sum."""
     sure = chances[chances >= _SURE]
     return len(sure) >= _SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
 
 
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
-    r"""Mean and variance of the number of objects with some probabilities, and of those that no look has shown.
+    r"""Mean and variance of the number of objects with probabilities `(M,)`, and of those that no look has shown.
 
-    The former are independent (a Poisson-binomial distribution), the latter have the distribution of `Certainty`:
-
-    .. math::
-        E = \sum_i p_i + E[n], \qquad
-        \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
-
-    Shapes: chances `(M,)`.
+    .. math:: E = \sum_i p_i + E[n], \qquad \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
     """
     each = chances.double()
     mean = float(each.sum()) + unseen[0]

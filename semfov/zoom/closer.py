@@ -31,11 +31,9 @@ _SMALLEST = 1e-4
 
 
 def closer_window(lattice: Lattice, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Window:
-    """The window that shows a box closely, with its surroundings; box `(4,)`.
+    """The window around a box `(4,)`, three times its longer side and at most an octave above the last level.
 
-    It is three times as large as the longer side of the box (`semfov.sensor.glimpse.window_around`), but its
-    magnification is at most one octave above that of the last level: pictures show no more beyond it. In a `photograph`
-    two numbers of its evidence say how large it is: usually 0.6 of the longer side at least, to show other places, too.
+    In a `photograph` two numbers of its evidence say how large it is, to show other places, too.
     """
     least, context = photograph
     if lattice.levels > 1:
@@ -61,18 +59,12 @@ class WindowLook(NamedTuple):
 
 
 class CandidateBoxes(CandidatePlaces[WindowLook]):
-    r"""Boxes that seem to hold the target of one search.
-
-    The next one is the detection with the highest score s of the target that does not overlap an examined place by
-    half. The probability that the target is there is taken from the probability P that the picture holds the target,
-    which follows from the highest score :math:`s^*` of the search:
+    r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
 
     .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
 
-    It is due if this probability is at least `likely`, or when no other look follows.
-
-    In a stream the scores of earlier frames count less, and detections and examined places are forgotten when half of
-    the evidence is left (`semfov.episode.Forgetting`).
+    with the highest score :math:`s^*` of the search, which gives the probability P of the picture. In a stream scores
+    fade, and places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
     """
 
     least = DETECTION_SCORE
@@ -136,11 +128,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
 
 class PhotographPlaces(CandidateBoxes):
-    r"""Places of a photograph that seem to hold the target, hints among them.
-
-    A look at a place is worth the probability that the target is there, and at none of the places looked at before:
-
-    .. math:: v = p \, (1 - \max_i p_i)
+    r"""Places of a photograph, hints among them; a look at one is worth :math:`v = p \, (1 - \max_i p_i)`.
 
     A place whose window is nearly the whole photograph is examined in the look at the whole, without a pass.
     """

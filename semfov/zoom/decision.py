@@ -31,11 +31,7 @@ class _LookFacts(NamedTuple):
 
 
 class SearchFacts:
-    """What the looks of a search have shown of the target, and what is left to see.
-
-    `best` is the highest score of the target in any look, and `box` `(4,)` that of the detection with the highest one,
-    None if there is none. `detected` tells whether a detection shows it, so that a search can name a box as found.
-    """
+    """What looks have shown of the target: the highest score, its `box` `(4,)`, and whether a detection shows it."""
 
     best: float
     box: Tensor | None
@@ -67,14 +63,7 @@ class SearchFacts:
         self.box, self.detected = shown.box if shown.found > 0 else None, shown.found >= DETECTION_SCORE
 
     def case(self, ahead: float) -> Tensor:
-        """Facts about the search for `GlimpseEvidence.anywhere`; → `(10,)`.
-
-        As features of scores: the highest and the second highest score of the target in a look, the highest in a look
-        of the last level, the score in the overview, the highest of a detection whose best class is the target, and the
-        value of the best look that is left. As a logarithm: the number of looks of the last level, side by side over
-        the picture, that are still expected to show the target. Then the share of the picture that is left to see. As
-        logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
-        """
+        """Facts `(10,)` for `GlimpseEvidence.anywhere`: six scores, what is left to see, and numbers of looks."""
         looks = self.looks
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
         closest, named = max(look.closest for look in looks), max(look.named for look in looks)
@@ -106,10 +95,7 @@ _DEFAULTS = Thresholds(0.9, 0.005)
 
 
 class WindowDecisions:
-    """Decides one search by windows, turn by turn, with closer looks where the evidence has fitted verification.
-
-    Shapes: close_up `(4,)`.
-    """
+    """Decides one search by windows, turn by turn, with closer looks where the evidence has fitted verification."""
 
     def __init__(
         self,

@@ -99,16 +99,11 @@ def look_by_look(
     forgetting: Forgetting | None = None,
     guess: _Guess | None = None,
 ) -> Iterator[WindowStep[_Belief]]:
-    r"""Look at the whole picture, and then at the windows of an order, until it has none left.
+    """Look at the whole picture, and then at the windows of an order, until it has none left.
 
-    The next windows are chosen after a turn was taken: a caller that wants no further turn spends no time on it. The
-    one that is guessed is resampled during the look before, by a second thread. After a look of the last level it is
-    known: nothing that such a look shows changes the belief.
-
-    In a stream (`LiveGlances.show`) looks are forgotten. A look counts for :math:`\ln 2 / r` frames, in which half of
-    its evidence would fade at the rate r, or until the next look at its window. The window is then free again. The
-    overview is renewed after as many frames. The episode has no end: where the order has no window left, the window
-    that was looked at longest ago is looked at again.
+    The next windows are chosen after a turn was taken; the guessed one is resampled by a second thread during the look
+    before. In a stream a look counts for the frames in which half of its evidence would fade, or until the next look at
+    its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
     recent, first = _Recent(belief, forgetting), Window.overview(glances.lattice)
 

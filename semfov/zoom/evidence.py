@@ -46,11 +46,7 @@ def features(scores: Tensor) -> Tensor:
 
 
 def _hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
-    """List the maps of one look: hints, detections and sizes of objects in and around each cell.
-
-    Shapes: own `(T, rows, columns)`, best `(rows, columns)`, detections `(T, rows, columns)`, size `(rows, columns)`,
-    crowd `(rows, columns)` → `(T, rows, columns)`.
-    """
+    """Maps `(T, rows, columns)` of one look: hints, detections and sizes of objects in and around each cell."""
 
     def wide(values: Tensor) -> Tensor:
         return values.expand(own.shape)
@@ -117,16 +113,9 @@ def _through(network: nn.Sequential, values: Tensor, outputs: slice | None = Non
 
 
 class Survey(nn.Module):
-    r"""Predicts how many objects of any class closer looks find that a look did not.
+    r"""Predicts how many objects of any class closer looks find, :math:`E[n(w)] = \sum_{x \in w} r(x) \lambda(x)`.
 
-    The expected number in a part w of the window is a sum over its cells. Its weights fall off towards the border of w,
-    which cuts objects that lie there:
-
-    .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
-
-    The rate λ is a network over the hints about a cell. Which classes these are matters, because some come in numbers.
-    The network therefore reads, besides the strongest hint, a few sums over the hints of all classes with learned
-    weights, in the cell itself and averaged over its neighbours.
+    The network λ reads sums over the hints of all classes with learned weights, because some come in numbers.
     """
 
     def __init__(self, classes: int, *, foresight: float = 0.35) -> None:
@@ -138,10 +127,7 @@ class Survey(nn.Module):
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
 
     def rates(self, look: Gist, targets: Tensor | None = None, before: Tensor | None = None) -> Tensor:
-        """Predict how many objects centred in each cell closer looks find that this look did not.
-
-        Shapes: targets `(1,)`, before `(1, rows, columns)` → `(1, 3, rows, columns)`.
-        """
+        """Log numbers `(1, 3, rows, columns)` of objects that only closer looks find; before `(1, rows, columns)`."""
         hints, best = features(look.scores), features(look.best)
         # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
         detections = look.found.to(best).amax(-1)
@@ -164,17 +150,11 @@ class Survey(nn.Module):
 
 
 class PhotographEvidence(nn.Module):
-    r"""Whether a photograph holds a class, by a look at the whole and by closer looks at places that seem to hold it.
-
-    After the look at the whole the log odds follow from the highest score s of the class in any hint, and from the
-    share :math:`q_t` of photographs that hold the class:
+    r"""Whether a photograph holds a class, by the highest score s of a hint and the share q of photographs.
 
     .. math:: \operatorname{logit} P(t) = a \operatorname{logit} s + b \operatorname{logit} q_t + c
 
-    `verification` has the probabilities after a closer look, and `certainty` that of an object. `window` is the size of
-    the window of a closer look (`semfov.zoom.closer.closer_window`).
-
-    Shapes: usual `(K,)`, :math:`\operatorname{logit} q`.
+    `verification`, `certainty` and the `window` of a closer look are those of photographs; usual `(K,)` is logit q.
     """
 
     usual: Tensor
@@ -540,10 +520,7 @@ def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor
 
 
 def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """`pool` for all windows of several sizes; each size is pooled from the next smaller one.
-
-    Shapes: scores `(rows, columns, K)` → `(down, across, K)`.
-    """
+    """`pool` for all windows of several sizes, `(down, across, K)`; each size is pooled from the next smaller one."""
     best = scores.amax(-1)
     maps = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
     by_span: dict[int, tuple[Tensor, Tensor]] = {}

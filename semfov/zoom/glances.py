@@ -60,10 +60,7 @@ class Window:
         return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
 
     def centre(self, lattice: Lattice) -> tuple[float, float]:
-        """Centre of the part of the picture that it shows, `(x, y)` in pixels whose centres are at integers.
-
-        It is not the centre of a window that reaches beyond the picture, as the overview does.
-        """
+        """Centre `(x, y)` in pixels of the part of the picture that it shows, which may end before the window does."""
         x1, y1, x2, y2 = self.region(lattice)
         return (x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2
 

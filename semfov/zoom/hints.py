@@ -22,10 +22,7 @@ DETECTION_SCORE = 0.1
 
 
 class Hints(NamedTuple):
-    """The hints of one look: boxes with class scores, in no order; several may be of one object.
-
-    Shapes: boxes `(N, 4)`, scores `(N, K)`.
-    """
+    """The hints of one look: boxes `(N, 4)` with class scores `(N, K)`, in no order; several may be of one object."""
 
     boxes: Tensor
     scores: Tensor
@@ -33,13 +30,7 @@ class Hints(NamedTuple):
 
 @dataclass(frozen=True)
 class Gist:
-    """The summary of a look at a window: the strongest hint of every class in each cell.
-
-    The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
-    form one cell of the gist.
-
-    Shapes: first `(column, row)`, scores `(rows, columns, K)`, size `(rows, columns)`, found `(rows, columns, K)`.
-    """
+    """The strongest hint of every class in each cell of a look, `(rows, columns, K)`, or in each square of cells."""
 
     level: int
     first: tuple[int, int]

@@ -31,11 +31,7 @@ _EDGE = 2.0
 
 
 def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
-    """The looks at a stream, without the detections whose place a later look has shown as closely.
-
-    What moves would otherwise be shown at every place where a look saw it. A box counts as shown if it lies in the
-    window with half its size around it, as far as the picture reaches.
-    """
+    """The looks at a stream, without detections whose place and surroundings a later look has shown as closely."""
     current = []
     for number, glance in enumerate(glances):
         detections, left = glance.detections, glance.detections.mask[0]
@@ -91,11 +87,7 @@ def merge(
 def merge_with_facts(
     glances: Sequence[Glance], lattice: Lattice, target: int | Sequence[int] | None = None, *, latest: bool = False
 ) -> tuple[Objects, Tensor]:
-    """Merge the detections of several looks as `merge` does, and list the facts about each object.
-
-    A cut box is the same object as one of another look from half of its area on, and the box of an object is the mean
-    over the looks that show it (`_fused`), except in a stream.
-    """
+    """Merge detections as `merge` does, with mean boxes (`_fused`) in still pictures, and list facts of the objects."""
     if not glances:
         return Objects.none(), torch.zeros(0, len(FACTS))
     every = _detected(glances, target)
@@ -112,17 +104,10 @@ def merge_with_facts(
 
 
 def _fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Tensor, magnifications: Tensor) -> Tensor:
-    r"""Mean box of each object over the looks that show it whole, as in weighted boxes fusion.
+    r"""Mean box of each object over the looks that show it whole, :math:`b = \sum_j s_j m_j^2 b_j / \sum_j s_j m_j^2`.
 
-    The box j of its class counts if it overlaps that of the object by half, with its score s and the number of canvas
-    pixels that show a pixel of the picture, the square of the magnification m:
-
-    .. math:: b = \frac{\sum_j s_j m_j^2 b_j}{\sum_j s_j m_j^2}
-
-    Solovyev, R., Wang, W. and Gabruseva, T. (2021), Weighted boxes fusion: ensembling boxes from different object
-    detection models, Image and Vision Computing 107:104117.
-
-    Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, cut `(L,)`, magnifications `(L,)` → `(M, 4)`.
+    Weighted boxes fusion (Solovyev, Wang and Gabruseva, 2021, Image and Vision Computing 107:104117), with the scores s
+    and the magnifications m; index `(M,)`, boxes `(L, 4)`, others `(L,)` → `(M, 4)`.
     """
     first, second, shared, area = _overlapping(boxes.float().numpy())
     chosen, kinds, whole = index.numpy(), labels.numpy(), ~cut.numpy()
@@ -160,10 +145,7 @@ def probable_objects(
 
 
 def shown(objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float) -> Tensor:
-    """Which objects some looks show with a score: one for each box, of its class, that overlaps it by half; → `(M,)`.
-
-    It is the most probable one of those that overlap the box by `_ALIKE`, or else the one that overlaps it most.
-    """
+    """Which objects `(M,)` looks show with a score: for each box the most probable one it fits, or the best fit."""
     counts = torch.zeros(len(objects), dtype=torch.bool)
     if len(objects) and glances:
         boxes, scores, labels, *_ = _detected(glances, target)
@@ -213,14 +195,9 @@ def _object_facts(
     *,
     latest: bool = False,
 ) -> Tensor:
-    """Compute the facts about each object (`FACTS`) from all looks.
+    """Facts `(M, 14)` about the objects `index` `(M,)` (`FACTS`), from boxes `(L, 4)` of looks at windows `(N, 4)`.
 
-    A look shows an object with a box of its class that overlaps it by half, or that the border of the window cuts and
-    of which four fifths lie in it. A look should show an object of 6 canvas pixels or more that lies in its window and
-    not at its border.
-
-    Shapes: index `(M,)`, boxes `(L, 4)`, scores `(L,)`, labels `(L,)`, looks `(L,)`, cut `(L,)`, windows `(N, 4)`,
-    magnifications `(N,)`, size `(width, height)` → `(M, 14)`.
+    A look should show an object of 6 canvas pixels or more that lies in its window and not at its border.
     """
     count = len(index)
     if not count:

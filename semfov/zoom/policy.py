@@ -16,15 +16,10 @@ WindowChoice = tuple[Window, float]
 def best_find(
     belief: ZoomBelief, done: set[Window], foresight: float = 0.0, *, beside: Window | None = None
 ) -> WindowChoice | None:
-    r"""Choose the window in which a look is expected to find most objects that were not found yet.
+    r"""Choose the window in which a look is expected to find most objects, :math:`E[n_k(w)] + \kappa \, E[n_{k+1}(w)]`.
 
-    .. math:: v(w) = E[n_k(w)] + \kappa \, E[n_{k+1}(w)]
-
-    for windows w of all levels k but the first. The second term counts only cells that were not looked at from level k
-    yet: a look at the other cells gives no new information about where to look more closely.
-
-    A window counts for the share of it that lies `beside` one which is being looked at: an estimate, without a change
-    of the belief, of what will be the best one afterwards.
+    The second term counts only cells that were not looked at from level k yet. A window counts for the share of it that
+    does not lie `beside` one which is being looked at: an estimate of the best one afterwards.
     """
     lattice = belief.lattice
     best: WindowChoice | None = None
@@ -38,9 +33,7 @@ def best_hit(
 ) -> WindowChoice | None:
     """Choose the window that most probably shows the target, or one after which the target is soon found.
 
-    The value of a window is the probability that it shows the target. For windows that can be looked at more closely it
-    is the sum of these probabilities over the closer windows in it, divided by `patience`, if that is larger. `beside`
-    is as for `best_find`.
+    A value is the probability of a hit, or the sum of those of the closer windows in it over `patience`, if larger.
     """
     lattice, patience = belief.lattice, belief.evidence.patience
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}

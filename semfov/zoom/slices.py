@@ -20,11 +20,9 @@ def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
 
 
 def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
-    """Slices as people cut them: half as long again as the canvas shows at the largest magnification.
+    """Slices as people cut them, which overlap by a fifth: half as long again as the canvas shows at the last level.
 
-    In a picture that is not four times as long as the canvas they have the largest magnification itself. A photograph
-    has four, each 0.6 as long as its longer side. Neighbours overlap by a fifth. Those that show `blank` cells
-    `(rows, columns)` alone are left out, unless all do.
+    Those of pictures nearly as small as the canvas are shorter. Slices of `blank` cells alone are left out.
     """
     if lattice.levels == 1:
         side = max(1, round(0.6 * max(lattice.size)))

@@ -26,12 +26,7 @@ class _AnyLook(Look):
 
 @dataclass(frozen=True)
 class _AnyBelief(Belief):
-    r"""Belief about any of several classes. It answers for all of them together, and ignores the target asked for.
-
-    .. math:: P(x) = 1 - \prod_k (1 - w_k \, p_k(x))
-
-    The inner beliefs are one for each class, or a single one about all classes; w are the weights by class.
-    """
+    """Belief about any of several classes with weights w, P(x) = 1 - Π_k (1 - w_k p_k(x)), whichever is asked for."""
 
     inner: tuple[Belief, ...]
     weights: Mapping[int, float]

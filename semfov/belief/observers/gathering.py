@@ -20,11 +20,7 @@ _Model = TypeVar("_Model", bound=Evidence)
 
 @dataclass(frozen=True)
 class EvidenceLook(Look):
-    """Evidence `(B, X·Y)` of looks about one class, log odds, or `(B, T, X·Y)` about T classes at once.
-
-    Distances `(B, X·Y)` are those of the fixation from every cell; scores and targets are `(B,)` or `(B, T)`, and the
-    fixated cell is `(B,)`.
-    """
+    """Evidence `(B, X·Y)` of looks about a class, or `(B, T, X·Y)`; distance `(B, X·Y)`, score `(B,)` or `(B, T)`."""
 
     evidence: Tensor
     distance: Tensor
@@ -36,11 +32,7 @@ class EvidenceLook(Look):
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
-    """Base of beliefs that are computed from the evidence of all looks, about one class or each of K classes.
-
-    Of each cell, `(B, X·Y)` or `(B, K, X·Y)`: the evidence of its closest look, the strongest one, and the sum weighted
-    by nearness; of the image: the highest score in any detection `(B,)` or `(B, K)`, and the number of looks `(B,)`.
-    """
+    """Base of beliefs from all looks; cells `(B, X·Y)` or `(B, K, X·Y)`, score `(B,)` or `(B, K)`, looks `(B,)`."""
 
     closest: Tensor
     nearest: Tensor
@@ -75,10 +67,7 @@ class Gatherer(Observer, Generic[_Model]):
         }
 
     def gather(self, belief: GatheredBelief, look: EvidenceLook) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """Gather the evidence of one more look in each episode, for one class or several.
-
-        It gives the attributes of `GatheredBelief`, and the networks' inputs: those of `Gathered` up to the class.
-        """
+        """Gather one more look: the attributes of `GatheredBelief`, and the inputs of `Gathered` up to the class."""
 
         def by_cell(values: Tensor) -> Tensor:
             """`(B, X·Y)`, the same for all classes."""
@@ -100,12 +89,9 @@ class Gatherer(Observer, Generic[_Model]):
         return gathered, [gathered["nearest"], gathered["best"], mean, *unchanged]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
-        r"""Discount the gathered evidence, and count the closest look as one from farther away; see `Observer.fade`.
+        r"""Discount the evidence towards that of nothing seen, and move the closest looks away; see `Observer.fade`.
 
-        The evidence for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards :math:`e_0`, that of a look from
-        far away without detections. The weight of a look, :math:`e^{-d/R}` (`nearness`), is multiplied by k. For the
-        closest look this means :math:`d \leftarrow d - R \ln k`, so that in time a new look from farther away takes its
-        place.
+        A look's weight (`nearness`) is multiplied by k; the closest one moves away by :math:`d \leftarrow d - R \ln k`.
         """
         if keep == 1:
             return belief
