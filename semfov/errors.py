@@ -53,6 +53,12 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
+def check_data(condition: bool, where: object, expected: str, got: object) -> None:
+    """Raise `DataError` with a message in the house's form, for what is wrong in a file, unless a condition holds."""
+    if not condition:
+        raise DataError(f"{where}: expected {expected}, got {got}")
+
+
 def values_known(*tensors: Tensor) -> bool:
     """Tell whether the values of tensors can be read: not while traced, under `torch.func`, or on the device `meta`."""
     if torch.compiler.is_compiling():

@@ -1,14 +1,11 @@
 """Data sets in COCO's format as scenes for visual search; every entry of their files is checked before it is used."""
 
 import contextlib
-import hashlib
 import io
-import json
 import logging
-import os
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -19,8 +16,8 @@ from torch import Tensor
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
-from semfov.errors import DataError, check
-from semfov.io.files import check_regular, json_sha256, sha256
+from semfov.errors import DataError, check, check_data
+from semfov.io.files import check_regular, inside, json_sha256, read_json, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
@@ -36,99 +33,77 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     annotations `id`, `image_id`, `category_id` and `bbox` = `[x, y, width, height]`; these may have `iscrowd`.
     """
     name = f"annotations {Path(path)}"
-    check_regular(path, name)
-    try:
-        raw = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise DataError(f"{name}: no such file; check data.annotations") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{name}: cannot be read ({error})") from None
-    try:
-        data = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{name}: not a JSON file ({error}); fetch it again") from None
-    if not isinstance(data, dict):
-        raise DataError(f"{name}: expected an object with images, annotations and categories, got {_kind(data)}")
-    try:
-        _check(data)
-    except _Fault as fault:
-        raise DataError(f"{name}: {fault}; correct or replace the file") from None
+    data = read_json(path, name=name)
+    expected = "an object with images, annotations and categories"
+    check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
+    _check(data, name)
     from pycocotools.coco import COCO
 
     coco = COCO()
     coco.dataset = data
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
         coco.createIndex()
-    return coco, hashlib.sha256(raw).hexdigest()
+    return coco, sha256(path)
 
 
-class _Fault(Exception):
-    """An error in an entry; the message describes it."""
+_Field = tuple[Callable[[Any], object], str]
+"""Whether a value of an entry fits, and what it is expected to be."""
+
+_ID: _Field = (
+    lambda value: isinstance(value, int | str) and not isinstance(value, bool) and is_plain(str(value)),
+    "an integer or a string without control characters",
+)
+_TEXT: _Field = (
+    lambda value: isinstance(value, str) and value and is_plain(value),
+    "a string without control characters",
+)
+_SIDE: _Field = (
+    lambda value: is_number(value) and 1 <= value <= _LARGEST and value == int(value),
+    "a whole number of pixels",
+)
+_BOX: _Field = (
+    lambda value: isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) >= 0,
+    "[x, y, width, height] with finite numbers and a size of at least 0",
+)
+_WAY = "correct or replace the file"
 
 
-def _check(data: dict[str, Any]) -> None:
-    categories = _ids(data, "categories", {"name": str})
-    images = _ids(data, "images", {"file_name": str})
-    if len({type(i) for i in images}) > 1:
-        raise _Fault("images: expected ids of one kind, got integers and strings")
-    for where, image in _entries(data, "images"):
-        for key in ("width", "height"):
-            if not (is_number(image.get(key)) and 1 <= image[key] <= _LARGEST and image[key] == int(image[key])):
-                raise _Fault(f"{where}: expected {key} to be a whole number of pixels, got {_show(image, key)}")
-    _ids(data, "annotations", {})
-    for where, annotation in _entries(data, "annotations"):
-        for key, ids, what in (("image_id", images, "images"), ("category_id", categories, "categories")):
-            value = annotation.get(key)
-            if isinstance(value, bool) or not isinstance(value, int | str) or value not in ids:
-                got = _show(annotation, key)
-                raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {got}")
-        box = annotation.get("bbox")
-        if not (isinstance(box, list) and len(box) == 4 and all(map(is_number, box)) and min(box[2:]) >= 0):
-            raise _Fault(
-                f"{where}: expected bbox to be [x, y, width, height] with finite numbers and a size of at least 0, "
-                f"got {_show(annotation, 'bbox')}"
-            )
-        if annotation.get("iscrowd", 0) not in (0, 1):
-            raise _Fault(f"{where}: expected iscrowd to be 0 or 1, got {_show(annotation, 'iscrowd')}")
+def _check(data: dict[str, Any], name: str) -> None:
+    """Raise `DataError` with the entry and the field that is missing or has another form than it is used in."""
+    images = _checked_ids_of(data, "images", name, {"id": _ID, "file_name": _TEXT, "width": _SIDE, "height": _SIDE})
+    check_data(
+        len({type(i) for i in images}) < 2, f"{name}: images", "ids of one kind", f"integers and strings; {_WAY}"
+    )
+    categories = _checked_ids_of(data, "categories", name, {"id": _ID, "name": _TEXT})
+    fields: dict[str, _Field] = {
+        "id": _ID,
+        "image_id": (lambda value: _ID[0](value) and value in images, "the id of one of the images"),
+        "category_id": (lambda value: _ID[0](value) and value in categories, "the id of one of the categories"),
+        "bbox": _BOX,
+        "iscrowd": (lambda value: value in (0, 1), "0 or 1"),
+    }
+    _checked_ids_of(data, "annotations", name, fields)
 
 
-def _entries(data: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    entries = data.get(key)
+def _checked_ids_of(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> set[int | str]:
+    """The ids of the entries of a list, which are unique; fields but `iscrowd` are needed in each."""
+    entries, ids = data.get(key), set()
     if not isinstance(entries, list):
-        raise _Fault(f"expected {key} to be a list, got {_kind(entries) if key in data else 'nothing'}")
-    for position, entry in enumerate(entries):
+        raise DataError(f"{name}: expected {key} to be a list, got {_show(data, key)}; {_WAY}")
+    for place, entry in enumerate(entries):
+        where = f"{name}: {key}[{place}]"
         if not isinstance(entry, dict):
-            raise _Fault(f"{key}[{position}]: expected an object, got {_kind(entry)}")
-        yield f"{key}[{position}]", entry
-
-
-def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | str]:
-    """Ids of the entries, checked to be unique; further fields are checked to have their type and not to be empty."""
-    ids: set[int | str] = set()
-    for where, entry in _entries(data, key):
-        identity = entry.get("id")
-        if not isinstance(identity, int | str) or isinstance(identity, bool):
-            raise _Fault(f"{where}: expected id to be an integer or a string, got {_show(entry, 'id')}")
-        if isinstance(identity, str) and not is_plain(identity):
-            raise _Fault(f"{where}: expected id to have no control characters, got {_show(entry, 'id')}")
-        if identity in ids:
-            raise _Fault(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once")
-        ids.add(identity)
-        for field, kind in fields.items():
-            if not isinstance(entry.get(field), kind) or not entry[field]:
-                raise _Fault(f"{where}: expected {field} to be a string, got {_show(entry, field)}")
-            if not is_plain(entry[field]):
-                raise _Fault(f"{where}: expected {field} to have no control characters, got {_show(entry, field)}")
+            raise DataError(f"{where}: expected an object, got {excerpt(entry)}; {_WAY}")
+        for field, (fits, expected) in fields.items():
+            if not fits(entry.get(field, 0 if field == "iscrowd" else None)):
+                raise DataError(f"{where}: expected {field} to be {expected}, got {_show(entry, field)}; {_WAY}")
+        if entry["id"] in ids:
+            raise DataError(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once; {_WAY}")
+        ids.add(entry["id"])
     return ids
 
 
-def _kind(value: object) -> str:
-    names = {dict: "an object", list: "a list", str: "a string", type(None): "null"}
-    return names.get(type(value), "a number" if is_number(value) else type(value).__name__)
-
-
 def _show(entry: dict[str, Any], key: str) -> str:
-    """A value as error messages print it: on one line and short."""
     return excerpt(entry[key]) if key in entry else "nothing"
 
 
@@ -244,10 +219,10 @@ class CocoScenes(Scenes):
                 f"and a class that covers at most {max_target_area} of it; relax min_instances or max_target_area"
             )
         self.ids = [packed.ids[row] for row in self._rows]
-        self._files = [Path(root, packed.names[row]) for row in self._rows]
-        settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
         names = [packed.names[row] for row in self._rows]
-        self.fingerprint = json_sha256([settings, names, _file_sizes(root, self._files)])
+        self._files = [inside(root, name) for name in names]
+        settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
+        self.fingerprint = json_sha256([settings, names, _file_sizes(self._files)])
 
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
@@ -291,12 +266,7 @@ class CocoScenes(Scenes):
             DataError: the file is missing or cannot be read.
         """
         path = self._files[index]
-        check_regular(path, f"image {path}")
-        try:
-            content = sha256(path)
-        except OSError as error:
-            raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
-        return json_sha256([content, self._packed.sizes[self._rows[index]]])
+        return json_sha256([sha256(path, f"image {path}"), self._packed.sizes[self._rows[index]]])
 
 
 def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
@@ -387,26 +357,12 @@ def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> di
     return labels
 
 
-def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
-    """Sizes of files, checked to be regular files inside `root`, also after links are followed."""
-    sizes, missing = [], []
-    base = os.path.realpath(root)
+def _file_sizes(files: list[Path]) -> list[int]:
+    """Sizes of files, checked to be regular ones that are there."""
     for path in files:
-        try:
-            below = Path(os.path.realpath(path)).is_relative_to(base) and ".." not in path.relative_to(root).parts
-        except (OSError, ValueError):
-            below = False
-        if not below:
-            raise DataError(
-                f"image {path}: expected a file inside data.root ({root}), got a file_name that leads out of it"
-            )
         check_regular(path, f"image {path}")
-        try:
-            sizes.append(path.stat().st_size)
-        except OSError:
-            missing.append(path)
-    if missing:
+    if missing := [path for path in files if not path.exists()]:
         raise DataError(
             f"image {missing[0]}: no such file ({len(missing)} of {len(files)} are missing); check data.root"
         )
-    return sizes
+    return [path.stat().st_size for path in files]

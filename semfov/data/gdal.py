@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree as XML
 
 from semfov.errors import DataError
-from semfov.io.files import check_regular, inside
+from semfov.io.files import check_regular, inside, read_bytes
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
 
@@ -74,10 +74,8 @@ def open_raster(path: str | PathLike[str]) -> Any:
 
 def _mosaic_text(path: Path) -> bytes:
     """GDAL's text of a mosaic, made anew of what is known in it; its sources are pictures in its folder or below."""
-    if path.stat().st_size > _MOST_BYTES:
-        raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}")
     try:
-        root = XML.fromstring(path.read_bytes())
+        root = XML.fromstring(read_bytes(path, most=_MOST_BYTES))
     except (XML.ParseError, ValueError, LookupError, RecursionError) as error:
         raise DataError(f"{path}: expected the XML text of a mosaic, got none that can be read ({error})") from None
     if root.tag != "VRTDataset":

@@ -11,7 +11,7 @@ import torch
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.errors import DataError
-from semfov.io.files import check_regular, inside, json_sha256, sha256
+from semfov.io.files import inside, json_sha256, sha256
 
 
 class Pictures(Scenes):
@@ -44,11 +44,7 @@ class Pictures(Scenes):
     def digest(self, index: int) -> str:
         """Compute the sha256 of a file's content."""
         path = self._path(self.ids[index])
-        check_regular(path, f"image {path}")
-        try:
-            return sha256(path)
-        except OSError as error:
-            raise DataError(f"image {path}: cannot be read ({error.strerror})") from None
+        return sha256(path, f"image {path}")
 
     def annotation(self, index: int) -> Annotation:
         """Return an annotation without objects, with the size of the picture."""

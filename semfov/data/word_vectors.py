@@ -14,7 +14,7 @@ from torch import Tensor
 
 from semfov.data.classes import canonical_name
 from semfov.errors import DataError, InputError, check, check_number
-from semfov.io.files import check_regular, sha256
+from semfov.io.files import reading, sha256
 
 _LONGEST = 1 << 20  # characters of a line that are read at once
 _COMMON = """
@@ -64,13 +64,9 @@ class WordVectors:
             InputError: the file has none of the words.
         """
         words = sorted({word for name in names for word in _words_of(name)})
-        check_regular(path)
         vectors: dict[str, Tensor] = {}
-        try:
-            with Path(path).open(encoding="utf-8", errors="replace", newline="\n") as file:
-                _read(iter(lambda: file.readline(_LONGEST), ""), set(words), vectors, str(path))
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+        with reading(path), Path(path).open(encoding="utf-8", errors="replace", newline="\n") as file:
+            _read(iter(lambda: file.readline(_LONGEST), ""), set(words), vectors, str(path))
         some = f"a file with vectors of some of the words {', '.join(words)}"
         check(bool(vectors), "embeddings", some, f"{path}, which has none of them")
         return cls(vectors, [word for word in words if word not in vectors], sha256(Path(path)))

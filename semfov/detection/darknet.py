@@ -16,7 +16,7 @@ from semfov.detection.darknet_config import Section
 from semfov.detection.feature_maps import NetworkStep, landmarks
 from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
-from semfov.io.files import check_regular
+from semfov.io.files import reading
 from semfov.io.schema import excerpt
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -384,15 +384,10 @@ class Darknet(nn.Module):
             weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
         """
         layers = [layer for layer in self.layers if isinstance(layer, Convolution)]
-        check_regular(path, f"weights {str(path)!r}")
-        try:
+        longest = 20 + 4 * sum(_count(layer) for layer in layers)
+        with reading(path, f"weights {str(path)!r}"), Path(path).open("rb") as file:
             length = Path(path).stat().st_size
-            longest = 20 + 4 * sum(_count(layer) for layer in layers)
-            # A longer file is refused below, so it is not read to its end.
-            with Path(path).open("rb") as file:
-                data = bytearray(file.read(longest + 1))
-        except OSError as error:
-            raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
+            data = bytearray(file.read(longest + 1))  # a longer file is refused below, so it is not read to its end
         start = 20
         if len(data) >= 12:
             major, minor, _ = struct.unpack_from("<3i", data)

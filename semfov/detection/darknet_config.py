@@ -3,11 +3,10 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from semfov.errors import DataError
-from semfov.io.files import check_regular, read_text
+from semfov.io.files import read_text
 from semfov.io.schema import excerpt
 
 _MOST_BYTES = 2**20
@@ -80,16 +79,7 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
 def read_cfg(path: str | PathLike[str]) -> list[Section]:
     """Read the sections of a cfg file."""
-    check_regular(path)
-    try:
-        if Path(path).stat().st_size > _MOST_BYTES:
-            size = Path(path).stat().st_size
-            raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes, got {size:,}")
-        return _parse_cfg(read_text(path), str(path))
-    except OSError as error:
-        raise DataError(f"cannot read the cfg {str(path)!r}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{str(path)!r}: expected a Darknet cfg, got a file that is not text") from error
+    return _parse_cfg(read_text(path, most=_MOST_BYTES), str(path))
 
 
 _ANCHORS = "10,13, 16,30, 33,23, 30,61, 62,45, 59,119, 116,90, 156,198, 373,326"

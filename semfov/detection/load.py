@@ -254,9 +254,4 @@ def _given_names(classes: Any) -> tuple[str, ...]:
 
 def class_lines(path: str | PathLike[str]) -> tuple[str, ...]:
     """Class names from the lines of a file."""
-    check_regular(path)
-    try:
-        lines = read_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the class names in {str(path)!r}: {error}") from error
-    return tuple(line.strip() for line in lines if line.strip())
+    return tuple(line.strip() for line in read_text(path).splitlines() if line.strip())

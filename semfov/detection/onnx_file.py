@@ -11,8 +11,8 @@ from semfov.detection.onnx_heads import STRIDES, cells
 from semfov.detection.onnx_session import check_file
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, read_text, sha256, write_bytes
-from semfov.io.schema import excerpt, is_number, is_plain
+from semfov.io.files import read_text, sha256, write_bytes
+from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, check_content, is_plain
 
 _MOST_BYTES = 2**20
 """Largest number of bytes of a settings file."""
@@ -23,19 +23,17 @@ _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer one
 METADATA_KEY = "semfov"
 """Key of the settings, as JSON, in the metadata of models that semfov exports."""
 
-_KEYS: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "head": (str,),
-    "classes": (list,),
-    "input_size": (int, list),
-    "stride": (int, type(None)),
-    "background": (str,),
-    "logits": (bool,),
-    "preprocessing": (dict,),
-    "licence": (str,),
-    "source": (str,),
-}
-"""Keys of a settings file, with the types of their values; `licence` and `source` are for people."""
+_SETTINGS = Object(
+    {
+        **dict.fromkeys(("name", "head", "background"), Text()),
+        "classes": Array(Text()),
+        "input_size": Array(Number(whole=True)),
+        "stride": Maybe(Number(whole=True)),
+        "logits": Flag(),
+        "preprocessing": Object(others=Json()),
+        **dict.fromkeys(("licence", "source"), Text()),  # for people
+    }
+)
 
 
 def check_canvas(name: str, size: tuple[int, int]) -> None:
@@ -46,45 +44,21 @@ def check_canvas(name: str, size: tuple[int, int]) -> None:
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """Settings in a model's metadata, by semfov or Ultralytics, overridden by those in `model.json` beside it."""
-    beside = path.with_suffix(".json")
-    inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
-    outside: dict[str, Any] = {}
-    if beside.exists():
-        check_regular(beside)
-        if beside.stat().st_size > _MOST_BYTES:
-            raise DataError(f"{beside}: expected at most {_MOST_BYTES:,} bytes, got {beside.stat().st_size:,}")
+    texts = {f"metadata of {path.name}": metadata[METADATA_KEY]} if METADATA_KEY in metadata else {}
+    if (beside := path.with_suffix(".json")).exists():
+        texts[str(beside)] = read_text(beside, most=_MOST_BYTES)
+    found, preprocessing = _ultralytics(metadata), dict[str, Any]()
+    for where, text in texts.items():
         try:
-            text = read_text(beside)
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"cannot read {beside}: {error}") from error
-        outside = _parse(text, str(beside))
-    preprocessing = {**inside.get("preprocessing", {}), **outside.get("preprocessing", {})}
-    return {**_ultralytics(metadata), **inside, **outside, "preprocessing": preprocessing}
-
-
-def _parse(text: str, where: str) -> dict[str, Any]:
-    try:
-        settings = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
-    except (ValueError, RecursionError):  # integers too long, lists too deep
-        raise DataError(f"{where}: expected JSON, got numbers that are too long or lists that are too deep") from None
-    if not isinstance(settings, dict):
-        raise DataError(f"{where}: expected an object, got {excerpt(settings)}")
-    unknown = sorted(set(settings) - set(_KEYS))
-    if unknown:
-        raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(_KEYS)}")
-    for key, value in settings.items():
-        if not isinstance(value, _KEYS[key]):
-            kinds = " or ".join(kind.__name__ for kind in _KEYS[key])
-            raise DataError(f"{where}: {key}: expected {kinds}, got {excerpt(value)}")
-    names, size = settings.get("classes", []), settings.get("input_size", 1)
-    if not all(isinstance(name, str) and is_plain(name) for name in names):
-        raise DataError(f"{where}: classes: expected names without control characters, got {excerpt(names)}")
-    for number in size if isinstance(size, list) else [size]:
-        if not is_number(number, whole=True):
-            raise DataError(f"{where}: input_size: expected whole numbers, got {excerpt(size)}")
-    return settings
+            settings = json.loads(text)
+        except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
+            raise DataError(f"{where}: cannot be read as JSON ({error}); correct it") from None
+        if isinstance(settings, dict) and isinstance(side := settings.get("input_size"), int):
+            settings["input_size"] = [side, side]
+        check_content(where, settings, _SETTINGS)
+        preprocessing |= settings.get("preprocessing", {})
+        found |= settings
+    return {**found, "preprocessing": preprocessing}
 
 
 def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-from semfov.errors import DataError
+from semfov.errors import DataError, check_data
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
 _OLD = 24 * 3600.0
@@ -32,8 +33,7 @@ def discard_unfinished() -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: a context manager that replaces `path` once its block has ended without an error."""
     path = Path(path)
-    if not path.name:
-        raise DataError(f"cannot write {str(path)!r}: expected the name of a file")
+    check_data(bool(path.name), f"cannot write {str(path)!r}", "the name of a file", "none")
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def _sweep(folder: Path) -> None:
                         Path(entry.path).unlink()
 
 
-def inside(folder: str | Path, name: str, *, links: bool = False) -> Path:
+def inside(folder: str | os.PathLike[str], name: str, *, links: bool = False) -> Path:
     """Join a folder and a name from elsewhere; refuses names that lead out of it, with `links` unless by a link."""
     folder = Path(folder)
     try:
@@ -77,8 +77,7 @@ def inside(folder: str | Path, name: str, *, links: bool = False) -> Path:
         lies = (resolved.is_relative_to(within) or (links and plain)) and resolved != within
     except (OSError, ValueError, RuntimeError):
         lies = False
-    if not lies:
-        raise DataError(f"{folder}: expected the name of a file in this folder, got {name!a}, which leads out of it")
+    check_data(lies, folder, "the name of a file in this folder", f"{name!a}, which leads out of it")
     return path
 
 
@@ -100,10 +99,8 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
         raise DataError(f"{name}: not the name of a file") from None
     except OSError:
         return
-    kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-    if not stat.S_ISREG(mode):
-        got = next((name for is_kind, name in kinds.items() if is_kind(mode)), "a device")
-        raise DataError(f"{name}: expected a file, got {got}")
+    kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+    check_data(stat.S_ISREG(mode), name, "a file", kinds.get(stat.S_IFMT(mode), "a device"))
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
@@ -118,15 +115,44 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
         raise DataError(f"cannot write {path}: no permission to write in {place}")
 
 
-def read_text(path: str | os.PathLike[str], otherwise: str | None = None) -> str:
+@contextmanager
+def reading(path: str | os.PathLike[str], name: str | None = None) -> Iterator[None]:
+    """Raise `DataError` for a file that is not there, no regular one, or cannot be read in the block."""
+    check_regular(path, name)
+    try:
+        yield
+    except FileNotFoundError:
+        raise DataError(f"{name or path}: no such file; check the path") from None
+    except OSError as error:
+        raise DataError(f"{name or path}: cannot be read ({error.strerror or error})") from None
+
+
+def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> bytes:
+    """The content of a file of at most `most` bytes."""
+    with reading(path, name):
+        size = Path(path).stat().st_size
+        check_data(most is None or size <= most, name or path, f"at most {most or 0:,} bytes", f"{size:,}")
+        return Path(path).read_bytes()
+
+
+def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, most: int | None = None) -> str:
     """The text of a file in UTF-8, UTF-16 or UTF-32, with a byte order mark or without; or in another encoding."""
-    content = Path(path).read_bytes()
+    content = read_bytes(path, most=most)
     try:
         return content.decode(_encoding(content))
-    except UnicodeDecodeError:
+    except UnicodeDecodeError as error:
         if otherwise is None:
-            raise
+            raise DataError(f"{path}: expected a file of text, got other bytes ({error}); save it as UTF-8") from None
         return content.decode(otherwise, "replace")
+
+
+def read_json(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> Any:
+    """The content of a file of JSON (`read_bytes`)."""
+    try:
+        return json.loads(read_bytes(path, most=most, name=name))
+    except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
+        reason = " ".join(str(error).split())
+        raise DataError(f"{name or path}: cannot be read as JSON ({reason}); correct or replace the file") from None
 
 
 def _encoding(content: bytes) -> str:
@@ -154,9 +180,9 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def sha256(path: str | Path) -> str:
+def sha256(path: str | os.PathLike[str], name: str | None = None) -> str:
     """Compute the sha256 of a file's content, as hexadecimal digits."""
-    with Path(path).open("rb") as file:
+    with reading(path, name), Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -7,9 +7,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
-from semfov.errors import DataError, InputError
-from semfov.io.files import check_regular, inside, sha256, write_text
-from semfov.io.schema import CLASSES, Array, Flag, Json, Maybe, Number, Object, Schema, Text
+from semfov.errors import DataError, check_data
+from semfov.io.files import inside, read_json, sha256, write_text
+from semfov.io.schema import CLASSES, Array, Flag, Json, Maybe, Number, Object, Text, check_content
 from semfov.io.storage import check_version, checksum
 from semfov.version import __version__
 
@@ -24,46 +24,30 @@ _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", 
 
 
 _PART = Object(
-    {
-        "file": Maybe(Text()),
-        "sha256": Maybe(Text()),
-        "used": Flag(),
-        "why": Text(),
-        "settings": Object(others=Json()),
-    },
+    {"file": Maybe(Text()), "sha256": Maybe(Text()), "used": Flag(), "why": Text(), "settings": Object(others=Json())},
     required=("file", "sha256", "used", "why", "settings"),
 )
-_SCHEMA = Schema(
-    {},
-    {
-        "kind": Text((_KIND,)),
-        "version": Text(),
-        "classes": CLASSES,
-        "detector": Object(
-            {
-                "name": Text(),
-                "sha256": Text(),
-                "model": Maybe(Text()),
-                "model_file": Maybe(_PLACE),
-                "weights_file": Maybe(_PLACE),
-                "options": Object(others=Json()),
-            },
-            required=("name", "sha256", "options"),
-        ),
-        "sensor": Object(
-            {
-                "name": Text(),
-                "reference": Number(above=0),
-            },
-            # The others depend on the sensor, which checks them when it is made.
-            others=Json(),
-            required=("name", "reference"),
-        ),
-        "grid": Array(Number(1, 200), 2),
-        "parts": Object(dict.fromkeys(PARTS, _PART)),
-        "training": Object(others=Json()),
-    },
-)
+_RECORD = {
+    "kind": Text((_KIND,)),
+    "version": Text(),
+    "classes": CLASSES,
+    "detector": Object(
+        {
+            "name": Text(),
+            "sha256": Text(),
+            "model": Maybe(Text()),
+            "model_file": Maybe(_PLACE),
+            "weights_file": Maybe(_PLACE),
+            "options": Object(others=Json()),
+        },
+        required=("name", "sha256", "options"),
+    ),
+    # Further values depend on the sensor, which checks them when it is made.
+    "sensor": Object({"name": Text(), "reference": Number(above=0)}, Json(), ("name", "reference")),
+    "grid": Array(Number(1, 200), 2),
+    "parts": Object(dict.fromkeys(PARTS, _PART)),
+    "training": Object(others=Json()),
+}
 
 
 @dataclass(frozen=True)
@@ -104,18 +88,12 @@ class Manifest:
         if recorded != checksum({}, record):
             raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
         check_version(path, record)
-        try:
-            _SCHEMA.check({}, record)
-        except InputError as error:
-            raise DataError(f"{path}: not a complete record of models ({error}); {_AGAIN}") from None
+        check_content(path, record, Object(_RECORD, Json(), tuple(_RECORD)))
         parts = {name: Part(**part) for name, part in record["parts"].items()}
         for part in parts.values():
             if part.file is not None:
                 file = inside(Path(folder), part.file)
-                check_regular(file)
-                if not file.is_file():
-                    raise DataError(f"{file}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
-                if sha256(file) != part.sha256:
+                if sha256(file, f"{file}, which {FILE} lists") != part.sha256:
                     raise DataError(f"{file}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
         columns, rows = record["grid"]
         settings = {name: record[name] for name in ("detector", "sensor", "training")}
@@ -126,18 +104,11 @@ _AGAIN = "run semfov fit again, or copy the folder again"
 
 
 def _read(path: Path) -> dict[str, Any]:
-    check_regular(path)
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}; {_AGAIN}")
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         gaze, what = path.with_name("gaze.safetensors"), "a folder of models that semfov fit wrote"
         if gaze.is_file():
             what = f"{what} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
-        raise DataError(f"{path}: no such file; expected {what}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not a readable JSON file ({' '.join(str(error).split())}); {_AGAIN}") from None
-    if not isinstance(record, dict):
-        raise DataError(f"{path}: expected an object, got {type(record).__name__}; {_AGAIN}")
+        raise DataError(f"{path}: no such file; expected {what}")
+    record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
+    check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
     return record

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.errors import check
+from semfov.errors import DataError, InputError, check
 
 _Size = int | str
 """A number, a name such as `K` that stands for the same number in the whole file, or a sum such as `K+1` or `N-1`."""
@@ -186,6 +186,14 @@ class Schema:
         shared = [name for name, each in self.tensors.items() if each.dtype is None and not each.mixed]
         free = {tensors[name].dtype for name in shared if name in tensors}
         check(len(free) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, free))))
+
+
+def check_content(where: object, value: Any, kind: Json) -> None:
+    """Raise `DataError` with the name of a file unless its content meets the requirements."""
+    try:
+        kind.check("", value, {})
+    except InputError as error:
+        raise DataError(f"{where}: {str(error).lstrip('.: ')}") from None
 
 
 def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:

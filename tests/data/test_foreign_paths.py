@@ -42,7 +42,7 @@ def test_files_outside_the_root_are_refused(data, name):
     (root / "link.png").symlink_to(root.parent / "outside.png")
     (root / "folder").symlink_to(root.parent)
     absolute = str(root.parent / "outside.png")
-    unusable(r"expected a file inside data\.root", scenes, absolute if name == "/absolute" else name)
+    unusable("leads out of it", scenes, absolute if name == "/absolute" else name)
 
 
 def test_links_inside_the_root_and_to_the_root_are_followed(data, tmp_path):
@@ -86,7 +86,7 @@ def test_pipes_devices_and_folders_are_refused_before_they_are_read(data, tmp_pa
 def test_control_characters_in_annotations_are_refused(data, text):
     _, scenes = data
     for arguments in ({"identity": text}, {"file_name": text}, {"category": text}):
-        unusable(r"expected (id|file_name|name) to have no control characters, got '", scenes, **arguments)
+        unusable(r"expected (id|file_name|name) to be .* without control characters, got '", scenes, **arguments)
 
 
 @pytest.mark.parametrize("name", ["../a", "/a", "b/../../a", "", ".", "..", "a\0", "link/a", "x" * 5000])

@@ -12,7 +12,7 @@ from typing import Any
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, InputError
-from semfov.io.files import check_regular, read_text
+from semfov.io.files import read_text, reading
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 
@@ -60,25 +60,20 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     remedy = _REMEDIES.get(path.suffix.lower())
     if remedy is not None and path.exists():
         raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
-    if not path.exists():
-        raise DataError(f"{path}: no such file; check the path")
-    check_regular(path)
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         drawn = path.suffix.lower() in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
     if drawn or path.suffix.lower() in VIDEOS:
         got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
         raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
+    text = read_text(path)
+    before = _BEFORE.match(text)
+    text = text[before.end() :] if before else text
+    separator = max(",;\t|", key=text.partition("\n")[0].count)
     try:
-        text = read_text(path)
-        before = _BEFORE.match(text)
-        text = text[before.end() :] if before else text
-        first = text.partition("\n")[0]
-        separator = max(",;\t|", key=first.count)
         table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         lines = [(f"line {table.line_num}", line) for line in table]
-    except (OSError, UnicodeError, csv.Error) as error:
-        remedy = "save it as UTF-8" if isinstance(error, UnicodeError) else "correct or replace the file"
-        raise DataError(f"{path}: cannot be read as a table ({error}); {remedy}") from None
+    except csv.Error as error:
+        raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
     header = [(name or "").strip() for name in table.fieldnames or ()]
     _check_different(str(path), header)
     rows = []

@@ -12,7 +12,7 @@ import numpy as np
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, check
-from semfov.io.files import check_regular, read_text
+from semfov.io.files import read_text
 
 _PICTURE = re.compile(r"^(?:!V IMGLOAD \S+|!V TRIAL_VAR (?:image|picture|img|stimulus))\s+(\S+)", re.IGNORECASE)
 _SIDE = r"[\s,]+(-?[\d.]+)"
@@ -56,11 +56,7 @@ def read_eyelink(
     """
     path = Path(path)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
-    check_regular(path)
-    try:
-        lines = read_text(path, "cp1252").splitlines()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error}); correct or replace the file") from None
+    lines = read_text(path, "cp1252").splitlines()
     trials: list[tuple[str, dict[str, list[tuple[float, float, float]]]]] = []
     frame = next((match for line in lines if (match := _FRAME.match(line))), None)
     x1, y1, x2, y2 = (0.0, 0.0, 0.0, 0.0) if frame is None else map(float, frame.groups())

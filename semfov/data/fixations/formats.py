@@ -14,8 +14,8 @@ import numpy as np
 from semfov.data.fixations.record import Fixations, by_picture
 from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check
-from semfov.io.files import check_regular, read_text, write_text
-from semfov.io.schema import Array, Json, Maybe, Number, Object, Text
+from semfov.io.files import read_json, write_text
+from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_content
 
 _PIXELS = Array(Number(low=-1e6, high=1e6), least=1)
 _MILLISECONDS = Array(Number(low=0, high=1e9))
@@ -332,15 +332,8 @@ def coco_name(name: str) -> str:
 
 def _read(path: Path, kind: Json) -> Any:
     """The content of a JSON file; errors name the file, the record and the field."""
-    check_regular(path)
-    try:
-        value = json.loads(read_text(path))
-    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
-    try:
-        kind.check("", value, {})
-    except InputError as error:
-        raise DataError(f"{path}: {str(error).lstrip('.: ') or 'unexpected content'}") from None
+    value = read_json(path)
+    check_content(path, value, kind)
     return value
 
 

@@ -14,7 +14,7 @@ from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruart
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.table import table_reader
 from semfov.errors import DataError, InputError, check, check_options
-from semfov.io.files import check_regular, read_text
+from semfov.io.files import read_text
 
 _Reader = Callable[..., list[Fixations]]
 DATA_SETS: dict[_Reader, str] = {
@@ -80,11 +80,7 @@ def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | No
         return read_eyelink
     if kind != ".json":
         return table_reader(source, columns)
-    check_regular(source)
-    try:
-        begins = _BEGINNING.match(read_text(source))
-    except (OSError, UnicodeError) as error:
-        raise DataError(f"{source}: cannot be read as JSON ({error}); correct or replace the file") from None
+    begins = _BEGINNING.match(read_text(source))
     if begins is None:
         raise DataError(f"{source}: expected JSON, a list or an object, got other text; correct or replace the file")
     trials, people = begins.groups()
