@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
+from semfov.fit.training import descend
 from semfov.fit.viewing import Events, Viewed, log_centre
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
@@ -69,82 +68,50 @@ def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, 
 
 
 def _fit_map(
-    model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures, fit: GazeFit, title: str = ""
-) -> list[float]:
-    """Fit map and weight of the centre bias to the fixations in some pictures of each group; mean loss of each epoch.
-
-    All pictures count alike. Each readout has its own likelihood, and reads a random part of the channels in each step.
-    """
+    model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures, fit: GazeFit, title: str = "map"
+) -> None:
+    """Fit map and weight of the centre bias to fixations; each readout has its likelihood and reads random channels."""
     generator = torch.Generator().manual_seed(fit.seed)
-    scale = _standardise(model, groups, pictures)
+    scale, batches = _standardise(model, groups, pictures), _batches(pictures, fit.batch, generator)
     parts = model.out.shape[0]
 
-    def loss_of(group: Viewed, number: int, some: Sequence[int]) -> Tensor:
+    def loss_of(_: int) -> Tensor:
+        number, some = next(batches)
+        group = groups[number]
         kept = torch.rand(parts, 1, model.read.shape[1], generator=generator) >= fit.dropout
         mask = (kept / (1 - fit.dropout)).expand(-1, model.out.shape[1], -1).flatten(0, 1) / scale
         values = blurred(model.readouts(group.some(some), group.size, model.read * mask), model.blur.exp())
         values = values + model.centre_bias(group.size)
         log = values - values.flatten(2).logsumexp(2)[..., None, None]
         seen = group.counts[torch.as_tensor(some)]
+        # All pictures count alike.
         return -((log * seen[:, None]).sum((2, 3)).mean(1) / seen.sum((1, 2)).clamp(min=1)).mean()
 
-    weights = [model.read, model.mix, model.out]
-    others = [model.shift, model.mix_shift, model.blur, model.centre_weight]
-    optimiser = torch.optim.AdamW(
-        [{"params": weights, "weight_decay": fit.decay}, {"params": others, "weight_decay": 0.0}], lr=fit.rate
-    )
+    # Only weights of channels decay.
+    own = [
+        {"params": each, "weight_decay": fit.decay * (name in ("read", "mix", "out"))}
+        for name, each in model.named_parameters()
+    ]
     model.train()
-    losses = _train(
-        model, optimiser, loss_of, groups, pictures, fit.batch, generator, title,
-        epochs=fit.epochs, rate=fit.rate, warm=0.1, clip=5.0,
-    )  # fmt: skip
+    descend(own, loss_of, fit.epochs * _steps(pictures, fit.batch), fit.rate, clip=5.0, rise=0.1, title=title)
     with torch.no_grad():
         model.read.div_(scale)
     model.eval()
-    return losses
 
 
-def _train(
-    model: FixationDensity,
-    optimiser: torch.optim.Optimizer,
-    loss_of: Callable[[Viewed, int, Sequence[int]], Tensor | None],
-    groups: Sequence[Viewed],
-    pictures: _Pictures,
-    batch: int,
-    generator: torch.Generator,
-    title: str,
-    *,
-    epochs: int,
-    rate: float,
-    warm: float,
-    clip: float = math.inf,
-) -> list[float]:
-    """Train on random batches of pictures of one group, in random order; returns the mean loss of each epoch."""
-    steps = sum(-(-len(some) // batch) for some in pictures) * epochs
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=warm)
-    means = []
-    with tqdm(total=epochs, desc=title, unit="epoch", leave=False, disable=not title) as bar:
-        for _ in range(epochs):
-            losses, batches = [], list[tuple[int, list[int]]]()
-            for group, some in enumerate(pictures):
-                order = [some[int(place)] for place in torch.randperm(len(some), generator=generator)]
-                batches += [(group, order[start : start + batch]) for start in range(0, len(order), batch)]
-            for place in torch.randperm(len(batches), generator=generator).tolist():
-                number, chosen = batches[place]
-                loss = loss_of(groups[number], number, chosen)
-                if loss is None:
-                    continue
-                optimiser.zero_grad()
-                loss.backward()
-                if clip < math.inf:
-                    torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
-                optimiser.step()
-                schedule.step()
-                losses.append(float(loss.detach()))
-            means.append(sum(losses) / max(len(losses), 1))
-            bar.set_postfix(bits=round(-means[-1] / math.log(2), 3))
-            bar.update()
-    return means
+def _steps(pictures: _Pictures, batch: int) -> int:
+    """Number of batches of pictures in an epoch."""
+    return sum(-(-len(some) // batch) for some in pictures)
+
+
+def _batches(pictures: _Pictures, batch: int, generator: torch.Generator) -> Iterator[tuple[int, list[int]]]:
+    """Random batches of pictures of one group, with its number, in random order, epoch after epoch."""
+    while True:
+        batches = list[tuple[int, list[int]]]()
+        for group, some in enumerate(pictures):
+            order = [some[int(place)] for place in torch.randperm(len(some), generator=generator)]
+            batches += [(group, order[start : start + batch]) for start in range(0, len(order), batch)]
+        yield from (batches[place] for place in torch.randperm(len(batches), generator=generator).tolist())
 
 
 def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures) -> Tensor:
@@ -180,12 +147,9 @@ def fit_oculomotor(
     fit: GazeFit,
     *,
     rate: float = 0.03,
-    title: str = "",
+    title: str = "saccades",
 ) -> None:
-    """Fit oculomotor biases and gains to the next fixations, given the maps of these pictures.
-
-    Shapes: maps `(1, rows, columns)`, or one for each person.
-    """
+    """Fit oculomotor biases and gains to the next fixations; maps `(1, rows, columns)`, or one for each person."""
     generator = torch.Generator().manual_seed(fit.seed)
     model.oculomotor = OculomotorBias()
     places = [{picture: row for row, picture in enumerate(some)} for some in pictures]
@@ -194,8 +158,11 @@ def fit_oculomotor(
         for group, some in zip(groups, pictures, strict=True)
     ]
 
-    def loss_of(group: Viewed, number: int, some: Sequence[int]) -> Tensor | None:
-        size = group.size
+    batches = _batches(pictures, fit.batch, generator)
+
+    def loss_of(_: int) -> Tensor | None:
+        number, some = next(batches)
+        size = groups[number].size
         centre = model.centre_bias(size).detach()
         losses = []
         for picture in some:
@@ -217,11 +184,8 @@ def fit_oculomotor(
             losses.append(F.cross_entropy(log.flatten(1), target))
         return torch.stack(losses).mean() if losses else None
 
-    optimiser = torch.optim.AdamW(model.oculomotor.parameters(), lr=rate, weight_decay=1e-3)
-    _train(
-        model, optimiser, loss_of, groups, pictures, fit.batch, generator, title,
-        epochs=fit.saccade_epochs, rate=rate, warm=0.2,
-    )  # fmt: skip
+    steps, own = fit.saccade_epochs * _steps(pictures, fit.batch), model.oculomotor.parameters()
+    descend(own, loss_of, steps, rate, clip=None, decay=1e-3, rise=0.2, title=title)
 
 
 def _for_events(maps: _MapsOfPicture, events: Events) -> Tensor:

@@ -69,7 +69,7 @@ class TargetSearch(ABC, Generic[LookType]):
 
 
 class SearchedPhotograph:
-    """A photograph with the classes to search for, and all looks at it so far."""
+    """A photograph with the classes to search for, and all looks at it so far, by cell and by box."""
 
     def __init__(
         self,
@@ -80,30 +80,13 @@ class SearchedPhotograph:
         grid: Grid,
         targets: tuple[DrawnSearch, ...],
         store: DetectionStore | None = None,
-        everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
-        self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.targets, self.everywhere = grid, targets, everywhere
+        self.eye, self.scenes, self.index, self.number, self.grid, self.targets = (
+            eye, scenes, index, number, grid, targets,
+        )  # fmt: skip
         self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(eye, lambda: scenes[index].image[None], grid), store, lambda: scenes.digest(index)
         )
-        self._from_cells: Detections | None = None
-
-    def close(self) -> None:
-        """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
-        self._from_cells = None
-        self.looks.close()
-
-    def look(self, cell: int) -> Detections:
-        """Look from the centre of a cell; returns the detections, a batch of one."""
-        if self.everywhere is None:
-            return self.looks(cell)
-        self._from_cells = self.everywhere(self.index) if self._from_cells is None else self._from_cells
-        return self._from_cells[cell : cell + 1]
-
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-        return self.looks(tuple(box.tolist()))
 
 
 def open_photographs(
@@ -114,7 +97,6 @@ def open_photographs(
     *,
     store: DetectionStore | None = None,
     spare: int = 0,
-    everywhere: Callable[[int], Detections] | None = None,
 ) -> list[SearchedPhotograph]:
     """Draw classes to search for in photographs, by a `VerificationConfig`."""
     photographs, seed, area = list[SearchedPhotograph](), config.seed, config.max_target_area
@@ -127,11 +109,9 @@ def open_photographs(
         more = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
         wide = choose_searches(scenes, index, grid, protocol, config.classes, area, more)
-        search_targets = tuple(search._replace(spare=number >= len(targets)) for number, search in enumerate(wide))
+        drawn = tuple(search._replace(spare=number >= len(targets)) for number, search in enumerate(wide))
         if targets:
-            photographs.append(
-                SearchedPhotograph(eye, scenes, index, len(photographs), grid, search_targets, store, everywhere)
-            )
+            photographs.append(SearchedPhotograph(eye, scenes, index, len(photographs), grid, drawn, store))
     return photographs
 
 
@@ -143,9 +123,13 @@ class _PhotographSearch(TargetSearch[Step]):
     def __init__(
         self, photograph: SearchedPhotograph, target: DrawnSearch, evidence: TargetEvidence, looks: int
     ) -> None:
-        places = partial(CandidateCells, photograph.grid, target.target)
         super().__init__(
-            photograph.number, target.target, places, photograph.close_up, present=target.present, spare=target.spare
+            photograph.number,
+            target.target,
+            partial(CandidateCells, photograph.grid, target.target),
+            lambda box: photograph.looks(tuple(box.tolist())),
+            present=target.present,
+            spare=target.spare,
         )
         self.photograph, self.sought, self.evidence, self.most_looks = photograph, target, evidence, looks
 
@@ -153,7 +137,7 @@ class _PhotographSearch(TargetSearch[Step]):
     def steps(self) -> list[Step]:
         """Looks where the class is most probable, at most as many as given."""
         photograph, sought = self.photograph, self.sought
-        source = CellLooks(photograph.look, photograph.grid, photograph.grid.centres, sought.target)
+        source = CellLooks(photograph.looks, photograph.grid, photograph.grid.centres, sought.target)
         choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
         observer, policy = Target(self.evidence), TargetPosterior(sought.target)
         return list(rollout(source, observer, policy, sought.start, choice, most=self.most_looks))
@@ -179,4 +163,4 @@ def photograph_searches(
     for photograph in track(photographs, title, "photograph"):
         for target in photograph.targets:
             yield _PhotographSearch(photograph, target, evidence, looks)
-        photograph.close()
+        photograph.looks.close()

@@ -45,22 +45,25 @@ def split(scene: Tensor, holdout: int) -> Tensor:
 
 
 def descend(
-    parameters: Iterable[nn.Parameter],
-    loss_of: Callable[[int], Tensor],
+    parameters: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
+    loss_of: Callable[[int], Tensor | None],
     steps: int,
     rate: float,
     *,
     clip: float | None = 1.0,
     decay: float = 1e-2,
+    rise: float = 0.3,
     title: str = "training",
 ) -> None:
-    """Train with AdamW and one cycle of the learning rate (Smith and Topin, 2019)."""
-    trained = list(parameters)
-    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+    """Train with AdamW and one cycle of the rate (Smith and Topin, 2019); a step without a loss is left out."""
+    optimiser = torch.optim.AdamW(parameters, lr=rate, weight_decay=decay)
+    trained = [each for group in optimiser.param_groups for each in group["params"]]
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=rise)
     with closing(task_bar(steps, title, "step")) as bar:
         for number in range(steps):
             loss = loss_of(number)
+            if loss is None:
+                continue
             optimiser.zero_grad()
             loss.backward()
             if clip is not None:

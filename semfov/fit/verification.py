@@ -364,7 +364,7 @@ class VerificationFit(PartFit):
             why = "not fitted, since the agent does not use the target evidence"
             return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
         photographs = open_photographs(
-            run.eye, run.scenes, judged, config, spare=min(20, _ABSENT // len(judged)), everywhere=run.detections
+            run.eye, run.scenes, judged, config, spare=min(20, _ABSENT // len(judged)), store=run.store
         )
         if len(photographs) < 2:
             raise DataError(

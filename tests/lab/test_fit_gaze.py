@@ -79,8 +79,13 @@ def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     fitted, held = _folds(len(group), 4, 0)
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
-    losses = _fit_map(model, [group], [fitted], fit)
-    assert losses[-1] < losses[0] - 1
+
+    def bits():
+        return float(score(model, group, maps_of(model, group, fitted), fitted, conditional=False)[0][:, 2].mean())
+
+    before = bits()
+    _fit_map(model, [group], [fitted], fit)
+    assert (bits() - before) * math.log(2) > 1
     base = saliency.FixationDensity({"backbone8": 3}, centre=model.centre)
     maps = maps_of(model, group, held)
     (baseline,) = score(base, group, [torch.zeros_like(each) for each in maps], held, conditional=False)
