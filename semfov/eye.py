@@ -1,6 +1,6 @@
 """The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -143,7 +143,10 @@ class Eye(StatedModule):
             The detections, a batch of F, boxes in pixels of the image. Those of several crops are merged by
             `semfov.detection.crops.merge_crops`.
         """
-        gaze = _on_canvas(fixations, view)
+        return self._detect(view, _on_canvas(fixations, view), canvases)
+
+    def _detect(self, view: View, gaze: Tensor, canvases: Tensor) -> Detections:
+        """Detect in canvases from fixations `(F, 2)` in their pixels."""
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
         if self.sensor.crops == 1:
             return self.detector.detect(canvases, view.placement, back=back)
@@ -156,12 +159,13 @@ class Eye(StatedModule):
         merged = merge_crops(detections, back(frame)[:, 0], self.sensor.crops, width, size, limit)
         return replace(merged, boxes=view.placement.boxes_to_image(merged.boxes))
 
-    def look(self, view: View, fixations: PointLike) -> Detections:
+    def look(self, view: View, fixations: PointLike, lap: Callable[[str], object] = lambda stage: None) -> Detections:
         """Look from fixations: apply the sensor, then detect.
 
         Args:
             view: the opened image.
             fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+            lap: called with `foveate` and `detect` when they are done (`semfov.episode.Stopwatch`).
 
         Returns:
             The detections, a batch of F, boxes in pixels of the image.
@@ -169,7 +173,12 @@ class Eye(StatedModule):
         Raises:
             InputError: the shape of `fixations` is wrong.
         """
-        return self.detect(view, fixations, self.foveated(view, fixations))
+        gaze = _on_canvas(fixations, view)
+        canvases = self.sensor.look(view.state, gaze)
+        lap("foveate")
+        detections = self._detect(view, gaze, canvases)
+        lap("detect")
+        return detections
 
     def features(self, view: View, fixations: PointLike, layers: Sequence[str] | None = None) -> FeatureMaps:
         """Look from fixations, and keep feature maps of the passes.

@@ -491,7 +491,7 @@ def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
     acquire = taking(32, by_target)
     observer.weigh, observer.update = taking(4, observer.weigh), taking(8, observer.update)
     seen = eye.look(view, GRID.centres)
-    eye.foveated = taking(1, eye.foveated)
+    eye.sensor.look = taking(1, eye.sensor.look)
     eye.detector.detect = taking(2, eye.detector.detect)
     for step in rollout(LiveLooks(eye, view, GRID), observer, acquire, START, choice, most=3):
         assert step.seconds == spent

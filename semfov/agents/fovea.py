@@ -1,10 +1,10 @@
 """Looks of a fovea at a photograph or at the frames of a stream: a gaze that moves over a grid of cells."""
 
-import math
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -24,8 +24,9 @@ from semfov.decision import (
     Decision,
     Verifier,
     conclude,
-    confirms,
     decide,
+    detects,
+    gains_less,
 )
 from semfov.detection.detections import Detections
 from semfov.episode import LiveLooks, Step, Stopwatch, rollout
@@ -81,22 +82,13 @@ class FoveaAgent:
             confirm=confirm, give_up=give_up, closer=closer if boxes is None else 0,
         )  # fmt: skip
         grid = episode.open(image)
-        goal = None if boxes is None else _goal_cells(boxes, grid, image)
-        first, least = next(iter(weights)), 0.5 if confirm is None else confirm
-
-        def outcome(step: Step) -> Tensor:
-            if goal is not None:
-                return goal[step.cell].long()
-            if episode.thresholds is not None:
-                return decide(step, first, episode.thresholds)
-            hits = [
-                confirms(step.detections, grid, step.cell, number, least / weight)
-                for number, weight in weights.items()
-                if weight > 0
-            ]
-            return torch.stack(hits).any(0).long()
-
-        episode.ends, episode.to_goal = outcome, goal is not None
+        if boxes is not None:
+            goal, episode.to_goal = _goal_cells(boxes, grid, image).long(), True
+            episode.ends = lambda step: goal[step.cell]
+        elif episode.thresholds is not None:
+            episode.ends = partial(decide, target=index, thresholds=episode.thresholds)
+        else:
+            episode.ends = partial(detects, grid=grid, weights=weights, score=0.5 if confirm is None else confirm)
         return episode.run()
 
     def explore(
@@ -123,13 +115,8 @@ class FoveaAgent:
         )
         grid = episode.open(image)
         if isinstance(observer, LearnedMap) and (policy is None or worth is not None):
-            gain, least = ExpectedGain(observer.model, grid), _WORTH if worth is None else worth
-
-            def outcome(step: Step) -> Tensor:
-                best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
-                return ((best < least) & (least > 0) & ~step.visited.all(-1)).long()
-
-            episode.ends = outcome
+            least = _WORTH if worth is None else worth
+            episode.ends = partial(gains_less, gain=ExpectedGain(observer.model, grid), least=least)
         return episode.run()
 
     def find_all(
@@ -237,6 +224,8 @@ class FoveaEpisode(Episode[Scanpath]):
             places = CandidateCells(grid, self.target, self.forgetting)
             self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
             self.criterion = self._verifier.criterion
+        elif self.forgetting is not None and self.target is not None and self.thresholds is not None:
+            self.ends = partial(decide, target=self.target, thresholds=self.thresholds)
         # A stream has no end, so it keeps the detections of the looks of which at least half the evidence is left.
         self._recent: deque[tuple[float, Detections]] = deque(maxlen=_MOST_RECENT if self.forgetting else None)
         self._last: tuple[Step, int] | None = None  # the last look of the fovea, and its number
@@ -350,21 +339,13 @@ class FoveaEpisode(Episode[Scanpath]):
         """The decision as it stands; None in an exploration, and in a search that ends on given cells."""
         if self._verifier is not None:
             return self._concluded or self._verifier.decision()
-        if self.target is None or self.to_goal or self._last is None or self._looks is None:
+        if self.target is None or self.ends is None or self.to_goal or self._last is None or self._looks is None:
             return None
-        step, grid = self._last[0], self._looks.grid
-        seen = tuple(detections for _, detections in self._recent)
-        if self.forgetting is not None:
-            if self.thresholds is None:
-                return None
-            outcome = int(decide(step, self.target, self.thresholds))
-            return conclude(outcome, step.belief, seen, grid, self.target)
-        if self.ends is None:
-            return None
+        step, seen = self._last[0], tuple(detections for _, detections in self._recent)
         # Without thresholds the target was found in the fixated cell.
         cell = None if self.thresholds is not None else int(step.cell)
         meant = class_meant(step.belief, self.target)
-        return conclude(self._outcome, step.belief, seen, grid, meant, cell)
+        return conclude(self._outcome, step.belief, seen, self._looks.grid, meant, cell)
 
     def record(self) -> Scanpath:
         """The scanpath so far."""

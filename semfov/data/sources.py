@@ -56,8 +56,8 @@ class Picture(NamedTuple):
     passed: float = 1.0
 
 
-def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
-    """List a photograph, or the photographs of a folder, of `recursive` also of those in it, in the order of names."""
+def picture_files(source: Path, *, recursive: bool = False, frames: bool = False) -> list[Path]:
+    """List a photograph, or those of a folder, or its `frames`, `recursive` of folders in it, in the order of names."""
     _check_there(source)
     if not source.is_dir():
         return [source]
@@ -71,9 +71,9 @@ def picture_files(source: Path, *, recursive: bool = False) -> list[Path]:
         remedy = "as their files are there, too; name them to look at them"
         warnings.warn(f"{source}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=2)
     if not files:
-        where = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
-        expected = f"photographs (.jpg, .png, .tif, …) in {source}, {where}"
-        raise DataError(f"picture: expected {expected}, got none")
+        where = ", or in a folder in it" if recursive else ", and recursive=True also searches the folders in it"
+        what, where = ("source: expected frames", "") if frames else ("picture: expected photographs", where)
+        raise DataError(f"{what} (.jpg, .png, .tif, …) in {source}{where}, got none")
     return files
 
 
@@ -131,9 +131,7 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         source = Path(source)
     name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
     if isinstance(source, Path) and source.is_dir():
-        if not any(path.suffix.lower() in PHOTOGRAPHS for path in source.iterdir()):
-            raise DataError(f"source: expected frames (.jpg, .png, .tif, …) in {source}, got none")
-        files = picture_files(source)[:most]
+        files = picture_files(source, frames=True)[:most]
         return Stream(name, None, (Picture(file.name, read_image(file, white=white)) for file in files))
     try:
         import cv2

@@ -1,6 +1,6 @@
 """The decision of a search: whether the image holds the target, where, and with what probability, on what evidence."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +21,6 @@ OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 
 _NEARLY = 0.9
 """A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
-
 
 _ABSENT = 0.5
 """A search that ends without a find decides that the target is absent below this probability of the picture."""
@@ -144,6 +143,22 @@ def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, scor
     sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
     there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
     return (there & sure).any(-1)
+
+
+def detects(step: Step, *, grid: Grid, weights: Mapping[int, float], score: float) -> Tensor:
+    """Decide without thresholds which searches end: where a fixated cell has a detection that is meant, `(A,)`.
+
+    The product of its score and of the weight of its class, the probability that it is meant, is `score` at least.
+    """
+    meant = ((number, weight) for number, weight in weights.items() if weight > 0)
+    hits = [confirms(step.detections, grid, step.cell, number, score / weight) for number, weight in meant]
+    return torch.stack(hits).any(0).long()
+
+
+def gains_less(step: Step, *, gain: Callable[[Belief, Tensor], Tensor], least: float) -> Tensor:
+    """Decide which explorations end: where a look at every cell that is left gains less than `least`, `(A,)`."""
+    best = gain(step.belief, step.visited).masked_fill(step.visited, -torch.inf).amax(-1)
+    return ((best < least) & (least > 0) & ~step.visited.all(-1)).long()
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:

@@ -103,10 +103,7 @@ class LiveLooks(Looks):
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""
         watch = Stopwatch()
-        canvases = self.eye.foveated(self.view, fixation)
-        watch.lap("foveate")
-        detections = self.eye.detect(self.view, fixation, canvases).to(self.like.device)
-        watch.lap("detect")
+        detections = self.eye.look(self.view, fixation, watch.lap).to(self.like.device)
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")
         return Sight(look, lambda: detections, watch.seconds, self.frames)

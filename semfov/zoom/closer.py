@@ -30,22 +30,21 @@ _WHOLE = 0.9
 _SMALLEST = 1e-4
 
 
-def closer_window(lattice: Lattice, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Window:
+def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Window:
     """The window around a box `(4,)`, three times its longer side and at most an octave above the last level.
 
-    In a `photograph` two numbers of its evidence say how large it is, to show other places, too.
+    In a photograph the two numbers of `window` say how large it is, to show other places, too.
     """
-    least, context = photograph
+    least, context = window
     if lattice.levels > 1:
         context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
-    window = window_around(box.double(), lattice.size, context=context, least=least)
-    x1, y1, x2, y2 = window.tolist()
+    x1, y1, x2, y2 = window_around(box.double(), lattice.size, context=context, least=least).tolist()
     return Window.around(lattice, (x1, y1, x2, y2))
 
 
-def look_closely(glances: Glances, box: Tensor, photograph: tuple[float, float] = USUAL_WINDOW) -> Glance:
+def look_closely(glances: Glances, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Glance:
     """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
-    return glances.see([closer_window(glances.lattice, box, photograph)], hints=glances.lattice.levels == 1)[0]
+    return glances.see([closer_window(glances.lattice, box, window)], hints=glances.lattice.levels == 1)[0]
 
 
 class WindowLook(NamedTuple):
