@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests import small
+
 CLASSES = ("red", "green", "blue")
 COLOURS = np.array([[210, 40, 40], [40, 190, 40], [50, 50, 210]], dtype=np.uint8)
 SIDE = 64
@@ -13,7 +15,7 @@ SIDE = 64
 
 def write_network(path: Path, bias: float = -4.0) -> Path:
     """Save a network that scores three colours in 8 × 8 squares of a canvas of 64 × 64 pixels."""
-    from onnx import TensorProto, helper, numpy_helper, save
+    from onnx import helper
 
     squares = SIDE // 8
     weight = 12 * (1.5 * np.eye(3) - 0.5)[:, :, None, None]
@@ -32,20 +34,9 @@ def write_network(path: Path, bias: float = -4.0) -> Path:
         helper.make_node("Transpose", ["rows"], ["classes"], perm=[0, 2, 1]),
         helper.make_node("Identity", ["corners"], ["boxes"]),
     ]
-    graph = helper.make_graph(
-        nodes,
-        "colours",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, SIDE, SIDE])],
-        [
-            helper.make_tensor_value_info("boxes", TensorProto.FLOAT, [1, squares**2, 4]),
-            helper.make_tensor_value_info("classes", TensorProto.FLOAT, [1, squares**2, 3]),
-        ],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(model, {"semfov": json.dumps({"classes": list(CLASSES)})})
-    save(model, str(path))
-    return path
+    outputs = {"boxes": [1, squares**2, 4], "classes": [1, squares**2, 3]}
+    told = {"semfov": json.dumps({"classes": list(CLASSES)})}
+    return small.write_network(path, nodes, {"images": [1, 3, SIDE, SIDE]}, outputs, constants, metadata=told)
 
 
 def write_photographs(folder: Path, count: int = 20) -> Path:

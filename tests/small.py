@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -73,6 +74,30 @@ def once(words: Sequence[str]) -> list[str]:
 def cells_of(text: str) -> list[list[str]]:
     """The cells of all rows of the tables in a text of Markdown, with their heads and rules."""
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
+
+
+def write_network(
+    path: Path,
+    steps: Sequence[Any],
+    inputs: dict[str, Any],
+    outputs: dict[str, Any],
+    stored: dict[str, Any],
+    **more: Any,
+) -> Path:
+    """Save a network of given nodes; inputs and outputs are shapes of floats, or pairs of a type and a shape."""
+    from onnx import TensorProto, helper, numpy_helper, save
+
+    def named(tensors: dict[str, Any]) -> list[Any]:
+        typed = {name: each if isinstance(each, tuple) else (TensorProto.FLOAT, each) for name, each in tensors.items()}
+        return [helper.make_tensor_value_info(name, *each) for name, each in typed.items()]
+
+    constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in stored.items()]
+    graph = helper.make_graph(steps, "network", named(inputs), named(outputs), constants)
+    opset = [helper.make_opsetid("", more.get("opset", 17))]
+    model = helper.make_model(graph, producer_name=more.get("producer", ""), opset_imports=opset, ir_version=8)
+    helper.set_model_props(model, more.get("metadata") or {})
+    save(model, str(path))
+    return path
 
 
 def scattered(index: int, grid: Grid, classes: int, most: int = 5) -> Detections:

@@ -10,6 +10,7 @@ import torch
 
 from semfov.detection.load import load_yolo
 from semfov.detection.yolo import YoloV3
+from tests.small import write_network
 
 SMALL_CFG = """
 [net] width=64 height=32 channels=3 batch=8
@@ -137,31 +138,19 @@ def write_onnx(
     producer: str = "pytorch",
     dtype: type = np.float32,
 ) -> Path:
-    from onnx import helper, numpy_helper, save
+    from onnx import helper
 
     kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     sides = ["height", "width"] if dynamic else [size[1], size[0]]
-    inputs = [helper.make_tensor_value_info(image, kind, [batch, 3, *sides])]
-    inputs += [helper.make_tensor_value_info(name, *about) for name, about in (extra or {}).items()]
+    inputs = {image: (kind, [batch, 3, *sides]), **(extra or {})}
     nodes = [
         helper.make_node("ReduceMean", [image], ["mean"], axes=[1, 2, 3], keepdims=0),
         helper.make_node("Sigmoid", ["mean"], ["gain"]),
     ]
-    infos, constants = [], []
+    written, stored = {}, {}
     for name, values in outputs.items():
-        ones = np.array([-1] + [1] * (values.ndim - 1), dtype=np.int64)
-        constants.append(numpy_helper.from_array(ones, f"{name}_shape"))
-        constants.append(numpy_helper.from_array(values.astype(dtype), f"{name}_values"))
+        stored |= {f"{name}_shape": np.array([-1] + [1] * (values.ndim - 1)), f"{name}_values": values.astype(dtype)}
         nodes.append(helper.make_node("Reshape", ["gain", f"{name}_shape"], [f"{name}_gain"]))
         nodes.append(helper.make_node("Mul", [f"{name}_values", f"{name}_gain"], [name]))
-        rest = [None] * (values.ndim - 1) if dynamic else list(values.shape[1:])
-        infos.append(helper.make_tensor_value_info(name, kind, [batch, *rest]))
-    model = helper.make_model(
-        helper.make_graph(nodes, "model", inputs, infos, constants),
-        producer_name=producer,
-        opset_imports=[helper.make_opsetid("", 17)],
-        ir_version=8,
-    )
-    helper.set_model_props(model, metadata or {})
-    save(model, str(path))
-    return path
+        written[name] = kind, [batch, *([None] * (values.ndim - 1) if dynamic else values.shape[1:])]
+    return write_network(path, nodes, inputs, written, stored, metadata=metadata, producer=producer)

@@ -4,11 +4,10 @@ import json
 import os
 import tracemalloc
 
-import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _parse_cfg, read_cfg
@@ -16,6 +15,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, InputError, SemfovError
 from tests.refusals import refused, unusable
+from tests.small import write_network
 
 NET = "[net]\nwidth=32\nheight=32\nchannels=3\n"
 HEAD = "[convolutional]\nfilters=7\nsize=1\n[yolo]\nmask=0\nanchors=4,6\nclasses=2\n"
@@ -66,28 +66,17 @@ def test_pipes_and_too_long_files_are_refused(tmp_path):
     unusable("too long", network.read_weights, tmp_path / "sparse.weights")
 
 
-def save(path, nodes, outputs, *, inputs=None, initialisers=(), metadata=None):
+def save(path, nodes, outputs, stored=None, *, image=(1, 3, 32, 32), **more):
     """Write a model with one image input."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 32, 32] if inputs is None else inputs)
-    values = [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in outputs]
-    graph = helper.make_graph(nodes, "graph", [image], values, list(initialisers))
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    for key, value in (metadata or {}).items():
-        model.metadata_props.add(key=key, value=value)
-    onnx.save(model, path)
-    return path
-
-
-def constant(name, values):
-    return numpy_helper.from_array(np.asarray(values), name)
+    return write_network(path, nodes, {"image": [*image]}, outputs, stored or {}, **more)
 
 
 def test_integer_and_scalar_outputs_are_refused_by_name(tmp_path):
     cast = helper.make_node("Cast", ["image"], ["label"], to=TensorProto.INT64)
     with pytest.raises(InputError, match=r"output 'label': expected floating-point numbers, got tensor\(int64\)"):
-        load_onnx(save(tmp_path / "integers.onnx", [cast], [("label", TensorProto.INT64, [1, 3, 32, 32])]))
+        load_onnx(save(tmp_path / "integers.onnx", [cast], {"label": (TensorProto.INT64, [1, 3, 32, 32])}))
     mean = helper.make_node("ReduceMean", ["image"], ["score"], keepdims=0)
-    path = save(tmp_path / "scalar.onnx", [mean], [("score", TensorProto.FLOAT, [])])
+    path = save(tmp_path / "scalar.onnx", [mean], {"score": []})
     refused(r"output 'score': expected a row for each of 1 images, got shape \(\)", load_onnx, path)
 
 
@@ -96,14 +85,13 @@ def test_too_large_tensors_are_refused_before_memory_is_allocated(tmp_path, side
     identity = helper.make_node("Identity", ["image"], ["out"])
     big = [1, 3, side, side]
     with pytest.raises(SemfovError, match="at most"):
-        load_onnx(save(tmp_path / "canvas.onnx", [identity], [("out", TensorProto.FLOAT, big)], inputs=big))
+        load_onnx(save(tmp_path / "canvas.onnx", [identity], {"out": big}, image=big))
     fill = helper.make_node("ConstantOfShape", ["shape"], ["out"])
-    shape = constant("shape", np.array([1, side, side]))
     with pytest.raises(DataError, match=r"tensor 'out': expected at most"):
-        load_onnx(save(tmp_path / "fill.onnx", [fill], [("out", TensorProto.FLOAT, None)], initialisers=[shape]))
+        load_onnx(save(tmp_path / "fill.onnx", [fill], {"out": None}, {"shape": [1, side, side]}))
     batch = [side, 3, 32, 32]
     with pytest.raises(SemfovError, match="at most"):
-        load_onnx(save(tmp_path / "batch.onnx", [identity], [("out", TensorProto.FLOAT, batch)], inputs=batch))
+        load_onnx(save(tmp_path / "batch.onnx", [identity], {"out": batch}, image=batch))
 
 
 def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path):
@@ -114,7 +102,9 @@ def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path):
     tensor.external_data.add(key="location", value="../secret")
     add = helper.make_node("Add", ["image", "w"], ["out"])
     path = folder / "model.onnx"
-    save(path, [add], [("out", TensorProto.FLOAT, [1, 3, 32, 32])], initialisers=[tensor])
+    model = onnx.load(save(path, [add], {"out": [1, 3, 32, 32]}))
+    model.graph.initializer.append(tensor)
+    path.write_bytes(model.SerializeToString())
     unusable("leads out of it", load_onnx, path)
 
 
@@ -135,9 +125,7 @@ def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path):
 )
 def test_invalid_or_excessive_metadata_is_refused_in_one_line(tmp_path, metadata):
     reshape = helper.make_node("Reshape", ["image", "shape"], ["out"])
-    shape = constant("shape", np.array([1, 384, 8]))
-    outputs = [("out", TensorProto.FLOAT, [1, 384, 8])]
-    path = save(tmp_path / "model.onnx", [reshape], outputs, initialisers=[shape], metadata=metadata)
+    path = save(tmp_path / "model.onnx", [reshape], {"out": [1, 384, 8]}, {"shape": [1, 384, 8]}, metadata=metadata)
     with pytest.raises(SemfovError) as caught:
         load_onnx(path)
     assert "\n" not in str(caught.value)

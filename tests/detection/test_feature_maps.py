@@ -2,10 +2,10 @@
 
 import re
 
-import onnx
+import numpy as np
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 from torch import nn
 
 from semfov import load_detector
@@ -15,7 +15,7 @@ from semfov.detection.feature_maps import NetworkStep, landmarks, stride_of
 from semfov.detection.onnx import load_onnx
 from semfov.detection.yolo import YoloV3
 from tests.refusals import refused
-from tests.small import Fixed, rand
+from tests.small import Fixed, rand, write_network
 
 
 def step(name, stride, *reads, convolution=True):
@@ -96,29 +96,23 @@ def network(tmp_path_factory):
     """An ONNX model of three convolutions with stride 2, and its torch twin of the layers."""
     torch.manual_seed(1)
     convolutions = [nn.Conv2d(3, 4, 3, 8, 1), nn.Conv2d(4, 6, 3, 2, 1), nn.Conv2d(6, 5, 3, 2, 1), nn.Conv2d(5, 6, 1)]
-    nodes, weights, source = [], [], "images"
+    nodes, stored, source = (
+        [],
+        {"shape": [1, 6, 4], "sides": np.array([[64, 64, 64, 64, 1, 1]], np.float32).T},
+        "images",
+    )
     for number, layer in enumerate(convolutions):
         for kind in ("weight", "bias"):
-            values = getattr(layer, kind).detach().numpy()
-            weights.append(numpy_helper.from_array(values, f"{kind}{number}"))
-        stride, padding = layer.stride[0], layer.padding[0]
+            stored[f"{kind}{number}"] = getattr(layer, kind).detach().numpy()
         given = [source, f"weight{number}", f"bias{number}"]
-        shape = {"strides": [stride] * 2, "pads": [padding] * 4}
+        shape = {"strides": layer.stride, "pads": layer.padding * 2}
         nodes.append(helper.make_node("Conv", given, [f"conv{number}"], **shape))
         nodes.append(helper.make_node("Relu" if number < 3 else "Sigmoid", [f"conv{number}"], [f"map{number}"]))
         source = f"map{number}"
     nodes.append(helper.make_node("Reshape", [source, "shape"], ["shares"]))
-    weights.append(numpy_helper.from_array(torch.tensor([1, 6, 4]).numpy(), "shape"))
     nodes.append(helper.make_node("Mul", ["shares", "sides"], ["output"]))  # boxes in pixels
-    weights.append(numpy_helper.from_array(torch.tensor([64.0, 64, 64, 64, 1, 1])[:, None].numpy(), "sides"))
-    made = helper.make_tensor_value_info
-    graph = helper.make_graph(
-        nodes, "net", [made("images", TensorProto.FLOAT, [1, 3, 64, 64])],
-        [made("output", TensorProto.FLOAT, [1, 6, 4])], weights,
-    )  # fmt: skip
     path = tmp_path_factory.mktemp("onnx") / "net.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
-    return path, convolutions
+    return write_network(path, nodes, {"images": [1, 3, 64, 64]}, {"output": [1, 6, 4]}, stored), convolutions
 
 
 def test_maps_of_an_onnx_model_equal_a_torch_twin(network):

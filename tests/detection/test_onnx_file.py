@@ -3,10 +3,9 @@
 import json
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 from torch.nn import functional as F
 from torchvision.ops import box_iou
 
@@ -14,6 +13,7 @@ from semfov import load_detector
 from semfov.detection.onnx_file import read_settings, with_input_size
 from semfov.detection.onnx_session import OnnxSession
 from tests.refusals import refused, unusable
+from tests.small import write_network
 
 
 def test_the_settings_file_overrides_the_metadata(tmp_path):
@@ -71,7 +71,6 @@ def shuffled(request, tmp_path, monkeypatch):
     """A convolution of stride 8 and a shuffle of its channels, exported for 64 x 64 pixels."""
     monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path / "cache"))
     shapes = {"apart": [1, 2, 3, 8, 8], "together": [1, -1, 8, 8], "cells": [1, 6, -1]}
-    tensors = {name: numpy_helper.from_array(np.array(shape), name) for name, shape in shapes.items()}
     steps = [
         helper.make_node("Conv", ["image", "weight"], ["map"], strides=[8, 8]),
         helper.make_node("Reshape", ["map", "apart"], ["groups"]),
@@ -79,17 +78,17 @@ def shuffled(request, tmp_path, monkeypatch):
         helper.make_node("Reshape", ["mixed", "together"], ["joined"]),
         helper.make_node("Reshape", ["joined", "cells"], ["output"]),
     ]
-    stored = [numpy_helper.from_array(WEIGHT, "weight")]
+    stored = {"weight": WEIGHT}
     if request.param == "node":
-        steps = [helper.make_node("Constant", [], [name], value=each) for name, each in tensors.items()] + steps
+        steps = [
+            helper.make_node("Constant", [], [name], value=numpy_helper.from_array(np.array(each)))
+            for name, each in shapes.items()
+        ] + steps
     else:
-        stored += tensors.values()
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 64])
-    output = helper.make_tensor_value_info("output", TensorProto.FLOAT, [1, 6, 64])
-    graph = helper.make_graph(steps, "shuffled", [image], [output], stored)
-    path = tmp_path / "shuffled.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
-    return path
+        stored |= shapes
+    return write_network(
+        tmp_path / "shuffled.onnx", steps, {"image": [1, 3, 64, 64]}, {"output": [1, 6, 64]}, stored, opset=13
+    )
 
 
 @pytest.mark.parametrize("canvas", [(64, 64), (96, 64), (32, 128)])

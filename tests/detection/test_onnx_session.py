@@ -2,10 +2,9 @@ import copy
 import pickle
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from semfov import InputError, load_detector
 from semfov.detection import onnx as onnx_detector
@@ -13,6 +12,7 @@ from semfov.detection import onnx_session
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from tests.refusals import refused, unusable
+from tests.small import write_network
 
 
 def values(*shape):
@@ -114,17 +114,9 @@ def test_execution_providers_are_chosen_by_name(make_onnx):
 
 def open_ended(path, nodes, numbers, boxes):
     """A model of the family `candidates` with given steps to its boxes and scores."""
-    stored = [numpy_helper.from_array(np.array(value), name) for name, value in numbers.items()]
-    image = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])
-    sizes = {"boxes": [1, boxes, 4], "scores": [1, boxes, 80]}
-    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, size) for name, size in sizes.items()]
-    model = helper.make_model(
-        helper.make_graph(nodes, "graph", [image], outputs, stored),
-        opset_imports=[helper.make_opsetid("", 17)],
-        ir_version=8,
+    return write_network(
+        path, nodes, {"images": [1, 3, 64, 64]}, {"boxes": [1, boxes, 4], "scores": [1, boxes, 80]}, numbers
     )
-    onnx.save(model, str(path))
-    return path
 
 
 @pytest.mark.parametrize(("count", "reason"), [(9, None), (11, "at most 10 boxes, got 11"), (9_000_000, "512 MiB")])
