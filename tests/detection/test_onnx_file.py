@@ -1,15 +1,20 @@
-"""Settings of ONNX files, and copies of them with another input size."""
+"""ONNX files: their settings, copies with another input size, and sessions that run them."""
 
+import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
 import torch
-from onnx import helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional as F
 from torchvision.ops import box_iou
 
-from semfov import load_detector
+from semfov import InputError, load_detector
+from semfov.detection import onnx as onnx_detector
+from semfov.detection import onnx_session
+from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_file import read_settings, with_input_size
 from semfov.detection.onnx_session import OnnxSession
 from tests.refusals import refused, unusable
@@ -141,3 +146,161 @@ def test_a_published_model_sees_the_same_objects_at_all_sizes(name, file, shared
         boxes.append(found.boxes[0, :1])
     for other in boxes[1:]:
         assert float(box_iou(boxes[0], other)) > 0.75
+
+
+def values(*shape):
+    return np.random.default_rng(0).random(shape)
+
+
+def expected(base, image):
+    return base * image.double().mean((1, 2, 3)).sigmoid().numpy().reshape(-1, *[1] * (base.ndim - 1))
+
+
+def images(count, dtype=torch.float32):
+    return torch.rand(count, 3, 64, 64, dtype=dtype, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, "batch"])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_batches_of_any_size_with_fixed_and_dynamic_models(make_onnx, batch, count):
+    base = values(1, 5, 4)
+    session = OnnxSession(make_onnx({"a": base, "b": base[..., 0]}, batch=batch))
+    image = images(count)
+    outputs = session(image)
+    assert list(outputs) == ["a", "b"]
+    np.testing.assert_allclose(outputs["a"].numpy(), expected(base, image), rtol=1e-5)
+    np.testing.assert_allclose(outputs["b"].numpy(), expected(base[..., 0], image), rtol=1e-5)
+
+
+@pytest.mark.parametrize("model", [np.float16, np.float32, np.float64])
+def test_outputs_have_the_dtype_of_the_image(make_onnx, model, dtype):
+    base = values(1, 5, 4)
+    image = images(1, dtype)
+    output = OnnxSession(make_onnx({"a": base}, dtype=model))(image)["a"]
+    assert output.dtype == dtype
+    np.testing.assert_allclose(output.numpy(), expected(base, image), rtol=1e-2 if model == np.float16 else 1e-5)
+
+
+def test_sizes_metadata_and_threads(make_onnx):
+    path = make_onnx({"a": values(1, 5, 4)}, dynamic=True, batch="n", metadata={"key": "value"}, producer="me")
+    session = OnnxSession(path)
+    assert session.shape == (None, 3, None, None)
+    assert session.outputs == (("a", (None, 5, 4)),)
+    assert session.metadata == {"key": "value"}
+    assert session.producer == "me"
+    assert session.threads == torch.get_num_threads()
+    assert OnnxSession(path, threads=1).threads == 1
+    refused("threads", OnnxSession, path, threads=0)
+
+
+def test_threads_do_not_spin_unless_asked(make_onnx):
+    path = make_onnx({"a": values(1, 5, 4)})
+    entry = "session.intra_op.allow_spinning"
+    for spinning in (False, True):
+        options = OnnxSession(path, spinning=spinning)._session.get_session_options()
+        assert options.get_session_config_entry(entry) == str(int(spinning))
+
+
+def test_sessions_can_be_pickled_and_copied(make_onnx):
+    session = OnnxSession(make_onnx({"a": values(1, 5, 4)}), threads=1)
+    for twin in (pickle.loads(pickle.dumps(session)), copy.deepcopy(session)):
+        assert twin.threads == 1
+        assert torch.equal(twin(images(1))["a"], session(images(1))["a"])
+
+
+def test_inputs_for_image_size_and_scale_are_filled_without_output(make_onnx, capfd):
+    extra = {"orig_target_sizes": (7, [1, 2]), "im_shape": (1, [1, 2]), "scale_factor": (1, [1, 2])}
+    session = OnnxSession(make_onnx({"a": values(1, 5, 4)}, extra=extra))
+    assert session(images(2))["a"].shape == (2, 5, 4)
+    OnnxSession(make_onnx({"a": values(1, 5, 4)}, extra={"scale_factor": (1, [1, 2])}))(images(1))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_unsuitable_files_and_inputs_are_refused(make_onnx, tmp_path):
+    unusable(r"missing\.onnx': no such file", OnnxSession, tmp_path / "missing.onnx")
+    damaged = tmp_path / "damaged.onnx"
+    damaged.write_bytes(make_onnx({"a": values(1, 5, 4)}).read_bytes()[:100])
+    unusable(r"damaged\.onnx", OnnxSession, damaged)
+    refused("mystery", OnnxSession, make_onnx({"a": values(1, 5, 4)}, extra={"mystery": (1, [1, 2])}))
+    session = OnnxSession(make_onnx({"a": values(1, 5, 4)}))
+    refused("at least one image", session, images(1)[:0])
+    unusable(r"model\.onnx: fails on images of shape \(1, 3, 64, 32\)", session, images(1)[..., :32])
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_device_is_refused(make_onnx):
+    refused("CPUExecutionProvider", OnnxSession, make_onnx({"a": values(1, 5, 4)}), device="cuda")
+
+
+def test_execution_providers_are_chosen_by_name(make_onnx):
+    path = make_onnx({"output": values(1, 84, 85) - 0.5 * (np.arange(85) < 4)})
+    wanted = [("CPUExecutionProvider", {"arena_extend_strategy": "kSameAsRequested"})]
+    chosen, plain = load_onnx(path, providers=wanted), load_onnx(path)
+    assert chosen.settings() == plain.settings() | {"providers": wanted}
+    assert pickle.loads(pickle.dumps(chosen.session)).providers == tuple(wanted)
+    canvas = images(1)
+    assert torch.equal(chosen.propose(canvas).classes, plain.propose(canvas).classes)
+    for missing in ([], ["CPUExecutionProvider", "NoSuchProvider"]):
+        with pytest.raises(InputError, match=r"providers: expected some of .*CPUExecutionProvider, got (none|NoSuch)"):
+            load_onnx(path, providers=missing)
+
+
+def open_ended(path, nodes, numbers, boxes):
+    """A model of the family `candidates` with given steps to its boxes and scores."""
+    return write_network(
+        path, nodes, {"images": [1, 3, 64, 64]}, {"boxes": [1, boxes, 4], "scores": [1, boxes, 80]}, numbers
+    )
+
+
+@pytest.mark.parametrize(("count", "reason"), [(9, None), (11, "at most 10 boxes, got 11"), (9_000_000, "512 MiB")])
+def test_the_number_of_boxes_may_depend_on_values_up_to_a_limit(tmp_path, monkeypatch, count, reason):
+    monkeypatch.setattr(onnx_detector, "_MOST_BOXES", 10)
+    shapes = [
+        helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
+        helper.make_node("Cast", ["mean"], ["whole"], to=TensorProto.INT64),
+        helper.make_node("Add", ["whole", "count"], ["boxes count"]),
+    ]
+    for name in ("boxes", "scores"):
+        shapes.append(helper.make_node("Concat", ["one", "boxes count", f"{name} size"], [f"{name} shape"], axis=0))
+        shapes.append(helper.make_node("ConstantOfShape", [f"{name} shape"], [name]))
+    numbers = {"count": [count], "one": [1], "boxes size": [4], "scores size": [80]}
+    path = open_ended(tmp_path / "model.onnx", shapes, numbers, None)
+    if reason is None:
+        assert load_detector(path).propose(torch.zeros(2, 3, 64, 64)).boxes.shape == (2, 9, 4)
+    else:
+        unusable(rf"model.*{reason}", lambda: load_detector(path).propose(torch.zeros(2, 3, 64, 64)))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_loop_that_does_not_end_is_stopped(tmp_path, monkeypatch, nested):
+    def value(name, kind=TensorProto.FLOAT, shape=(1, 9, 4)):
+        return helper.make_tensor_value_info(name, kind, [*shape])
+
+    again = [helper.make_node("Identity", ["go"], ["go on"]), helper.make_node("Identity", ["in"], ["out"])]
+    body_inputs = [value("step", TensorProto.INT64, ()), value("go", TensorProto.BOOL, ()), value("in")]
+    body = helper.make_graph(again, "body", body_inputs, [value("go on", TensorProto.BOOL, ()), value("out")])
+    loop = helper.make_node("Loop", ["", "yes", "start"], ["boxes"], body=body)
+    if nested:
+        inner = helper.make_node("Loop", ["", "yes", "start"], ["inside"], body=body)
+        branches = {
+            f"{name}_branch": helper.make_graph([inner], name, [], [value("inside")]) for name in ("then", "else")
+        }
+        loop = helper.make_node("If", ["yes"], ["boxes"], **branches)
+    numbers = {"yes": True, "start": np.ones((1, 9, 4), np.float32), "half": np.full((1, 9, 80), 0.5, np.float32)}
+    path = open_ended(tmp_path / "model.onnx", [loop, helper.make_node("Identity", ["half"], ["scores"])], numbers, 9)
+    monkeypatch.setattr(onnx_session, "_MOST_SECONDS", 0.1)
+    unusable(r"model\.onnx: fails on images .* not done after 0 s, as with a loop", load_detector, path)
+
+
+def test_the_reason_of_onnxruntime_is_not_cut_and_its_telemetry_is_off(tmp_path, make_onnx, monkeypatch):
+    import onnxruntime
+
+    off = []
+    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: off.append(True))
+    session = OnnxSession(make_onnx({"a": values(1, 5, 4)}))
+    assert off
+    unusable(r"index: 3 Got: 32 Expected: 64", session, images(1)[..., :32])
+    nodes = [helper.make_node("Identity", ["images"], ["boxes"]), helper.make_node("Unknown", ["images"], ["scores"])]
+    long = tmp_path / ("long" * 40) / "model.onnx"
+    long.parent.mkdir()
+    unusable("Unknown", OnnxSession, open_ended(long, nodes, {}, 9))

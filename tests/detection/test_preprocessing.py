@@ -1,9 +1,15 @@
+"""What becomes of a picture on its way to a canvas: its place, its size, and its values."""
+
+import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from semfov.detection import letterbox
+from semfov.detection.placement import resize
 from semfov.detection.preprocessing import Preprocessing
 from tests.refusals import refused
 
@@ -95,3 +101,81 @@ def test_merging_keeps_the_other_settings():
     merged = Preprocessing(channels="bgr", scale=255.0).merged({"std": [2, 2, 2], "stretch": True})
     assert merged == Preprocessing(channels="bgr", scale=255.0, std=(2.0, 2.0, 2.0), stretch=True)
     assert Preprocessing(**merged.settings()) == merged
+
+
+sides = st.integers(1, 90)
+
+
+@given(sides, sides, st.sampled_from([None, 32]), st.booleans(), st.sampled_from([torch.float32, torch.float64]))
+def test_boxes_and_points_are_mapped_to_the_canvas_and_back(width, height, stride, stretch, dtype):
+    canvas, placement = letterbox(
+        torch.zeros(1, 3, height, width, dtype=dtype), (64, 48), stride=stride, stretch=stretch
+    )
+    assert canvas.dtype == dtype
+    assert placement.size == (width, height)
+    image = torch.tensor([[0.0, 0.0, width, height], [0.3 * width, 0.1 * height, 0.9 * width, 0.8 * height]]).to(dtype)
+    scale, offset = torch.tensor(placement.scale * 2).to(dtype), torch.tensor(placement.offset * 2).to(dtype)
+    torch.testing.assert_close(placement.boxes_to_image(image * scale + offset), image, atol=1e-3, rtol=1e-5)
+    # A point is the centre of a pixel, half a pixel from its edges, both in the image and on the canvas.
+    points = torch.rand(5, 2, dtype=dtype) * torch.tensor([width, height])
+    there = placement.points_to_canvas(points)
+    box = torch.cat([there + 0.5, there + 0.5], -1)
+    back = placement.boxes_to_image(box)[:, :2] - 0.5
+    inside = ((points + 0.5 >= 0) & (points + 0.5 <= torch.tensor([width, height]))).all(-1)
+    torch.testing.assert_close(back[inside], points[inside], atol=1e-3, rtol=1e-5)
+
+
+@given(sides, sides, st.sampled_from([None, 32]))
+def test_the_image_is_at_the_place_given_by_the_placement(width, height, stride):
+    canvas, placement = letterbox(torch.ones(1, 1, height, width), (64, 64), fill=0.25, stride=stride)
+    bright = canvas[0, 0] > 0.99
+    rows, columns = bright.nonzero(as_tuple=True)
+    left, top = placement.offset
+    inner = (placement.scale[0] * width, placement.scale[1] * height)
+    assert (int(columns.min()), int(rows.min())) == (left, top)
+    assert (int(columns.max()) + 1 - left, int(rows.max()) + 1 - top) == pytest.approx(inner)
+    assert bool((canvas[0, 0][~bright] == 0.25).all())
+    if stride is None:
+        assert canvas.shape[-2:] == (64, 64)
+    else:
+        assert all(side % stride == 0 for side in canvas.shape[-2:])
+
+
+def test_resize_equals_bilinear_opencv_down_to_half_the_size_and_pillow_below():
+    for size in [(37, 29), (60, 45), (100, 81)]:
+        image = np.random.default_rng(0).random((58, 74, 3), dtype=np.float32)
+        expected = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+        actual = resize(torch.from_numpy(image).permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
+        np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+    for size in [(36, 58), (74, 20), (30, 7), (1, 1)]:
+        # Bilinear resizing in Pillow has antialiasing.
+        image = np.random.default_rng(0).random((58, 74), dtype=np.float32)
+        expected = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
+        actual = resize(torch.from_numpy(image)[None, None], size)[0, 0]
+        np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+
+
+def test_resize_to_the_same_size_returns_a_copy():
+    image = torch.rand(1, 3, 8, 8)
+    canvas = resize(image, (8, 8))
+    canvas.zero_()
+    assert image.any()
+
+
+def test_letterbox_is_differentiable():
+    image = torch.rand(1, 1, 5, 7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
+
+
+@pytest.mark.parametrize("size", [(700, 500), (300, 200)])
+def test_resize_is_reproducible_on_one_thread_and_agrees_on_two(size, threads):
+    image = torch.rand(1, 3, 480, 640)
+    (one, again), (two, _) = [[resize(image, size) for _ in range(2)] for _ in threads()]
+    assert torch.equal(one, again)
+    torch.testing.assert_close(two, one, atol=5e-5, rtol=0)
+
+
+def test_refuses_what_is_no_batch_of_images():
+    refused("floating-point pixels", letterbox, torch.zeros(1, 3, 8, 8, dtype=torch.uint8), (32, 32))
+    refused("image", letterbox, torch.zeros(3, 8, 8), (32, 32))
+    refused("image", letterbox, torch.zeros(1, 3, 0, 8), (32, 32))

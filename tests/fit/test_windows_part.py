@@ -1,4 +1,4 @@
-"""The evidence for large pictures in a folder of models, fitted on mosaics of photographs of coloured squares."""
+"""The part of a fit for windows: its evidence, kinds of windows, and a fit that is interrupted."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector import _FolderFit, _manifest_of
 from semfov.fit.settings import FitDetectorConfig
+from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.manifest import Manifest
@@ -20,9 +21,11 @@ from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import look_by_look
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import ranked, usual_slices
 from tests.colours import COLOURS, write_home
-from tests.small import Tiles
+from tests.small import RedBoxes, Tiles
+from train.zoom_pictures import PICTURE_KINDS, _compose_pictures
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +133,36 @@ def test_recall_is_that_of_the_objects_of_each_photograph():
     expected = torch.stack([torch.stack(shares[photograph]).mean(0) for photograph in sorted(shares)])
     assert expected.amax() > 0
     torch.testing.assert_close(torch.from_numpy(_photograph_recalls(mosaics, opened, None)), expected)
+
+
+SCENES = RedBoxes()
+SIZES = {
+    "few": (144, 108), "many": (288, 216), "one class": (192, 108), "photographs": (384, 216), "objects": (384, 216)
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PICTURE_KINDS)
+def test_pictures_of_a_kind_have_its_size_and_objects_and_depend_on_the_seed(kind):
+    pictures = _compose_pictures(kind, SCENES, 3, 0, tile=48)
+    assert len(pictures) == 3
+    for index in range(3):
+        assert pictures.annotation(index).size == SIZES[kind]
+    assert sum(len(pictures.annotation(index).boxes) for index in range(3)) > 0
+    assert pictures[0].size == SIZES[kind]
+    assert _compose_pictures(kind, SCENES, 3, 1, tile=48).digest(0) != pictures.digest(0)
+    assert _compose_pictures(kind, SCENES, 4, 0, tile=48).digest(0) == pictures.digest(0)
+
+
+@pytest.mark.parametrize(("kind", "photographs"), [("few", 9), ("objects", 0)])
+def test_windows_hold_one_for_each_photograph_of_a_mosaic(kind, photographs):
+    pictures = _compose_pictures(kind, SCENES, 1, 0, tile=48)
+    lattice = Lattice.over(SIZES[kind], (32, 32))
+    assert sum(window.within is not None for window in ZoomExample.windows(pictures, 0, lattice)) == photographs
+
+
+def test_objects_of_the_smallest_kinds_have_four_pixels_in_an_overview():
+    """Of 416 px, in pictures of the default size."""
+    pictures = _compose_pictures("objects", SCENES, 12, 0)
+    told = [pictures.annotation(index).boxes for index in range(12)]
+    sides = torch.cat([(boxes[:, 2:] - boxes[:, :2]).amax(-1) for boxes in told])
+    assert 2 < float(sides.quantile(0.1)) * 416 / 3840 < 8

@@ -1,19 +1,21 @@
-"""The density of fixations against loops, closed forms and what must hold for any density."""
+"""The density of fixations against loops, saliency of cells, and what glimpses show."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from semfov import Detections
+from semfov import Detections, Grid
 from semfov.detection import FeatureMaps, Placement
-from semfov.gaze.saliency import FixationDensity, OculomotorBias
+from semfov.gaze.saliency import FixationDensity, OculomotorBias, cell_saliency, features_so_far
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.gaze.saliency.oculomotor import _LENGTHS, _NEAR
 from tests.refusals import refused, unusable
-from tests.small import rand
+from tests.small import draw, rand
 
 
 @pytest.fixture
@@ -212,3 +214,79 @@ def test_draws_repeat_with_the_seed(model, maps):
     assert not torch.equal(draws[0], draws[2])
     inside = (draws[0] >= -0.5) & (draws[0] < torch.tensor([39.5, 29.5]))
     assert bool(inside.all())
+
+
+@given(st.integers(1, 23), st.integers(1, 23), st.integers(1, 8), st.integers(1, 8))
+def test_mean_and_max_equal_a_brute_force(height: int, width: int, columns: int, rows: int) -> None:
+    saliency = np.random.default_rng(height + 100 * width).random((2, height, width))
+    # Split every pixel into rows x columns pieces: then every cell consists of height x width whole pieces.
+    pieces = saliency.repeat(rows, 1).repeat(columns, 2)
+    cells = pieces.reshape(2, rows, height, columns, width).transpose(0, 1, 3, 2, 4).reshape(2, rows * columns, -1)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 2e-6)):
+        tensor = torch.from_numpy(saliency).to(dtype)
+        mean, largest = cell_saliency(tensor, columns, rows), cell_saliency(tensor, columns, rows, "max")
+        np.testing.assert_allclose(mean.numpy(), cells.mean(-1), atol=tolerance)
+        np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
+
+
+def test_gradients_and_compilation() -> None:
+    saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
+    for reduction in ("mean", "max"):
+        assert torch.autograd.gradcheck(lambda x, how=reduction: cell_saliency(x, 3, 2, how), saliency)
+        compiled = torch.compile(cell_saliency, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
+
+
+def test_bad_input():
+    refused("saliency", cell_saliency, torch.zeros((4, 4)), 2, 2, "mean")
+    refused("saliency", cell_saliency, torch.zeros((1, 1, 4, 4)), 2, 2, "mean")
+    refused("saliency", cell_saliency, torch.zeros((1, 0, 4)), 2, 2, "mean")
+    refused("columns", cell_saliency, torch.zeros((1, 4, 4)), 0, 2, "mean")
+    refused("reduction", cell_saliency, torch.zeros((1, 4, 4)), 2, 2, "sum")
+
+
+def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():
+    saliency = torch.zeros(1, 47, 61)
+    saliency[0, 33, 50] = 1.0
+    expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
+    for reduction in ("mean", "max"):
+        assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
+    refused("saliency", cell_saliency, torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)
+
+
+PLACE = Placement((80, 60), (0.5, 0.5), (2.0, 4.0))
+CANVAS = (48, 40)
+
+
+def views(count=5):
+    none = Detections(torch.zeros(count, 0, 4), torch.zeros(count, 0, 1), torch.zeros(count, 0, dtype=torch.bool))
+    maps = {"backbone8": draw(count, 3, 5, 6).float(), "head16": draw(count, 2, 3, 3, seed=1).float()}
+    return FeatureMaps(maps, CANVAS, PLACE, none)
+
+
+def test_each_place_has_the_features_of_the_closest_look():
+    seen, fixations = views(), torch.from_numpy(np.random.default_rng(0).uniform(0, (79, 59), (5, 2)))
+    path = fixations[[3, 1, 4]] + 0.1
+    got = features_so_far(seen, fixations, path[None])
+    assert got.placement == PLACE
+    for name, maps in seen.maps.items():
+        height, width = maps.shape[-2:]
+        for row in range(height):
+            for column in range(width):
+                x = ((column + 0.5) * CANVAS[0] / width - 2.0) / 0.5 - 0.5
+                y = ((row + 0.5) * CANVAS[1] / height - 4.0) / 0.5 - 0.5
+                away = [np.hypot(*(fixations[view].numpy() - (x, y))) for view in (3, 1, 4)]
+                expected = maps[(3, 1, 4)[int(np.argmin(away))], :, row, column]
+                assert torch.equal(got.maps[name][0, :, row, column], expected)
+
+
+def test_a_shorter_path_is_as_if_alone():
+    seen, fixations = views(), torch.tensor([[5.0, 5], [70, 5], [40, 30], [5, 50], [70, 50]])
+    short = torch.full((2, 3, 2), torch.nan)
+    short[0], short[1, 2] = fixations[[0, 2, 4]], fixations[1]
+    both, alone = features_so_far(seen, fixations, short), features_so_far(seen, fixations, short[1:, 2:])
+    for name in seen.maps:
+        assert torch.equal(both.maps[name][1], alone.maps[name][0])
+        assert torch.equal(both.maps[name][1], seen.maps[name][1])
+    refused("scanpath", features_so_far, seen, fixations, torch.full((1, 2, 2), torch.nan))
+    refused("fixations", features_so_far, seen, fixations[:3], short)
