@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +31,6 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, area_under_roc, cumulative_performance
-from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.protocols import (
@@ -44,7 +42,7 @@ from semfov.runs.protocols import (
 )
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Share, Weight
-from semfov.runs.tables import table
+from semfov.runs.tables import mean_or_dash, share, table
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
@@ -53,11 +51,7 @@ _JUDGED = (1, 5, 15)
 _ABSENT = 1000
 """Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
 SUREST, SUREST_OF_FEW = 0.99, 0.9
-"""Upper limit of the threshold for reporting a target as found. The second value is for few expected false alarms.
-
-If the threshold were higher than any search reaches, nothing would ever be found. With few searches, a single false
-alarm could push it that high.
-"""
+"""Upper limit of the threshold for found targets, and that for few searches, in which one false alarm pushes it up."""
 
 
 @dataclass(frozen=True)
@@ -91,32 +85,21 @@ class FitSearchConfig(FitOnLooksConfig):
 
 @dataclass(frozen=True)
 class _TargetExamples(Examples):
-    """One example for each pair of photograph and class to search for. The class may be absent.
-
-    Shapes: features `(E, X·Y, X·Y, F)`, score `(E, X·Y)`, target `(E,)`, goal `(E, X·Y)`.
-    """
+    """One for each pair of photograph and class, present or not; features `(E, X·Y, X·Y, F)`, goal `(E, X·Y)`."""
 
     looks = TargetLook
 
     goal: Tensor
 
 
-def _make_examples(
-    run: Looking,
-    classes: int,
-    max_area: float,
-    seed: int,
-    *,
-    absent: int | None = None,
-    scenes: Sequence[int] | None = None,
-) -> _TargetExamples:
+def _make_examples(run: Looking, config: FitSearchConfig, scenes: Sequence[int] | None = None) -> _TargetExamples:
     """Make examples from photographs for present and for absent classes."""
-    rows = []
+    rows, drawn = [], (config.classes, config.max_target_area, config.seed, config.absent)
     those, title = (range(len(run.scenes)), "describing looks") if scenes is None else (scenes, "describing others")
     for index in track(those, title, "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         covered = grid.footprint(annotation.boxes)
-        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed, absent)
+        chosen = choose_classes(run.scenes, index, annotation, *drawn)
         detections = run.detections(index) if chosen else None
         for target in chosen:
             assert detections is not None
@@ -125,9 +108,8 @@ def _make_examples(
                 continue
             with torch.inference_mode():
                 features = look_features(detections, grid.centres, grid, target).half()
-            score = highest_score(detections, target)
-            row = features, score, grid.cell_distance, torch.tensor(index), torch.tensor(target), goal
-            rows.append(row)
+            score, where = highest_score(detections, target), torch.tensor(index)
+            rows.append((features, score, grid.cell_distance, where, torch.tensor(target), goal))
     if not rows:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
     return _TargetExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
@@ -135,7 +117,7 @@ def _make_examples(
 
 def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds."""
-    examples = _make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
+    examples = _make_examples(run, config)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
@@ -171,25 +153,20 @@ def _train_evidence(
 
 
 def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
-    r"""Compute the training loss after a look; goal `(E, X·Y)`.
+    r"""The training loss after a look; goal `(E, X·Y)`.
 
     .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
               + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
               \qquad o = p / (1 - p)
 
-    The terms are the cross-entropy of all cells (four times their mean, which the formula writes for 100 cells), the
-    cross-entropy of two selected cells, the cross-entropy of presence in the photograph, and minus the log probability
-    that a fixation drawn in proportion to the odds o of the unvisited cells lands on the target.
-
-    The cell a is the next one to fixate, and b is the most probable fixated cell. Both are selected because of their
-    high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
-    they have a term of their own.
+    for 100 cells. The last term is the log probability that a fixation drawn by the odds o lands on the target.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)
     cells, present = belief.present.logit(eps=1e-7), goal.any(-1).to(belief.anywhere)
     loss = 4 * F.binary_cross_entropy_with_logits(cells, goal.to(cells))
     loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
+    # The next cell, and the most probable fixated one, are selected by their probability, which is biased by that.
     named = cells.detach().masked_fill(~step.visited, -torch.inf).argmax(-1)
     for chosen in (step.next_cell, named):
         there = goal.gather(-1, chosen[:, None]).to(cells)
@@ -239,18 +216,11 @@ def _judge_evidence(
 
 
 def choose_thresholds(config: Any, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
-    """Choose thresholds with few false alarms and few missed targets, with the limits of a `FitSearchConfig`.
-
-    For each candidate of the `place` threshold, the lowest `confirm` threshold is computed that respects the limit on
-    false alarms. Of these pairs, the one with the highest `place` is taken that misses few enough of the targets found
-    without a `place` threshold. Then the highest `give_up` is taken that misses few enough of the targets still found.
-
-    Shapes: anywhere `(n, E)`, place `(n, E)`, left `(n, E)`, there `(E,)`.
-    """
+    """Choose thresholds with few false alarms and few missed targets; probabilities `(n, E)`, there `(E,)`."""
     number = torch.arange(len(anywhere))[:, None]
 
     def found(chosen: Thresholds) -> Tensor:
-        """Return which searches report the target as found, `(E,)` boolean."""
+        """Which searches report the target as found, `(E,)`."""
         sure = (anywhere >= chosen.confirm) & (place > 0) & (place >= chosen.place)
         first = torch.where(sure, number, len(sure)).amin(0)
         return sure.any(0) & ~((left < chosen.give_up) & (number < first)).any(0)
@@ -259,7 +229,7 @@ def choose_thresholds(config: Any, anywhere: Tensor, place: Tensor, left: Tensor
         return int(found(chosen)[there].sum())
 
     def confirming(least: float) -> Thresholds:
-        """Return the thresholds with the lowest `confirm` for a `place` threshold."""
+        """The lowest `confirm` with few enough false alarms, for a `place`."""
         confirm = 1.0
         for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
             if float(found(Thresholds(candidate, 0.0, least))[~there].double().mean()) > config.false_alarms:
@@ -269,6 +239,7 @@ def choose_thresholds(config: Any, anywhere: Tensor, place: Tensor, left: Tensor
 
     lost = config.lost * int(there.sum())
     anyhow = confirming(0.0)
+    # The highest `place` that misses few of the targets found without one, and then the highest `give_up` likewise.
     pairs = (confirming(least) for least in torch.arange(0.95, 0.04, -0.05).tolist())
     chosen = next((pair for pair in pairs if hits(anyhow) - hits(pair) <= lost), anyhow)
     for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001):
@@ -308,80 +279,8 @@ def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, tra
     )
 
 
-def _search_curves(
-    run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig, max_area: float
-) -> dict[str, FloatArray]:
-    """Measure the cumulative performance of search strategies on every photograph with a target; → `(P, shifts+1)`."""
-    curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
-    for index in track(scenes, "searching", "scene"):
-        targets = legal_targets(run.scenes.annotation(index), max_area)
-        episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
-        if not episodes:
-            continue
-        grid = run.grid(index)
-        looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
-        noise = [
-            noise_for(protocol, len(grid), run.scenes.ids[index], each.target, each.repetition) for each in episodes
-        ]
-        for name, way in ways.items():
-            with torch.inference_mode():
-                outcomes = run_episodes(
-                    episodes, way, looks, torch.stack(noise), shifts=protocol.shifts, batch=protocol.batch
-                )
-            shifts = np.array([found_at for _, found_at in outcomes])
-            curves[name].append(cumulative_performance(shifts, protocol.shifts))
-    return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
-
-
-_DecisionRates = tuple[float, float, float, float, int]
-"""Shares of searches that find a present class, find an absent one, and decide nothing; mean looks; searches."""
-
-
 _Rule = Callable[..., Tensor]
 """Decides after a `step` which searches for a `target` end: numbers of their outcomes, 0 for those that go on."""
-
-
-def _decisions(
-    run: Looking,
-    scenes: Sequence[int],
-    ways: Mapping[str, tuple[Strategy, _Rule]],
-    protocol: ProtocolConfig,
-    classes: int,
-    max_area: float,
-) -> dict[str, _DecisionRates]:
-    """Evaluate the decisions of search strategies."""
-    results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
-    for index in track(scenes, "deciding", "scene"):
-        annotation, grid = run.scenes.annotation(index), run.grid(index)
-        searches = choose_searches(run.scenes, index, grid, protocol, classes, max_area, classes)
-        if not searches:
-            continue
-        detections = run.detections(index)
-        for search in searches:
-            target = search.target
-            looks = StoredLooks(detections, grid, torch.tensor([target]))
-            there = bool((annotation.labels == target).any())
-            for name, (way, rule) in ways.items():
-                ends = partial(rule, target=search.target, grid=grid)
-                with torch.inference_mode():
-                    steps = search_steps(looks, way, target, search.start, search.noise, ends)
-                    outcome = OUTCOMES[int(ends(steps[-1]))]
-                results[name].append((there, outcome, len(steps)))
-    rates: dict[str, _DecisionRates] = {}
-    for name, ended in results.items():
-        shares = []
-        for outcome, which in (("found", [True]), ("found", [False]), ("undecided", [True, False])):
-            chosen = [each == outcome for there, each, _ in ended if there in which]
-            shares.append(sum(chosen) / len(chosen) if chosen else math.nan)
-        hits, false_alarms, undecided = shares
-        rates[name] = (
-            hits,
-            false_alarms,
-            undecided,
-            sum(number for *_, number in ended) / max(len(ended), 1),
-            len(ended),
-        )
-    return rates
 
 
 class EvidenceFit(PartFit):
@@ -404,16 +303,63 @@ class EvidenceFit(PartFit):
     def _wide_thresholds(self, model: TargetEvidence) -> Thresholds:
         """Choose the thresholds on the held-out photographs, with many absent classes for a precise share of alarms."""
         config, scenes = self.settings, self.inputs.held_out
-        each, area = max(config.classes, min(20, _ABSENT // len(scenes))), config.max_target_area
-        wide = _make_examples(self.run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        absent = max(config.classes, min(20, _ABSENT // len(scenes)))
+        wide = _make_examples(self.run, replace(config, absent=absent), scenes)
         expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
         bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
         return _judge_evidence(bounds, model, wide, Grid(*config.cells, config.cells))[1]
 
+    def _curves(self, ways: Mapping[str, Strategy]) -> dict[str, FloatArray]:
+        """Cumulative performance of strategies on every photograph with a target, `(P, shifts+1)`."""
+        run, protocol = self.run, self.inputs.protocol
+        curves: dict[str, list[FloatArray]] = {name: [] for name in ways}
+        for index in track(self.inputs.judged, "searching", "scene"):
+            targets = legal_targets(run.scenes.annotation(index), self.settings.max_target_area)
+            episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
+            if not episodes:
+                continue
+            grid, name_of = run.grid(index), run.scenes.ids[index]
+            looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
+            noise = torch.stack(
+                [noise_for(protocol, len(grid), name_of, each.target, each.repetition) for each in episodes]
+            )
+            for name, way in ways.items():
+                with torch.inference_mode():
+                    ends = run_episodes(episodes, way, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
+                shifts = np.array([found_at for _, found_at in ends])
+                curves[name].append(cumulative_performance(shifts, protocol.shifts))
+        return {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in curves.items()}
+
+    def _decisions(self, ways: Mapping[str, tuple[Strategy, _Rule]]) -> tuple[list[list[str]], int]:
+        """Rows of a table of the decisions of strategies, and the number of searches."""
+        run, config, protocol = self.run, self.settings, self.inputs.protocol
+        results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
+        drawn = config.classes, config.max_target_area, config.classes
+        for index in track(self.inputs.judged, "deciding", "scene"):
+            annotation, grid = run.scenes.annotation(index), run.grid(index)
+            searches = choose_searches(run.scenes, index, grid, protocol, *drawn)
+            detections = run.detections(index) if searches else None
+            for search in searches:
+                assert detections is not None
+                looks = StoredLooks(detections, grid, torch.tensor([search.target]))
+                there = bool((annotation.labels == search.target).any())
+                for name, (way, rule) in ways.items():
+                    ends = partial(rule, target=search.target, grid=grid)
+                    with torch.inference_mode():
+                        steps = search_steps(looks, way, search.target, search.start, search.noise, ends)
+                        outcome = OUTCOMES[int(ends(steps[-1]))]
+                    results[name].append((there, outcome, len(steps)))
+        rows = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
+        for name, ended in results.items():
+            found = ([each == "found" for there, each, _ in ended if there == present] for present in (True, False))
+            shares = [share(sum(each), len(each)) for each in found]
+            undecided = share(sum(each == "undecided" for _, each, _ in ended), len(ended))
+            rows.append([name, *shares, undecided, mean_or_dash([looks for *_, looks in ended])])
+        return rows, len(results["fitted"])
+
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
-        config, run, inputs = self.settings, self.run, self.inputs
-        fit = fit_evidence(config, run)
+        inputs, fit = self.inputs, fit_evidence(self.settings, self.run)
         fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
         learned = Strategy(Target(fit.model), Policy("non-predictive"))
         ways = {
@@ -423,8 +369,7 @@ class EvidenceFit(PartFit):
         }
         for way in ways.values():
             way.eval().requires_grad_(False)
-        protocol, judged = inputs.protocol, inputs.judged
-        curves = _search_curves(run, judged, ways, protocol, config.max_target_area)
+        protocol, curves = inputs.protocol, self._curves(ways)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         at = inputs.compared_at
@@ -441,15 +386,10 @@ class EvidenceFit(PartFit):
                 lambda step, target, grid: confirms(step.detections, grid, step.cell, target, 0.5).long(),
             ),
         }
-        decided = _decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
+        outcomes, searched = self._decisions(rules)
         shifts = (1, at, protocol.shifts)
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
-        outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
-        outcomes += [
-            [name, *(f"{100 * share:.1f}" for share in shares), f"{looks:.1f}"]
-            for name, (*shares, looks, _) in decided.items()
-        ]
         report = "\n".join(
             [
                 section(
@@ -459,7 +399,7 @@ class EvidenceFit(PartFit):
                     rows,
                 ),
                 section(
-                    f"Decisions of {decided['fitted'][-1]} searches for present and for absent classes. A target "
+                    f"Decisions of {searched} searches for present and for absent classes. A target "
                     f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
                     f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
                     "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "

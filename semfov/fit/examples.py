@@ -36,22 +36,16 @@ class _Exploratory(Greedy):
 
 @dataclass(frozen=True)
 class Examples:
-    """Base of training examples; the fields are tensors with a row for each example.
-
-    Stored looks become looks of the kind `looks`, which takes `more` fields, with the model in training.
-
-    Shapes: features `(E, X·Y, …, X·Y, F)`, score `(E, X·Y, …)`, distance `(E, X·Y, X·Y)`, scene `(E,)`, target
-    `(E, …)`.
-    """
+    """Base of training examples, a row of each tensor; `looks` are made of them and `more` fields by a model."""
 
     looks: ClassVar[type[EvidenceLook]]
     more: ClassVar[tuple[str, ...]] = ()
 
-    features: Tensor
-    score: Tensor
-    distance: Tensor
-    scene: Tensor
-    target: Tensor
+    features: Tensor  # (E, X·Y, …, X·Y, F)
+    score: Tensor  # (E, X·Y, …)
+    distance: Tensor  # (E, X·Y, X·Y)
+    scene: Tensor  # (E,)
+    target: Tensor  # (E, …)
 
     def __len__(self) -> int:
         return len(self.scene)

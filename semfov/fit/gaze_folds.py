@@ -29,20 +29,14 @@ ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases
 
 
 def _folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int], list[int]]:
-    """Pictures to fit on and pictures held out of one of `count` folds: every `count`-th picture is held out.
-
-    `first` is the number of the first picture in its data set, of which a group has the pictures of one size.
-    """
+    """Pictures to fit on, and every `count`-th, which is held out; `first` numbers the first one in its data set."""
     check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
     held = [*range((fold - first) % count, number, count)]
     return [each for each in range(number) if each not in set(held)], held
 
 
 class Fold:
-    """The pictures of one of `count` folds, which are held out, and the others, to which a model is fitted.
-
-    The pictures are looked at when they are needed.
-    """
+    """Pictures that are held out in one of `count` folds, and those a model is fitted to; looked at when needed."""
 
     def __init__(
         self, groups: _Groups, number: int, count: int, settings: GazeFit, judges: _Groups | None = None
@@ -104,10 +98,7 @@ class Fold:
 
 
 class FoldStore:
-    """Models of folds, their scores and what else is computed of them in a folder, each computed once.
-
-    A change of the data, of the settings or of the program computes them anew.
-    """
+    """Models of folds and what is computed of them, in a folder, once for the same data, settings and program."""
 
     def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
         self.folder, code = folder, modules_digest("semfov.gaze.saliency", __name__)

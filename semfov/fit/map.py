@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +29,6 @@ from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.policies import Policy
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, answers_of
-from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.protocols import explorations_of, run_explorations
@@ -40,6 +40,8 @@ from semfov.viz.style import save_figure
 
 _JUDGED = (1, 2, 3, 5, 10, 15)
 """Numbers of looks after which a map is evaluated."""
+_MEASURED = {"objects": "right", "all": "right_everywhere"}
+"""Cells of which strategies are compared, with the name of the numbers of right ones."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +67,7 @@ class FitMapConfig(FitOnLooksConfig):
 
 @dataclass(frozen=True)
 class _MapExamples(Examples):
-    """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
-
-    Shapes: features `(E, X·Y, T, X·Y, F)`, score `(E, X·Y, T)`, target `(E, T)`, answers `(E, X·Y, T+1)`, stands_for
-    `(E, T)`.
-    """
+    """One for each photograph, with T classes; features `(E, X·Y, T, X·Y, F)`, answers `(E, X·Y, T+1)`."""
 
     looks, more = MapLook, ("stands_for",)
 
@@ -77,10 +75,9 @@ class _MapExamples(Examples):
     stands_for: Tensor
 
 
-def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _MapExamples:
-    """Make examples from all photographs with objects."""
-    rows = []
-    components = len(run.scenes.classes) + 1
+def _make_map_examples(run: Looking, config: FitMapConfig) -> _MapExamples:
+    """Make examples from all photographs with objects: of present classes, of high scores, and of a few others."""
+    rows, components, others, own = [], len(run.scenes.classes) + 1, config.others, config.classes - config.others
     for index in track(range(len(run.scenes)), "describing looks", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         if not len(annotation.labels):
@@ -90,11 +87,11 @@ def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _M
         score = highest_score(detections, every)
         held = torch.isin(every, annotation.labels)
         order = (score.amax(0) + 2 * held).argsort(descending=True)
-        chosen, rest = order[: classes - others], order[classes - others :]
-        drawn = torch.randperm(len(rest), generator=generator_for("others", seed, run.scenes.ids[index]))[:others]
-        chosen = torch.cat([chosen, rest[drawn]])
+        rest, generator = order[own:], generator_for("others", config.seed, run.scenes.ids[index])
+        drawn = torch.randperm(len(rest), generator=generator)[:others]
+        chosen = torch.cat([order[:own], rest[drawn]])
         stands_for = torch.ones(len(chosen))
-        stands_for[classes - others :] = len(rest) / max(len(drawn), 1)
+        stands_for[own:] = len(rest) / max(len(drawn), 1)
         with torch.inference_mode():
             features = torch.cat(
                 [
@@ -104,8 +101,8 @@ def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _M
             )
         answers = answers_of(annotation, grid, components)
         answers = torch.cat([~answers.any(-1, keepdim=True), answers[:, every[chosen]]], -1)
-        row = features, score[:, chosen], grid.cell_distance, torch.tensor(index), every[chosen], answers, stands_for
-        rows.append(row)
+        where = grid.cell_distance, torch.tensor(index), every[chosen]
+        rows.append((features, score[:, chosen], *where, answers, stands_for))
     if not rows:
         raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")
     return _MapExamples(*(torch.stack(column) for column in zip(*rows, strict=True)))
@@ -113,7 +110,7 @@ def _make_map_examples(run: Looking, classes: int, others: int, seed: int) -> _M
 
 def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model."""
-    examples = _make_map_examples(run, config.classes, config.others, config.seed)
+    examples = _make_map_examples(run, config)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
@@ -159,10 +156,7 @@ def _train_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
 
 
 def map_objective(step: Step, examples: _MapExamples) -> Tensor:
-    """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
-
-    A class that was drawn at random counts as often as the number of classes that it represents.
-    """
+    """The cross-entropy of every class and background: a mean over cells, and a sum over the classes represented."""
     belief = step.belief
     assert isinstance(belief, MapBelief)
     weight = torch.cat([torch.ones_like(examples.stands_for[:, :1]), examples.stands_for], 1)
@@ -172,32 +166,29 @@ def map_objective(step: Step, examples: _MapExamples) -> Tensor:
 
 
 def _train_gain(config: FitMapConfig, model: MapEvidence, examples: _MapExamples, grid: Grid) -> None:
-    """Train the prediction of a look's gain by least squares.
-
-    The gain of a look in a cell is the change of the cell's answer from wrong to right (1) or from right to wrong (-1).
-    """
+    """Train by least squares what a look brings in a cell: 1 if its answer gets right, -1 if it gets wrong."""
     generator = torch.Generator().manual_seed(config.seed + 1)
 
     def loss_of(_: int) -> Tensor:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
-        before: Step | None = None
         loss = chosen.score.new_zeros(())
         learned, policy = LearnedMap(model, together=True), CloserLook(grid)
         with torch.no_grad():
             steps = [*example_episodes(chosen, learned, policy, grid, config.looks, config.astray, generator)]
-        for step in steps:
-            if before is not None:
-                belief = before.belief
-                assert isinstance(belief, MapBelief)
-                brought = _right(step, chosen.answers) - _right(before, chosen.answers)
-                distance = chosen.distance[torch.arange(len(chosen)), step.cell][:, None]
-                expected = model.gain(belief.probabilities, belief.closest, belief.looks, distance)[:, 0]
-                loss = loss + (expected - brought).square().mean() * 100
-            before = step
+        for before, step in pairwise(steps):
+            brought = _right(step, chosen.answers) - _right(before, chosen.answers)
+            loss = loss + (_gain(model, before, chosen, step.cell) - brought).square().mean() * 100
         return loss
 
     title = "learning the gain of looks"
     descend(model.worth.parameters(), loss_of, config.gain_steps, config.rate, clip=None, title=title)
+
+
+def _gain(model: MapEvidence, step: Step, examples: _MapExamples, cell: Tensor) -> Tensor:
+    """The gain of looks from cells `(B,)` that the model expects after a look, `(B, X·Y)`."""
+    belief, distance = step.belief, examples.distance[torch.arange(len(examples)), cell][:, None]
+    assert isinstance(belief, MapBelief)
+    return model.gain(belief.probabilities, belief.closest, belief.looks, distance)[:, 0]
 
 
 def _right(step: Step, answers: Tensor) -> Tensor:
@@ -211,22 +202,15 @@ def _right(step: Step, answers: Tensor) -> Tensor:
 @torch.no_grad()
 def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples, grid: Grid) -> list[dict[str, float]]:
     """Evaluate the model on held-out explorations, after each number of looks in `_JUDGED`."""
-    generator = torch.Generator().manual_seed(config.seed)
-    judged = []
-    answers = examples.answers
+    generator, judged, answers = torch.Generator().manual_seed(config.seed), [], examples.answers
     some = ~answers[..., 0]
-    before: tuple[Tensor, Tensor] | None = None
+    expected = was = torch.zeros(())
     learned, policy = LearnedMap(model, together=True), CloserLook(grid)
     for step in example_episodes(examples, learned, policy, grid, max(_JUDGED), 0.0, generator):
         belief = step.belief
         assert isinstance(belief, MapBelief)
         p, now = belief.probabilities, _right(step, answers)
         named = answers[..., 1:].gather(-1, p[..., 1:].argmax(-1, keepdim=True))[..., 0]
-        gained = (0.0, 0.0)
-        if before is not None:
-            distance = examples.distance[torch.arange(len(examples)), step.cell][:, None]
-            expected, was = before
-            gained = float(expected.sum(-1).mean()), float((now - was).sum(-1).mean())
         if step.shift + 1 in _JUDGED:
             judged.append(
                 {
@@ -237,12 +221,11 @@ def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
                     "nll": float(F.binary_cross_entropy(p.double(), answers.double())),
                     "ece": float(calibration_error(p.flatten(), answers.flatten())),
                     "ece_background": float(calibration_error(p[..., 0].flatten(), answers[..., 0].flatten())),
-                    "expected": gained[0],
-                    "brought": gained[1],
+                    "expected": float(expected.sum(-1).mean()) if step.shift else 0.0,
+                    "brought": float((now - was).sum(-1).mean()) if step.shift else 0.0,
                 }
             )
-        distance = examples.distance[torch.arange(len(examples)), step.next_cell][:, None]
-        before = model.gain(p, belief.closest, belief.looks, distance)[:, 0], now
+        expected, was = _gain(model, step, examples, step.next_cell), now
     return judged
 
 
@@ -276,37 +259,6 @@ def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> 
     )
 
 
-def _explore_curves(
-    run: Looking, scenes: Sequence[int], ways: Mapping[str, Strategy], protocol: ProtocolConfig
-) -> dict[str, dict[str, FloatArray]]:
-    """Measure the share of cells that exploration strategies classify correctly; → `(P, shifts+1)`."""
-    curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
-    for index in track(scenes, "exploring", "scene"):
-        grid = run.grid(index)
-        answers = answers_of(run.scenes.annotation(index), grid, len(run.scenes.classes) + 1)
-        if not answers.any():
-            continue
-        looks = StoredLooks(run.detections(index), grid)
-        episodes = explorations_of(run.scenes, index, len(grid), protocol)
-        noise = torch.stack(
-            [noise_for(protocol, len(grid), run.scenes.ids[index], None, each.repetition) for each in episodes]
-        )
-        cells = int(answers.any(-1).sum())
-        for name, way in ways.items():
-            with torch.inference_mode():
-                progress = run_explorations(
-                    episodes, way, looks, answers, noise, shifts=protocol.shifts, batch=protocol.batch
-                )
-            rates = [np.asarray(counts["right"]) / cells for _, counts in progress]
-            curves["objects"][name].append(np.mean(rates, axis=0))
-            rates = [np.asarray(counts["right_everywhere"]) / len(grid) for _, counts in progress]
-            curves["all"][name].append(np.mean(rates, axis=0))
-    return {
-        what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in ways_of.items()}
-        for what, ways_of in curves.items()
-    }
-
-
 class MapFit(PartFit):
     """Train the map of all classes."""
 
@@ -323,6 +275,34 @@ class MapFit(PartFit):
             "exploring": len(self.inputs.judged),
         }
 
+    def _curves(self, ways: Mapping[str, Strategy]) -> dict[str, dict[str, FloatArray]]:
+        """Share of the cells, with `objects` and of `all`, that strategies classify correctly, `(P, shifts+1)`."""
+        run, protocol = self.run, self.inputs.protocol
+        curves: dict[str, dict[str, list[FloatArray]]] = {what: {name: [] for name in ways} for what in _MEASURED}
+        for index in track(self.inputs.judged, "exploring", "scene"):
+            grid = run.grid(index)
+            answers = answers_of(run.scenes.annotation(index), grid, self.inputs.components)
+            if not answers.any():
+                continue
+            looks = StoredLooks(run.detections(index), grid)
+            episodes = explorations_of(run.scenes, index, len(grid), protocol)
+            noise = torch.stack(
+                [noise_for(protocol, len(grid), run.scenes.ids[index], None, each.repetition) for each in episodes]
+            )
+            cells = {"objects": int(answers.any(-1).sum()), "all": len(grid)}
+            for name, way in ways.items():
+                with torch.inference_mode():
+                    progress = run_explorations(
+                        episodes, way, looks, answers, noise, shifts=protocol.shifts, batch=protocol.batch
+                    )
+                for what, counted in _MEASURED.items():
+                    rates = [np.asarray(counts[counted]) / cells[what] for _, counts in progress]
+                    curves[what][name].append(np.mean(rates, axis=0))
+        return {
+            what: {name: np.array(each).reshape(-1, protocol.shifts + 1) for name, each in of_ways.items()}
+            for what, of_ways in curves.items()
+        }
+
     def fit(self) -> PartResult:
         """Train, and compare explorations with those of raw scores and random gaze."""
         inputs, run = self.inputs, self.run
@@ -337,9 +317,7 @@ class MapFit(PartFit):
         }
         for way in ways.values():
             way.eval().requires_grad_(False)
-        protocol = inputs.protocol
-        curves = _explore_curves(run, inputs.judged, ways, protocol)
-        at = inputs.compared_at
+        protocol, at, curves = inputs.protocol, inputs.compared_at, self._curves(ways)
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):
             raise DataError("data: none of the held-out photographs contains an object; give more photographs")
@@ -353,13 +331,10 @@ class MapFit(PartFit):
             f"{gain.in_words('points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
             f"{100 * every['raw'][:, at].mean():.1f} %"
         )
-        sections = []
+        sections, after = [], (1, at, protocol.shifts)
         for what, words in (("objects", "cells with objects, the published success rate"), ("all", "all cells")):
-            rows = [["map", *(f"after {n}" for n in (1, at, protocol.shifts))]]
-            rows += [
-                [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
-                for name, curve in curves[what].items()
-            ]
+            rows = [["map", *(f"after {n}" for n in after)]]
+            rows += [[name, *(mean_percent(curve[:, n]) for n in after)] for name, curve in curves[what].items()]
             sections.append(section(f"Classified correctly after n gaze shifts, in % of {words}:", rows))
         head = (
             f"On {len(objects['raw'])} held-out photographs. `raw` fuses raw scores with random gaze; `fused` uses the "

@@ -33,10 +33,7 @@ _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 def fit_published(
     eye: Eye | WindowEye, scenes: Scenes, statistics: DirichletStatistics, edges: Sequence[float], **options: Any
 ) -> FovealObservationModel:
-    """Fit Dirichlet distributions to the scores of each class and level (`FovealObservationModel.fit`).
-
-    A pair of class and level with enough detections is fitted by maximum likelihood, as published. Others are shrunk.
-    """
+    """Fit Dirichlet distributions to the scores of each class and level; those with few detections are shrunk."""
     model = FovealObservationModel.identity(eye.detector.classes, edges)
     samples, data = int(statistics.count.sum()), scenes.fingerprint
     with warnings.catch_warnings():
@@ -86,15 +83,13 @@ class ObservationFit(PartFit):
         config, run, samples = self.config, self.run, self.inputs.samples
         holdout, edges = self.settings["holdout"], config.sensor.level_edges()
         held_out = split(samples.scene, holdout)
-        judged = samples[held_out]
-        fitted = samples[~held_out]
+        judged, fitted = samples[held_out], samples[~held_out]
         statistics = statistics_of(edges, run.eye.detector.classes, [fitted])
         noted = {"expected": "empirical", "fixations": config.fixations, "seed": config.seed}
         start = fit_published(run.eye, run.scenes, statistics, edges, **noted)
         model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
         fitted_on = {index for index in range(len(run.scenes)) if index % holdout}
-        cells = partial(all_cells, cells=config.cells)
-        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        misses = count_misses(run.scenes, samples, fitted_on, model.edges, partial(all_cells, cells=config.cells))
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, edges).eval()
         with torch.inference_mode():

@@ -88,11 +88,7 @@ def fit_photographs(
     config: FitMosaicsConfig,
     prior: Verification | None = None,
 ) -> str:
-    """Fit the evidence for photographs on some of them, evaluate it in folds, and add it to the model.
-
-    Those with most pixels are searched, each for up to two classes that it holds and for others that it does not. The
-    prior is that of `fit`. Returns the report in Markdown.
-    """
+    """Fit the evidence for photographs on those with most pixels, in folds, and add it to the model; the report."""
     canvas = eye.detector.input_size
     single = [n for n in range(len(pictures)) if Lattice.over(pictures.annotation(n).size, canvas).levels == 1]
     if not single:

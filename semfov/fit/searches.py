@@ -31,10 +31,7 @@ from semfov.runs.store import DetectionStore, RememberedLooks
 
 
 class TargetSearch(ABC, Generic[LookType]):
-    """Base of the searches for a class in a picture, with all their looks but the closer ones, `steps`.
-
-    Decisions do not move the gaze, so all of them can be made along the same looks.
-    """
+    """Base of the searches for a class in a picture, with all `steps`: decisions do not move the gaze."""
 
     after: ClassVar[tuple[int, ...]]
     most: ClassVar[int] = MOST_CLOSER

@@ -49,13 +49,9 @@ def hit_rates(
     least: int,
     most: int | None = None,
 ) -> dict[int, float]:
-    """Compute the share of next fixations that hit the target in each of `most` photographs with `least` objects.
-
-    The settings are those of the looks: `fixations`, `columns`, `rows` and `max_target_area`.
-    """
+    """Share of next fixations that hit the target in each of `most` photographs with `least` objects."""
     rates = {}
-    number = min(most or len(scenes), len(scenes))
-    for index in track(range(number), title, "scene"):
+    for index in track(range(min(most or len(scenes), len(scenes))), title, "scene"):
         annotation = scenes.annotation(index)
         targets = legal_targets(annotation, config.max_target_area)
         if len(annotation.labels) < least or not targets:
@@ -80,14 +76,7 @@ def hit_rates(
 def hit_rate(
     observer: Semantic, detections: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
 ) -> float | None:
-    """Compute the share of next fixations that hit the target in one photograph.
-
-    The mean is over targets and over the beliefs after the first look, the second look and so on. Looks that fixate the
-    target are left out, as they would have ended the search. If several cells are equally probable, the share of them
-    that contain the target counts.
-
-    Shapes: fixations `(R, 2)`, targets `(T,)`, goal `(T, X·Y)`.
-    """
+    """Share of next fixations that hit the target, over targets and looks before they fixate it; goal `(T, X·Y)`."""
     evidence = observer.weigh(detections, fixations, grid)
     belief = observer.start(len(targets), grid, detections.scores)
     visited = torch.zeros_like(goal)
@@ -98,7 +87,7 @@ def hit_rate(
         belief.beta[going], belief.closest[going] = updated.beta, updated.closest
         visited[going, cell] = True
         posterior = updated.probability(targets[going]).masked_fill(visited[going], -1)
-        best = posterior == posterior.amax(-1, keepdim=True)
+        best = posterior == posterior.amax(-1, keepdim=True)  # of which one is drawn
         hits.append((best & goal[going]).sum(-1) / best.sum(-1))
     share = torch.cat(hits)
     return float(share.mean()) if len(share) else None
@@ -127,11 +116,8 @@ class TemperingFit(PartFit):
         means = {way: mean_hits(holdout, each) for way, each in rates.items()}
         scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
         held_out = [index for index in raw if index % holdout == 0]
-        chosen = rates[best]
-        gain = Difference.of(
-            torch.tensor([chosen[index] for index in held_out]).numpy(),
-            torch.tensor([raw[index] for index in held_out]).numpy(),
-        )
+        shares = (torch.tensor([each[index] for index in held_out]).numpy() for each in (rates[best], raw))
+        gain = Difference.of(*shares)
         before = mean_hits(holdout, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "

@@ -102,10 +102,7 @@ class _VerifiedSearch(NamedTuple):
 
 
 class _CloserLooks(NamedTuple):
-    """Closer looks at places that seemed to hold a target.
-
-    Shapes: features `(N, 7)`, right `(N,)`, present `(N,)`, fold `(N,)`.
-    """
+    """Closer looks at N places that seemed to hold a target; features `(N, 7)`."""
 
     features: Tensor
     right: Tensor
@@ -120,10 +117,7 @@ def fit_in_folds(
     prior: Verification | None = None,
     surest: float = _LEVELS[-1],
 ) -> tuple[Verification, list[Verification], _CloserLooks, list[_VerifiedSearch]]:
-    """Fit the model to closer looks at photographs, search again in folds, and choose the threshold `confirm`.
-
-    Returns the model, those of the folds, the closer looks, and the searches of photographs that were left out.
-    """
+    """Fit the model and those of folds to closer looks, search again in the folds, and choose `confirm` on that."""
     closer = examine(photograph_searches(photographs, evidence, config.looks, "looking"), config.folds)
     if closer is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
@@ -216,18 +210,12 @@ def choose_confirm(searches: Sequence[_VerifiedSearch], false_alarms: float, sur
 
 
 def fit(closer: _CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
-    r"""Fit both logistic regressions by penalised maximum likelihood; chosen `(N,)`.
+    r"""Fit both logistic regressions by penalised maximum likelihood, or maximum a posteriori; chosen `(N,)`.
 
-    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \qquad
-              \lambda = 10^{-4}
+    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \quad\text{or}\quad
+              \dots + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right)
 
-    where w' are the weights of the features scaled to zero mean and unit variance. With a prior the fit keeps close to
-    a model with parameters :math:`w_0, b_0`, the closer the fewer the closer looks:
-
-    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i)
-              + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right), \qquad \kappa = 10
-
-    This is the maximum a posteriori estimate for normal distributions around :math:`w'_0` and :math:`b'_0`.
+    with w' the weights of features of zero mean and unit variance, λ = 1e-4, and w'₀, b'₀ those of a prior, κ = 10.
     """
     phi = closer.features[chosen].double()
     if len(phi) < 2:
@@ -343,10 +331,7 @@ def _row(present: Sequence[bool], ended: Sequence[_SearchEnd]) -> list[str]:
 
 
 class VerificationFit(PartFit):
-    """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
-
-    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`_SHIPPED`).
-    """
+    """Fit the verification to held-out photographs: the target evidence is surer on those it learned from."""
 
     settings: VerificationConfig
 
@@ -400,10 +385,7 @@ class VerificationFit(PartFit):
 
 
 def _scores(searches: Sequence[_VerifiedSearch], ends: Sequence[_SearchEnd]) -> FloatArray:
-    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes; → `(P,)`.
-
-    Shapes: → `(P,)`.
-    """
+    """Mean score of the decisions in each photograph, `(P,)`; present and absent classes have equal weight."""
     by_picture: dict[int, dict[bool, list[int]]] = {}
     for each, (right, _) in zip(searches, ends, strict=True):
         score = 0 if right is None else 1 if right else -1

@@ -213,10 +213,7 @@ def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> li
 
 
 class Events(NamedTuple):
-    """Fixations to be predicted in a picture, all but the first of each path: those before, cell and person.
-
-    Shapes: before `(E, N, 2)`, NaN before a shorter path; cell `(E,)`; person `(E,)`.
-    """
+    """Fixations to be predicted, all but the first of a path: those before `(E, N, 2)`, cell and person."""
 
     before: Tensor
     cell: Tensor

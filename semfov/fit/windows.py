@@ -59,16 +59,13 @@ _JUDGED = (1, 4, 8, 16)
 
 
 class _Searches(NamedTuple):
-    """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
+    """E searches of n looks; one that ends early is padded with its last values, and with 0 for `left`."""
 
-    Shapes: best `(E, n)`, case `(E, n, 10)`, looked `(E, n)`, left `(E, n)`, there `(E,)`.
-    """
-
-    best: Tensor
-    case: Tensor
-    looked: Tensor
-    left: Tensor
-    there: Tensor
+    best: Tensor  # (E, n)
+    case: Tensor  # (E, n, 10)
+    looked: Tensor  # (E, n)
+    left: Tensor  # (E, n)
+    there: Tensor  # (E,)
 
 
 @torch.inference_mode()

@@ -46,14 +46,11 @@ _COVERED = 0.8
 
 
 class Exploration(NamedTuple):
-    """An exploration of a picture for all classes, or for a target of which it holds a number of objects.
-
-    After numbers of looks, the last one included, it has the facts about the objects `(n, 14)` and whether they are
-    right `(n,)`, -1 in a crowd.
-    """
+    """An exploration of a picture for all classes, or for a target of which it holds a number of objects."""
 
     target: int | None
     held: int
+    # After numbers of looks, facts about the objects `(n, 14)`, and whether they are right `(n,)`, -1 in a crowd.
     objects: dict[int, tuple[Tensor, Tensor]]
     remaining: list[tuple[float, float]]
     promised: list[float]
@@ -125,20 +122,8 @@ def explorations_of_kinds(
 
 
 def logistic_regression(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> list[float]:
-    """Fit a logistic regression by maximum likelihood, with Newton's method in float64: the offset, then the weights.
-
-    A weak prior (half a case for and against without any facts, and small weights) keeps the result finite where all
-    cases are right or all wrong.
-
-    >>> torch.manual_seed(0)
-    <torch._C.Generator object at ...>
-    >>> facts, weights = torch.randn(20_000, 3), torch.full((3,), 0.5)
-    >>> fitted = logistic_regression(facts, torch.rand(20_000) < (facts @ weights - 1).sigmoid())
-    >>> [round(number, 1) for number in fitted]
-    [-1.0, 0.5, 0.5, 0.5]
-
-    Shapes: facts `(n, m)`, right `(n,)`.
-    """
+    """Fit a logistic regression by maximum likelihood, with Newton's method: offset and weights; facts `(n, m)`."""
+    # Half a case for and against without any facts keeps the result finite where all cases are right or all wrong.
     inputs = torch.cat([facts.double(), facts.new_zeros(2, facts.shape[1], dtype=torch.float64)])
     inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
     there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
@@ -176,14 +161,9 @@ def _fitted(explored: Sequence[Exploration], passes: int) -> Certainty:
 
 
 def _fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certainty:
-    """Fit the number of objects that further looks show, by least squares over a grid.
-
-    The error is that of the logarithm of one more than the number of objects in all, so that pictures with few objects
-    count as much as those with many. Only explorations for objects of all classes are taken: of a single class some
-    pictures hold hundreds of a few pixels.
-    """
+    """Fit the number of objects that further looks show, by least squares of logarithms over a grid."""
     cases = []
-    for each in explored:
+    for each in explored:  # for all classes: of a single one some pictures hold hundreds of a few pixels
         numbers = [n for n in _EXPECTING if n < each.looks] if each.target is None else []
         end = each.sums(certainty, each.looks)[1] if numbers else 0.0
         for number in numbers:

@@ -33,7 +33,7 @@ class _WindowResult(NamedTuple):
 
 
 class ZoomExample(NamedTuple):
-    """A mosaic with looks at many windows; labels `(M,)`."""
+    """A mosaic with looks at many windows; a look shows a class with a score of `least`; labels `(M,)`."""
 
     lattice: Lattice
     labels: Tensor
@@ -49,10 +49,7 @@ class ZoomExample(NamedTuple):
 
     @classmethod
     def of(cls, pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> "ZoomExample":
-        """Look at all windows of a picture and collect the results; a look shows a class with a score of `least`.
-
-        A look finds the objects that it shows with a detection of their class.
-        """
+        """Look at all windows of a picture, and collect which objects are shown with a detection of their class."""
         annotation, looks = pictures.annotation(index), []
         for glance in glances.see(cls.windows(pictures, index, glances.lattice)):
             detections = glance.detections
@@ -68,10 +65,7 @@ _Cells = tuple[int, int, int, int]
 
 
 def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _WindowResult, int, _Cells]]:
-    """The closer looks of a mosaic inside a look, by number, as far as it predicts them, and its cells that they show.
-
-    An overview predicts all: their windows may reach beyond the picture.
-    """
+    """The closer looks inside a look, by number, as far as it predicts them (an overview all), and the cells shown."""
     high, wide = (n * look.scale for n in look.scores.shape[:2])
     for place, closer in enumerate(example.looks):
         steps = closer.window.level - look.level
@@ -82,11 +76,7 @@ def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _Wi
 
 
 class Windows(NamedTuple):
-    """N pairs of a look and a closer window inside it, as one table.
-
-    Shapes: scores `(N, K)`, summary `(N, 3)`, steps `(N,)`, presence `(N, K)`, before `(N,)`, slot `(N,)`, mosaic
-    `(N,)`.
-    """
+    """Pairs of a look and a closer window inside it; scores and presence `(N, K)`, summary `(N, 3)`, others `(N,)`."""
 
     scores: Tensor
     summary: Tensor
@@ -165,11 +155,9 @@ def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, b
 def _rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic."""
     strongest = torch.stack([look.show for look in example.looks]).amax(0)
-    sure, faint = (
-        (strongest >= example.least).nonzero()[:, 0] + 1,
-        ((strongest >= 0.02) & (strongest < example.least)).nonzero()[:, 0] + 1,
-    )
-    targets = torch.cat([_some(sure, 8), _some(faint, 4)])
+    sure = strongest >= example.least
+    kinds = ((sure, 8), ((strongest >= 0.02) & ~sure, 4))
+    targets = torch.cat([_some(kind.nonzero()[:, 0] + 1, most) for kind, most in kinds])
     if not len(targets):
         targets = _some(torch.arange(len(strongest)) + 1, 1)
     looks = [look for look in example.looks if look.gist is not None]
@@ -191,10 +179,7 @@ def _some(values: Tensor, most: int) -> Tensor:
 
 
 def _rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
-    """Convert the rates of the overview to the cells of a closer look, for windows one octave closer than that look.
-
-    Shapes: logs `(T, 3, rows, columns)` → `(T, rows, columns)`.
-    """
+    """Rates of the overview `(T, 3, …)` in the cells of a closer look, for windows an octave closer, `(T, …)`."""
     cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     rows, columns = (n * look.scale for n in look.scores.shape[:2])
     part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
@@ -202,12 +187,7 @@ def _rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
 
 
 def _likelihood_loss(
-    model: GlimpseEvidence,
-    example: ZoomExample,
-    look: Gist,
-    logs: Tensor,
-    targets: Tensor,
-    earlier: Tensor,
+    model: GlimpseEvidence, example: ZoomExample, look: Gist, logs: Tensor, targets: Tensor, earlier: Tensor
 ) -> Tensor:
     """Compute the mean negative log likelihood over the closer windows inside a look."""
     rates = logs.exp()

@@ -162,11 +162,7 @@ def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
 
 @torch.inference_mode()
 def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], model: GlimpseEvidence | None) -> FloatArray:
-    """Measure the recall in each photograph of some mosaics after each pass; → `(P, 16)`.
-
-    Without a model the looks are at slices in the order of the overview's scores, as an agent without evidence makes
-    them.
-    """
+    """Recall in each photograph of mosaics after each pass, `(P, 16)`; without a model by slices, as by an agent."""
     hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
     for index, glances in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)

@@ -52,7 +52,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def examples(run):
-    return _make_examples(run, 2, 0.5, 0)
+    return _make_examples(run, FitSearchConfig(classes=2, max_target_area=0.5))
 
 
 def test_examples_match_looks_from_every_cell(run, examples):
@@ -315,7 +315,7 @@ def looked():
 
 @pytest.fixture(scope="module")
 def map_examples(looked):
-    return _make_map_examples(looked, 6, 2, 0)
+    return _make_map_examples(looked, FitMapConfig(classes=6, others=2))
 
 
 def classes_in(annotation, cell):
@@ -355,21 +355,24 @@ def test_examples_have_all_present_classes_and_some_that_represent_the_others(lo
         # Four classes, present or with the highest scores, represent themselves; two represent the four others.
         assert map_examples.stands_for[row].tolist() == [1, 1, 1, 1, 2, 2]
         assert float(map_examples.stands_for[row].sum()) == len(CLASSES)
-    draws = {tuple(_make_map_examples(looked, 6, 2, seed).target[0].tolist()) for seed in range(8)}
+    draws = {
+        tuple(_make_map_examples(looked, FitMapConfig(classes=6, others=2, seed=seed)).target[0].tolist())
+        for seed in range(8)
+    }
     assert len(draws) > 1
-    assert torch.equal(_make_map_examples(looked, 6, 2, 0).target, map_examples.target)
+    assert torch.equal(_make_map_examples(looked, FitMapConfig(classes=6, others=2)).target, map_examples.target)
 
 
 @pytest.mark.parametrize(("classes", "others"), [(8, 3), (9, 3), (12, 3), (20, 5)])
 def test_every_class_represents_itself_when_there_are_few(looked, classes, others):
-    made = _make_map_examples(looked, classes, others, 0)
+    made = _make_map_examples(looked, FitMapConfig(classes=classes, others=others))
     assert made.target.shape == (4, 8)
     assert bool((made.stands_for == 1).all())
 
 
 def test_looks_of_examples_of_the_map_match_stored_looks(looked):
     """The beliefs about all classes are equal except for the rounding of features to half precision."""
-    map_examples = _make_map_examples(looked, 12, 3, 0)
+    map_examples = _make_map_examples(looked, FitMapConfig())
     torch.manual_seed(1)
     model = MapEvidence(6, 5, components=len(CLASSES) + 1).eval().requires_grad_(False)
     cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
