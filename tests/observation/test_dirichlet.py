@@ -1,21 +1,23 @@
-"""Densities, moments, entropy and divergence against scipy, torch.distributions, mpmath and closed forms.
-
-Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
-"""
+"""Dirichlet distributions: densities, divergences, special functions, maximum likelihood, against SciPy and mpmath."""
 
 import math
 
+import dirichlet as pypi
 import mpmath
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.optimize
+import scipy.special
 import scipy.stats
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semfov import DirichletBelief, InputError, dirichlet
 from semfov.belief.fusion import fuse
+from semfov.observation.dirichlet import floor, log_prob, mle, shrink, vacuous
+from semfov.observation.special import log_gamma_divergence
 from tests.refusals import refused
 
 DTYPES = [torch.float32, torch.float64]
@@ -186,3 +188,238 @@ def test_parameters_that_are_no_floats_or_too_large_are_refused():
     ):
         for call in (dirichlet.entropy, lambda given: dirichlet.kl_divergence(given, torch.ones(2))):
             refused(said if call is dirichlet.entropy else "alpha|other", call, alpha)
+
+
+METHODS = ["newton", "fixed_point", "gradient"]
+
+
+def expected_logs(alpha):
+    """Mean logs of infinitely many samples."""
+    return alpha.digamma() - alpha.sum(-1, keepdim=True).digamma()
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("components", "mean", "spread"),
+    [(2, 0, 1.5), (2, 0, 3), (3, 0, 1), (10, 3, 2), (81, -1, 2), (81, -6, 1.5), (81, 4, 2)],
+)
+def test_parameters_are_recovered_from_their_expected_logs(method, components, mean, spread):
+    alpha = (normal(5, 4, components) * spread + mean).exp()
+    got = mle(expected_logs(alpha), method=method)
+    assert got.shape == alpha.shape
+    torch.testing.assert_close(got, alpha, rtol=1e-6, atol=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 12), st.integers(2, 30), st.floats(-3, 4))
+def test_all_methods_find_the_same_maximum(seed, components, samples, level):
+    generator = np.random.default_rng(seed)
+    truth = np.exp(generator.normal(level, 1.5, components))
+    scores = floor(torch.from_numpy(generator.dirichlet(truth, samples)), 1e-6)
+    mean_log = scores.log().mean(0)
+    found = [mle(mean_log, method=method) for method in METHODS]
+    torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=0)
+    torch.testing.assert_close(found[2], found[0], rtol=1e-6, atol=0)
+    best = log_prob(found[0], mean_log)
+    bounded = float(found[0].sum()) > 0.999e8
+    for direction in normal(5, components, seed=seed) * 1e-2:
+        near = found[0] * direction.exp()
+        near = near * (found[0].sum() / near.sum() if bounded else 1.0)
+        assert float(log_prob(near, mean_log)) <= float(best)
+
+
+def test_fit_matches_the_pypi_package():
+    samples = np.random.default_rng(1).dirichlet([3.0, 0.5, 8.0, 1.0], 100)
+    mean_log = torch.from_numpy(np.log(samples)).mean(0)
+    reference = pypi.mle(samples, tol=1e-12)
+    ours = mle(mean_log)
+    np.testing.assert_allclose(ours, reference, rtol=1e-5)
+    assert float(log_prob(ours, mean_log)) >= pypi.loglikelihood(samples, reference) / 100 - 1e-12
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_batch_equals_its_rows(method):
+    alpha = (normal(6, 5) * 2).exp()
+    mean_log = expected_logs(alpha)
+    kept = mean_log.clone()
+    batch = mle(mean_log.reshape(3, 2, 5), method=method)
+    assert torch.equal(mean_log, kept)
+    rows = torch.stack([mle(row, method=method) for row in mean_log])
+    torch.testing.assert_close(batch.reshape(6, 5), rows, rtol=1e-7, atol=0)
+    assert mle(mean_log[:0], method=method).shape == (0, 5)
+
+
+def test_single_precision_input_gives_single_precision_output():
+    alpha = (normal(4, 6) * 0.5 + 1).exp()
+    got = mle(expected_logs(alpha).float())
+    assert got.dtype == torch.float32
+    torch.testing.assert_close(got.double(), alpha, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_identical_samples_get_the_largest_precision(method):
+    scores = torch.tensor([0.7, 0.2, 0.1], dtype=torch.float64)
+    alpha = mle(torch.stack([scores, scores]).log().mean(0), method=method, max_precision=1e5)
+    assert float(alpha.sum()) == pytest.approx(1e5)
+    torch.testing.assert_close(alpha / alpha.sum(), scores, rtol=1e-4, atol=0)
+    default = mle(scores.log(), method=method)
+    assert float(default.sum()) == pytest.approx(1e8)
+
+
+def test_a_bound_on_the_precision_gives_the_constrained_maximum():
+    samples = np.random.default_rng(2).dirichlet([30.0, 5.0, 65.0], 50)
+    mean_log = np.log(samples).mean(0)
+    bound = 20.0
+
+    def loss(x):
+        alpha = bound * np.exp(x) / np.exp(x).sum()
+        return (
+            -scipy.stats.dirichlet(alpha).logpdf(np.exp(mean_log) / np.exp(mean_log).sum())
+            + ((alpha - 1) * (mean_log - np.log(np.exp(mean_log).sum()) - mean_log)).sum()
+        )
+
+    best = scipy.optimize.minimize(loss, np.zeros(3), options={"gtol": 1e-10}).x
+    expected = bound * np.exp(best) / np.exp(best).sum()
+    got = mle(torch.from_numpy(mean_log), max_precision=bound)
+    assert float(mle(torch.from_numpy(mean_log)).sum()) > bound
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_zeros_are_refused_unless_they_are_floored():
+    scores = torch.tensor([[0.0, 0.4, 0.6], [0.0, 0.7, 0.3]], dtype=torch.float64)
+    refused(r"mean_log.*finite", mle, scores.log().mean(0))
+    mean_log = floor(scores, 1e-6).log().mean(0)
+    alpha = mle(mean_log)
+    torch.testing.assert_close(expected_logs(alpha), mean_log, rtol=0, atol=1e-8)
+
+
+def test_shrinkage_adds_samples_of_the_prior():
+    empty = torch.full((2, 4), torch.nan, dtype=torch.float64)
+    parent = expected_logs(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64))
+    torch.testing.assert_close(shrink(empty, torch.zeros(2), parent, 1.0), parent.expand(2, 4))
+    alpha = mle(shrink(empty, torch.zeros(2), vacuous(4), 1.0))
+    torch.testing.assert_close(alpha, torch.ones(2, 4, dtype=torch.float64))
+    data = torch.from_numpy(np.random.default_rng(4).dirichlet([2.0, 1.0, 4.0], 7)).log()
+    prior = torch.from_numpy(np.random.default_rng(5).dirichlet([1.0, 1.0, 1.0], 3)).log()
+    pooled = mle(torch.cat([data, prior]).mean(0))
+    shrunk = mle(shrink(data.mean(0), torch.tensor(7), prior.mean(0), 3.0))
+    torch.testing.assert_close(shrunk, pooled, rtol=1e-10, atol=0)
+
+
+def test_gradients_of_the_optimum_are_correct():
+    mean_log = expected_logs((normal(3, 4, seed=5)).exp()).requires_grad_()
+    assert torch.autograd.gradcheck(mle, (mean_log,), rtol=1e-4)
+    bounded = torch.tensor([[0.7, 0.2, 0.1]], dtype=torch.float64).log().requires_grad_()
+    assert torch.autograd.gradcheck(lambda g: mle(g - 1e-3, max_precision=50.0), (bounded,), rtol=1e-4)
+
+
+def test_bad_arguments_are_named():
+    refused("expected|did you mean", lambda: mle(torch.tensor([-1.0])))
+    refused("expected|did you mean", lambda: mle(torch.tensor(-1.0)))
+    refused("expected|did you mean", lambda: mle(torch.tensor([-0.1, -0.1])))
+    refused("expected|did you mean", lambda: mle(torch.tensor([-1.0, torch.nan])))
+    refused("expected|did you mean", lambda: mle(torch.tensor([-1.0, -1.0]), method="newtons"))
+    refused("expected|did you mean", lambda: mle(torch.tensor([-1.0, -1.0]), max_precision=0.0))
+    refused("expected|did you mean", lambda: shrink(torch.zeros(2), torch.tensor(1), torch.zeros(2), 0.0))
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_fits_without_gradients(method, mode):
+    mean_log = torch.tensor([[-1.0, -2.0, -1.5], [-2.0, -1.2, -1.0]], dtype=torch.float64)
+    expected = mle(mean_log, method=method)
+    with mode():
+        torch.testing.assert_close(mle(mean_log.clone(), method=method), expected)
+
+
+mp = mpmath.mp.clone()
+mp.dps = 40
+
+# From close to the pole at 0 to where the function is linear, and close to c.
+POINTS = [*np.logspace(-8, 8, 97).tolist(), 0.5, 1.0, 2.0, 8.0]
+NEAR = [1 + step for step in (-0.1, -1e-2, -1e-3, 1e-3, 1e-2, 0.1, 0.5)]
+
+
+def exact(x, c):
+    x, c = mp.mpf(x), mp.mpf(c)
+    return float((x - c) * mp.digamma(x) - mp.loggamma(x) + mp.loggamma(c))
+
+
+@pytest.mark.parametrize("c", [0.25, 0.5, 1.0, 5.0, 100.0])
+@pytest.mark.parametrize(("dtype", "digits"), [(torch.float64, 5e-14), (torch.float32, 1e-6)], ids=str)
+def test_divergence_of_log_gamma_matches_mpmath(dtype, digits, c):
+    """Up to a few rounding errors of the value or of the distance from c, as the value is much smaller near c."""
+    x = torch.tensor([*POINTS, *(c * step for step in NEAR)], dtype=dtype)
+    got = log_gamma_divergence(x, c)
+    assert got.dtype == dtype
+    for value, at in zip(got.tolist(), x.tolist(), strict=True):
+        assert abs(value - exact(at, c)) <= digits * (exact(at, c) + abs(at - c)), at
+
+
+def test_divergence_of_log_gamma_of_very_small_and_very_large_numbers(dtype):
+    """(c - x) ψ(x) is c / x near 0, and it is x where x is large."""
+    x = torch.tensor([1e-38, 1e-30, 1e30, 1e38], dtype=dtype)
+    expected = torch.tensor([5e37, 5e29, 1e30, 1e38], dtype=dtype)
+    torch.testing.assert_close(log_gamma_divergence(x, 0.5), expected)
+
+
+def test_derivative_of_the_divergence_of_log_gamma():
+    """(x - c) times trigamma."""
+    x = torch.logspace(-3, 4, 57, dtype=torch.float64, requires_grad=True)
+    for c in (0.5, 2.0):
+        assert torch.autograd.gradcheck(lambda y, c=c: log_gamma_divergence(y, c), x[10:40])
+        (slope,) = torch.autograd.grad(log_gamma_divergence(x, c).sum(), x)
+        trigamma = scipy.special.polygamma(1, x.detach().numpy())
+        np.testing.assert_allclose(slope.numpy(), (x.detach().numpy() - c) * trigamma, rtol=1e-8, atol=1e-8)
+
+
+def test_divergence_of_log_gamma_compiles_to_one_graph_and_vectorises(dtype):
+    x = torch.rand(3, 7, dtype=dtype) + 0.1
+    whole = log_gamma_divergence(x, 0.5)
+    torch.compiler.reset()
+    compiled = torch.compile(log_gamma_divergence, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(x, 0.5), whole)
+    torch.testing.assert_close(torch.func.vmap(lambda row: log_gamma_divergence(row, 0.5))(x), whole)
+
+
+def beliefs(classes, dtype=torch.float64):
+    """Dirichlets with no, little and much evidence."""
+    generator = torch.Generator().manual_seed(classes)
+    alpha = 0.5 + 3 * torch.rand(40, classes, generator=generator, dtype=torch.float64) ** 4
+    alpha[0] = 0.5
+    alpha[10:20, 0] += 30
+    alpha[20:30] *= 200
+    return alpha.to(dtype)
+
+
+@pytest.mark.parametrize("parameter", [0.1, 0.5, 1.0, 7.0])
+@pytest.mark.parametrize("classes", [2, 5, 81])
+def test_divergence_matches_torch_distributions(classes, parameter):
+    alpha = beliefs(classes)
+    one, base = (torch.distributions.Dirichlet(a) for a in (alpha, torch.full_like(alpha, parameter)))
+    got = dirichlet.kl_from_symmetric(alpha, parameter)
+    torch.testing.assert_close(got, torch.distributions.kl_divergence(one, base), rtol=1e-11, atol=1e-9)
+    torch.testing.assert_close(
+        got, dirichlet.kl_divergence(alpha, torch.full_like(alpha, parameter)), rtol=1e-11, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("classes", [2, 5, 81])
+def test_divergence_in_single_precision(classes):
+    """The error is only that of rounding each term: the term of the sum of all parameters is computed in double."""
+    alpha = beliefs(classes, torch.float32)
+    got, exact = dirichlet.kl_from_symmetric(alpha, 0.5), dirichlet.kl_from_symmetric(alpha.double(), 0.5)
+    assert got.dtype == torch.float32
+    terms = (alpha.double() * alpha.double().digamma()).abs().sum(-1) + exact
+    assert bool(((got - exact).abs() <= 3e-7 * terms.clamp(min=1)).all())
+
+
+def test_divergence_from_itself_is_zero_and_the_parameter_positive():
+    for dtype in (torch.float32, torch.float64):
+        assert dirichlet.kl_from_symmetric(torch.full((81,), 0.5, dtype=dtype), 0.5).abs() < 1e-12
+    with pytest.raises(InputError, match="parameter"):
+        dirichlet.kl_from_symmetric(torch.ones(3), 0.0)
