@@ -62,7 +62,7 @@ def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
 
 def main() -> None:
     """Run the command line of the export."""
-    from semfov.detection.load import load_yolo
+    from semfov.detection.load import load_detector
 
     parser = argparse.ArgumentParser(prog="python -m semfov.detection.export", description="Darknet detector to ONNX")
     parser.add_argument("detector", help="yolov3-tiny, yolov3, yolov3-spp, or the path of a cfg")
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--static", action="store_true", help="fix the batch to one image, and fix the image's size")
     arguments = parser.parse_args()
     try:
-        detector = load_yolo(
+        detector = load_detector(
             arguments.detector,
             weights=arguments.weights,
             classes=arguments.classes,

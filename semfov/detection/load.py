@@ -15,30 +15,32 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
 from semfov.detection.detector import Detector
-from semfov.detection.scores import BackgroundPolicy
+from semfov.detection.onnx import load_onnx
 from semfov.detection.selection import Selection
+from semfov.detection.torchvision import TorchvisionDetector
+from semfov.detection.transformers import TransformersDetector
+from semfov.detection.ultralytics import UltralyticsDetector
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import Runtime, YoloV3
 from semfov.errors import DataError, InputError, check, check_options, lookup
 from semfov.io.files import check_regular, read_text
 
-_WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; give 'x.cfg' with weights='{}'"
-_PICKLE = (
-    "detector: expected a file that can be read without running code from it, got {0}; export the model to ONNX, for "
-    "Ultralytics with: yolo export model={0} format=onnx; for other modules with: torch.onnx.export(model, image, "
-    "'{1}.onnx'). A state dict of a torchvision model is read as 'torchvision:MODEL' with weights='{0}' "
-    "and classes="
-)
 _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?detr[a-z0-9_-]*)")
 """Names of models of Ultralytics, of which there are files of Python's pickle."""
 
 _OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".keras", ".mlmodel", ".safetensors")
 """Ends of the names of models in formats that are not read."""
 
-_EXPORT = "export it with: yolo export model={}.pt format=onnx"
-
 _SELECTING = [each.name for each in fields(Selection)]
-"""Options of the selection of boxes, which all loaders have."""
+_COMMON = ["background", "device", *_SELECTING]
+"""Options of all detectors."""
+
+_WRAPPERS: dict[str, Callable[..., Detector]] = {
+    "torchvision.models.detection.": TorchvisionDetector,
+    "transformers.models.": TransformersDetector,
+    "ultralytics.": UltralyticsDetector,
+}
+"""Classes of detectors that hold a module (in memory, not a copy), by the package of its class or of its bases."""
 
 DetectorLike = str | PathLike[str] | nn.Module
 """What `load_detector` takes: the name or file of a detector, a `Detector`, or a model of another library."""
@@ -88,54 +90,39 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
 
 
 def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:
-    """Call a loader with options that it has."""
-    check_options(options, _options_of(load), f"semfov.load_detector for {what}")
+    """Call a loader with options that it has, and set those of all detectors."""
+    own = _options_of(load)
+    check_options(options, [*own, *_COMMON], f"semfov.load_detector for {what}")
     if options.get("classes") is not None:
         options = {**options, "classes": _given_names(options["classes"])}
     if "device" in options:
         try:
             torch.device(options["device"])
         except (RuntimeError, TypeError):
-            raise InputError(
-                f"device: expected a device of PyTorch, such as cpu or cuda, got {options['device']!r}"
-            ) from None
-    chosen = {name: value for name, value in options.items() if name in _SELECTING}
-    others = {name: value for name, value in options.items() if name not in _SELECTING}
-    return load(model, selection=Selection(**chosen), **others)
+            got = repr(options["device"])
+            raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {got}") from None
+    selection = Selection(**{name: value for name, value in options.items() if name in _SELECTING})
+    detector = load(model, **{name: value for name, value in options.items() if name in own})
+    detector.selection = selection
+    if options.get("background") is not None:
+        detector.background = options["background"]
+    return detector if "device" in own else detector.to(options.get("device"))
 
 
 def _loader(name: str) -> Callable[..., Detector]:
     """The function that loads a detector by its name or file."""
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
-        from semfov.detection.onnx import load_onnx
-
         return load_onnx
     if name.startswith("torchvision:"):
-        from semfov.detection.torchvision import TorchvisionDetector
-
         return TorchvisionDetector.load
-    if name.startswith("hf:"):
-        from semfov.detection.transformers import TransformersDetector
-
-        return TransformersDetector.load
-    return load_yolo
+    return TransformersDetector.load if name.startswith("hf:") else load_yolo
 
 
 def _wrapper(model: nn.Module) -> Callable[..., Detector]:
-    """The class of detectors that holds a module (in memory, not a copy), which is known by its own class."""
-    packages = [f"{kind.__module__}." for kind in type(model).__mro__]
-    if any(package.startswith("torchvision.models.detection.") for package in packages):
-        from semfov.detection.torchvision import TorchvisionDetector
-
-        return TorchvisionDetector
-    if any(package.startswith("transformers.models.") for package in packages):
-        from semfov.detection.transformers import TransformersDetector
-
-        return TransformersDetector
-    if any(package.startswith("ultralytics.") for package in packages):
-        from semfov.detection.ultralytics import UltralyticsDetector
-
-        return UltralyticsDetector
+    """The class of detectors that holds a module, which is known by its own class."""
+    for package, wrapper in _WRAPPERS.items():
+        if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
+            return wrapper
     raise InputError(
         f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
         f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
@@ -143,24 +130,14 @@ def _wrapper(model: nn.Module) -> Callable[..., Detector]:
 
 
 def _options_of(load: Callable[..., Detector]) -> list[str]:
-    """Names of the options of a loader, and of the one that it passes further options on to."""
-    from semfov.detection.transformers import TransformersDetector
-
-    loaders = (load, TransformersDetector) if load == TransformersDetector.load else (load,)
-    options = (each for loader in loaders for each in signature(loader).parameters.values())
-    names = [each.name for each in options if each.kind is Parameter.KEYWORD_ONLY]
-    return [each for name in names for each in (_SELECTING if name == "selection" else [name])]
+    """Names of the options that a loader has of its own."""
+    return [each.name for each in signature(load).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
 
 
 def loader_options() -> list[str]:
     """Names of the options of `load_detector` for any detector."""
-    from semfov.detection.onnx import load_onnx
-    from semfov.detection.torchvision import TorchvisionDetector
-    from semfov.detection.transformers import TransformersDetector
-    from semfov.detection.ultralytics import UltralyticsDetector
-
-    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, TorchvisionDetector.load, TorchvisionDetector]
-    return [name for load in [*loaders, TransformersDetector.load, UltralyticsDetector] for name in _options_of(load)]
+    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, TorchvisionDetector.load, TransformersDetector.load]
+    return [*_COMMON, *(name for load in (*loaders, *_WRAPPERS.values()) for name in _options_of(load))]
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
@@ -179,21 +156,22 @@ def _detector_name(name_or_path: str | PathLike[str]) -> str:
     check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")
     if name.endswith((".onnx", ".cfg")):
         return name
-    if name.endswith(".weights"):
-        raise InputError(_WEIGHTS_ALONE.format(name))
-    if name.endswith((".pt", ".pth")):
-        raise InputError(_PICKLE.format(name, Path(name).stem))
+    alone = f"weights only; give 'x.cfg' with weights='{name}'"
+    check(not name.endswith(".weights"), "detector", "a cfg and its weights", alone)
+    pickled = (
+        f"{name}; export the model to ONNX, for Ultralytics with: yolo export model={name} format=onnx; for other "
+        f"modules with: torch.onnx.export(model, image, '{Path(name).stem}.onnx'). A state dict of a torchvision model "
+        f"is read as 'torchvision:MODEL' with weights='{name}' and classes="
+    )
+    safe = "a file that can be read without running code from it"
+    check(not name.endswith((".pt", ".pth")), "detector", safe, pickled)
     lower = name.lower()
-    if _EXPORTED.fullmatch(lower):
-        raise InputError(f"detector: expected an ONNX file of {name}, got its name; {_EXPORT.format(name)}")
-    if Path(name).suffix.lower() in _OTHER_FORMATS:
-        raise InputError(
-            f"detector: expected an ONNX file, a Darknet cfg or a name, got {name}; export the model to ONNX"
-        )
-    if lower.startswith("torchvision:"):
-        return lower
-    if lower.startswith("hf:"):
-        return f"hf:{name[3:]}"
+    way = f"its name; export it with: yolo export model={name}.pt format=onnx"
+    check(_EXPORTED.fullmatch(lower) is None, "detector", f"an ONNX file of {name}", way)
+    read = Path(lower).suffix not in _OTHER_FORMATS
+    check(read, "detector", "an ONNX file, a Darknet cfg or a name", f"{name}; export the model to ONNX")
+    if lower.startswith(("torchvision:", "hf:")):
+        return lower if lower[0] == "t" else f"hf:{name[3:]}"
     return lower if lower in WEIGHTS else lookup(name, WEIGHTS, "detector")
 
 
@@ -201,13 +179,10 @@ def load_yolo(
     name_or_cfg: str,
     *,
     weights: str | PathLike[str] | None = None,
-    classes: Sequence[str] | str | PathLike[str] | None = None,
+    classes: Sequence[str] = COCO_CLASSES,
     input_size: int | tuple[int, int] | None = None,
     stride: int | None = 32,
-    background: BackgroundPolicy = "residual",
-    selection: Selection | None = None,
     runtime: Runtime = "auto",
-    device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
     """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights."""
@@ -223,16 +198,14 @@ def load_yolo(
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,
-        COCO_CLASSES if classes is None else _given_names(classes),
+        tuple(classes),
         name=name,
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         stride=stride,
-        background=background,
-        selection=selection,
         digest=digest,
         runtime=runtime,
     )
-    return detector.to(device).eval()
+    return detector.eval()
 
 
 def _given_names(classes: Any) -> tuple[str, ...]:

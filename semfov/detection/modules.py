@@ -14,7 +14,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, no_features, recorded, stride_of
 from semfov.detection.placement import Placement
 from semfov.detection.scores import Candidates
-from semfov.errors import InputError, check_shape
+from semfov.errors import check, check_shape
 
 
 class ModuleDetector(Detector):
@@ -52,8 +52,7 @@ class ModuleDetector(Detector):
     def _pixels(self, canvas: Tensor) -> Tensor:
         """A canvas in the precision of the network; raises `InputError` for anything else."""
         check_shape(canvas, "canvas", None, 3, None, None)
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         return canvas.to(next(self.model.parameters()).dtype)
 
     def _named(self, candidates: Candidates) -> Candidates:

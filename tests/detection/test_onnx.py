@@ -10,7 +10,6 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_heads import HEADS
 from semfov.detection.preprocessing import Preprocessing
-from semfov.detection.selection import Selection
 from semfov.io.files import sha256
 from tests.colours import write_network
 from tests.refusals import refused, unusable
@@ -183,7 +182,7 @@ MAKERS = {
 def test_score_vectors_of_every_head_equal_a_plain_implementation(make_onnx, kind, dtype):
     outputs, read = MAKERS[kind]()
     path = make_onnx(outputs, producer="PaddlePaddle" if kind == "picodet" else "pytorch")
-    detector = load_onnx(path, classes=NAMES, selection=Selection(0.0, 1.0, 1000))
+    detector = load_detector(path, classes=NAMES, threshold=0.0, iou=1.0, limit=1000)
     assert detector.head == kind.split()[0]
     image = torch.rand(2, 3, SIDE, SIDE, dtype=dtype, generator=torch.Generator().manual_seed(0))
     image[1] *= 0.3

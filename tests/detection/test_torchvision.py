@@ -287,7 +287,8 @@ def test_a_model_in_memory_is_a_detector(kind):
     model = randomise_heads(MODELS[kind]())
     detector = load_detector(model, classes=NAMES, limit=7)
     image = torch.rand(1, 3, 60, 80)
-    other = TorchvisionDetector(model, classes=NAMES, selection=Selection(limit=7))
+    other = TorchvisionDetector(model, classes=NAMES)
+    other.selection = Selection(limit=7)
     assert torch.equal(detector(image).scores, other(image).scores)
     assert _output_count(model) == 4
     assert len(detector.digest) == 64

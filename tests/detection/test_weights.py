@@ -131,7 +131,6 @@ def package(tmp_path, monkeypatch) -> _SourceDistribution:
         "semfov_test_weights",
         "1.0",
         hashlib.sha256(archive.read_bytes()).hexdigest(),
-        archive.stat().st_size,
         "semfov_test_weights-1.0/data/x.weights",
     )
 
