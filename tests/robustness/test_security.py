@@ -115,7 +115,7 @@ def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
 @pytest.mark.parametrize("target", ["../../../../etc/passwd", "/etc/passwd", "p-1/other"])
 def test_nothing_is_extracted_from_archives_with_links_or_outside_paths(tmp_path, monkeypatch, target):
     """Members with outside paths are not extracted, and a link is not followed."""
-    source = _SourceDistribution("p", "1", "0" * 64, 100, "p-1/weights")
+    source = _SourceDistribution("p", "1", "0" * 64, "p-1/weights")
 
     def download(self, folder: Path) -> None:
         (folder / "archives").mkdir()
