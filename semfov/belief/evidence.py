@@ -61,12 +61,10 @@ class Evidence(PretrainedForEye):
         self.prior = nn.Parameter(torch.zeros(components))
 
     def _record(self) -> dict[str, Any]:
-        """The widths of the networks and the number of classes."""
         return {"widths": self.widths, "components": len(self.prior)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model with the saved tensors and record."""
         model = cls(*record["widths"], components=record["components"], metadata=record["metadata"])
         model.load_state_dict(tensors)
         return model

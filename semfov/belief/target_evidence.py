@@ -164,12 +164,10 @@ class TargetEvidence(Evidence):
         return peak + value[..., 0]
 
     def _record(self) -> dict[str, Any]:
-        """The widths of the networks, the number of classes, and the thresholds."""
         return {**super()._record(), "thresholds": self.thresholds and asdict(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model with the saved tensors and record."""
         model = super()._restore(record, tensors)
         model.thresholds = record["thresholds"] and Thresholds(**record["thresholds"])
         return model

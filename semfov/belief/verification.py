@@ -76,12 +76,10 @@ class Verification(PretrainedForEye):
         return value
 
     def _record(self) -> dict[str, Any]:
-        """The thresholds."""
         return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model with the saved tensors and record."""
         thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
         model = cls(thresholds=thresholds, metadata=record["metadata"])
         model.load_state_dict(tensors)

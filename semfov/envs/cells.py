@@ -1,7 +1,5 @@
 """Gazes that move from cell to cell: searches and explorations with a fovea."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -103,7 +101,6 @@ class CellGazes(Gazes):
         self._stimulus: Stimulus | None = None
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
-        """The episode that the options of a reset ask for, or one at random."""
         unknown, scenery = options.keys() - {"episode", "scene"}, self.scenery
         check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
         if "episode" in options:
@@ -120,7 +117,6 @@ class CellGazes(Gazes):
         return episodes[random.integers(len(episodes))]
 
     def action(self, action: Any) -> Tensor:
-        """Check the cell of a single episode; returns a batch of one."""
         expected = f"a whole number from 0 to {int(self.action_space.n) - 1}"
         check(self.action_space.contains(action), "action", expected, repr(action))
         return torch.tensor([int(action)])
@@ -139,7 +135,6 @@ class CellGazes(Gazes):
         return planes.reshape(len(rows), -1, *self.scenery.shape)
 
     def places(self, rows: Tensor) -> Tensor:
-        """Fixated points `(n, 2)` as fractions of width and height."""
         lines, columns = self.scenery.shape
         cell = self.cell[rows]
         return torch.stack([(cell % columns + 0.5) / columns, (cell // columns + 0.5) / lines], -1)
@@ -149,12 +144,10 @@ class CellGazes(Gazes):
         return self.places(rows) * self.size[rows] - 0.5
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
-        """Cells that were not fixated, `(n, X·Y)`."""
         free: NDArray[np.bool_] = (~self.memory.visited[rows]).numpy()
         return free
 
     def detections(self, rows: Tensor) -> Detections:
-        """Detections of the present looks, a batch of n."""
         return self.looks.see(self.observer, rows, self.cell[rows], self.points(rows)).detections()
 
     def draw(self) -> NDArray[np.uint8]:
@@ -181,7 +174,6 @@ class CellGazes(Gazes):
 
     @torch.inference_mode()
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Start episodes in the rows `(n,)`, each with its first look."""
         super().begin(rows, episodes)
         scenes = [episode.scene for episode in episodes]
         if self.searching:

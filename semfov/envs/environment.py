@@ -1,7 +1,5 @@
 """The environments for `gymnasium.make`: one episode at a time, with cells or with windows as actions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, ClassVar, TypeVar, get_args

@@ -1,7 +1,5 @@
 """Batches of episodes that environments step through: starts, gaze shifts, observations and rewards."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Registration of the environments with Gymnasium, and the entry points of `gymnasium.make` and `make_vec`."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The parts that environments share: scenes, the eye that looks at them, and the belief about them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Gazes that move from window to window of a large picture: a choice of where to look and how closely."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -48,7 +46,6 @@ class WindowGaze(Gazes):
         self.done: set[Window] = set()
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> _WindowEpisode:
-        """The episode that the options of a reset ask for, or one at random."""
         unknown = [name for name in options if name not in ("scene", "target")]
         check(not unknown, "options", "scene or target", ", ".join(unknown))
         scene, target = options.get("scene"), options.get("target")
@@ -60,7 +57,6 @@ class WindowGaze(Gazes):
         return _WindowEpisode(int(scene), int(target))
 
     def action(self, action: Any) -> Tensor:
-        """Check an action; returns a batch of one."""
         try:
             place = np.asarray(action, dtype=np.float64)
         except (ValueError, TypeError):  # it has no numbers
@@ -93,7 +89,6 @@ class WindowGaze(Gazes):
         return planes[None]
 
     def places(self, rows: Tensor) -> Tensor:
-        """The middle of the window and its magnification, each from 0 to 1."""
         return torch.from_numpy(_action_of(self.glances.lattice, self.window))[None]
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
@@ -106,11 +101,9 @@ class WindowGaze(Gazes):
         return free
 
     def detections(self, rows: Tensor) -> Detections:
-        """Detections of the last look."""
         return next(glance for glance in self.looking.glances if glance.window == self.window).detections
 
     def draw(self) -> NDArray[np.uint8]:
-        """Picture of the windows that were looked at, and of the objects that were found."""
         image = self.scenery.image(self.episodes[0].scene)[None]
         share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
         size = [max(1, round(n * share)) for n in image.shape[-2:]]
@@ -118,7 +111,6 @@ class WindowGaze(Gazes):
         return render([plot_scanpath(self.looking.record(), small)])[0]
 
     def begin(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
-        """Start an episode with a look at the whole picture."""
         super().begin(rows, episodes)
         (episode,) = episodes
         self.targets[rows] = episode.target

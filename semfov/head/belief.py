@@ -50,15 +50,12 @@ class SceneBelief(Belief):
         return self.values.shape[-1] > 2
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target, `(1, S)`."""
         return pick(self.values, torch.as_tensor(target)) if self.about_all else self.values[..., 0]
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """The same under the condition that no fixated cell holds the target, `(1, S)`."""
         return self.probability(target) if self.about_all else self.values[..., 1]
 
     def class_probabilities(self) -> Tensor:
-        """Probabilities of all classes, `(1, S, K+1)`."""
         return self.values if self.about_all else super().class_probabilities()
 
 
@@ -91,7 +88,6 @@ class SceneObserver(Observer):
         return _SceneLook(pose, inner, self.views.gaze_cell[action])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
-        """The belief after one more look."""
         belief, look = own(belief, SceneBelief, "belief"), own(look, _SceneLook, "look")
         views, grid, pose = self.views, self.views.view_grid, look.pose
         values = belief.values

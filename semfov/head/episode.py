@@ -31,7 +31,6 @@ class _HeadLooks(Looks):
         self.grid, self.like = views.grid, views.poses
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Detect objects, and weigh them as evidence."""
         watch = Stopwatch()
         detections = self.detect(int(cell))
         watch.lap("detect")

@@ -351,12 +351,10 @@ class FovealObservationModel(Pretrained):
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
     def _record(self) -> dict[str, Any]:
-        """The classes and ε."""
         return {"classes": self.classes, "epsilon": self.epsilon}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model with the saved tensors and record."""
         model = cls(
             tensors["log_alpha"].exp(),
             tensors["edges"],

@@ -1,7 +1,5 @@
 """Files of records: tensors, with JSON values that describe them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from os import PathLike, fspath
 from pathlib import Path

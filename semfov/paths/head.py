@@ -1,7 +1,5 @@
 """The record of an episode of eye and head: where both looked, what was seen and what was believed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """One look of a record: where it was, what it detected, and what it showed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Objects of a record, merged from the detections of its looks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """What the looks of a record found: its objects, its decision, and the words for both."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

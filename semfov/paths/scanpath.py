@@ -1,7 +1,5 @@
 """The records of looks of a fovea at cells: an episode in a photograph, from its steps, and a frame of a stream."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -278,7 +276,6 @@ class Scanpath(_CellRecord):
         return scanpath_html(self)
 
     def _lines(self) -> list[str]:
-        """The fixated cells."""
         grid = self.grid
         cells = [f"({cell % grid.columns}, {cell // grid.columns})" for cell in self.cells.tolist()]
         path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
@@ -409,7 +406,6 @@ class FoveaMoment(_CellRecord, Moment):
         return x, y
 
     def _looks(self) -> Iterator[RecordedLook]:
-        """The look at the frame, with the whole frame as its region."""
         (x, y), (width, height) = self.fixation.tolist(), self.size
         more = {"frame": self.number, **cell_columns(self.grid, self.cell, self.probability)}
         region = (0.0, 0.0, float(width), float(height))

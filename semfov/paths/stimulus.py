@@ -1,7 +1,5 @@
 """The stimulus of an episode: the data for its foveated views, small enough to keep, and reduced photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """The records of looks at windows: of a search or an exploration of a picture, and of a frame of a stream."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -251,7 +249,6 @@ class ZoomPath(Record):
         return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
     def _lines(self) -> list[str]:
-        """The windows."""
         points = [(*look.fixation, look.more["magnification"]) for look in self]
         looks = [f"({x:.0f}, {y:.0f}) × {magnification:.2f}" for x, y, magnification in points]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
@@ -338,7 +335,6 @@ class WindowMoment(ZoomPath, Moment):
         return self._decided() or self.objects_in_words()
 
     def _lines(self) -> list[str]:
-        """The frame and the windows."""
         return [f"frame {self.number}", *super()._lines()]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

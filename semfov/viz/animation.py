@@ -1,7 +1,5 @@
 """Animations of episodes: GIF by Pillow, and MP4 where ffmpeg is installed."""
 
-from __future__ import annotations
-
 import base64
 import io
 import shutil

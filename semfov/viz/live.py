@@ -1,7 +1,5 @@
 """The view and belief of an agent drawn into frames of a camera or a video, and video files of such frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

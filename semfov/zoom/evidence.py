@@ -462,7 +462,6 @@ class GlimpseEvidence(Pretrained):
         check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
 
     def _record(self) -> dict[str, Any]:
-        """Sizes and chosen settings, for the file."""
         verified, own = self.verification, self.photograph
         at = own and own.verification.thresholds
         return {
@@ -484,7 +483,6 @@ class GlimpseEvidence(Pretrained):
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model from its file."""
         verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
         chosen, sure = record["thresholds"], verified and verified["thresholds"]
         at, certain = (photograph and photograph[name] for name in ("thresholds", "certainty"))

@@ -1,7 +1,5 @@
 """Windows of a picture, and the results of looks at them."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ class Window:
 
     @staticmethod
     @lru_cache(4096)
-    def on(lattice: Lattice, action: tuple[int, int, int]) -> Window:
+    def on(lattice: Lattice, action: tuple[int, int, int]) -> "Window":
         """The window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
         level, column, row = action
         x, y, magnification = lattice.fixation(level, column, row)
@@ -36,12 +34,12 @@ class Window:
         return Window((x, y, magnification), level, (column, row, column + span, row + span))
 
     @staticmethod
-    def overview(lattice: Lattice) -> Window:
+    def overview(lattice: Lattice) -> "Window":
         """The window with the whole picture."""
         return Window.on(lattice, (0, 0, 0))
 
     @staticmethod
-    def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
+    def around(lattice: Lattice, box: tuple[float, float, float, float]) -> "Window":
         """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
         x1, y1, x2, y2 = box
         magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
@@ -130,11 +128,9 @@ class LiveGlances(Glances):
         self._prepared.clear()
 
     def prepare(self, window: Window) -> None:
-        """Resample the window that is likely to be looked at next."""
         self._prepared[window] = self.eye.resample(self.view, *_aims([window]))
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
-        """Resample the windows and detect in them."""
         hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()

@@ -1,7 +1,5 @@
 """What a look shows of where to zoom in: hints, which are faint candidates too, and the strongest in each cell."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +38,7 @@ class Gist:
     found: Tensor
 
     @staticmethod
-    def of(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
+    def of(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> "Gist":
         """Compute the gist of a look at a window of the lattice; action `(level, column, row)`."""
         level, column, row = action
         span = lattice.span(level)

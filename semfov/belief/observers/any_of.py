@@ -33,15 +33,12 @@ class _AnyBelief(Belief):
     closest: Tensor
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that a cell holds an object that is meant, `(B, X·Y)`."""
         return self._any(lambda belief, index: belief.probability(index))
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """As `probability`, given that no fixated cell holds such an object."""
         return self._any(lambda belief, index: belief.chance(index))
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that an object that is meant is anywhere in the image, `(B,)`."""
         return self._any(lambda belief, index: belief.presence(index))
 
     def _each(self) -> list[tuple[Belief, int, float]]:

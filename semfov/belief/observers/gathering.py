@@ -1,7 +1,5 @@
 """Base classes of the observers with learned evidence: their looks, their beliefs, and how evidence is gathered."""
 
-from __future__ import annotations
-
 from abc import ABC
 from collections.abc import Callable
 from dataclasses import dataclass, replace

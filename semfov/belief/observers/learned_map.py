@@ -29,11 +29,9 @@ class MapBelief(GatheredBelief):
     probabilities: Tensor
 
     def class_probabilities(self) -> Tensor:
-        """Probabilities of all classes, background first; they need not sum to 1."""
         return self.probabilities
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target, `(B, X·Y)`."""
         return pick(self.probabilities, torch.as_tensor(target))
 
 

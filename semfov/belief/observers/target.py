@@ -30,15 +30,12 @@ class TargetBelief(GatheredBelief):
     anywhere: Tensor
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """As `probability`, given that no fixated cell holds the target."""
         return self.following
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target of the search, `(B, X·Y)`; `target` is ignored."""
         return self.present
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that the image holds the target of the search, `(B,)`; `target` is ignored."""
         return self.anywhere
 
 

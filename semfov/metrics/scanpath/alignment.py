@@ -1,7 +1,5 @@
 """Scanpaths aligned by distance: MultiMatch, ScanMatch, dynamic time warping, time delay embedding."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

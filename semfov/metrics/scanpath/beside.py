@@ -1,7 +1,5 @@
 """One scanpath beside those of people in the same picture, by the measures of this folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path

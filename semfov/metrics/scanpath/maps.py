@@ -1,7 +1,5 @@
 """Saliency maps and densities over a whole picture, beside the pixels that people fixated, or their map."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """How soon searches find their target, and how direct their scanpaths are."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 
 import numpy as np

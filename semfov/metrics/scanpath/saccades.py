@@ -1,7 +1,5 @@
 """Distributions of the lengths and directions of saccades, and how far two of them are apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scanpaths as sequences of labels, and how similar two sequences are."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Hashable, Sequence
 from typing import Any
