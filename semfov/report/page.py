@@ -220,7 +220,11 @@ def _picture(data: Data, place: str) -> str:
     spans = [(unit * (6.3 * len(text) + 4), unit * 13) for text in words]
     boxes = [tuple(each["box"]) for each in data["objects"]]
     around = [
-        [(x, y) for x in (x1 + w / 2, x2 - w / 2, x1 - w / 2, x2 + w / 2) for y in (y1 - h / 2, y2 + h / 2)]
+        [
+            (x - w / 2, y - h / 2)
+            for x in (x1 + w / 2, x2 - w / 2, x1 - w / 2, x2 + w / 2)
+            for y in (y1 - h / 2, y2 + h / 2)
+        ]
         for (x1, y1, x2, y2), (w, h) in zip(boxes, spans, strict=True)
     ]
     places = place_within(around, spans, (width, height), tags)

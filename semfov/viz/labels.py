@@ -14,20 +14,11 @@ def place_labels(
     boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
     """Rectangles for labels `(width, height)` of boxes: at a free corner of the box, or further down."""
-    placed: list[LabelBox] = list(obstacles)
-    for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
-        corners = [
-            (x1, y1),
-            (x1, y2 - height),
-            (x2 - width, y1),
-            (x2 - width, y2 - height),
-            (x1, y1 - height),
-            (x1, y2),
-        ]
-        inside = [_into(x, y, width, height, frame) for x, y in corners]
-        free = next((label for label in inside if not _covers_any(label, placed)), None)
-        placed.append(free or _further(inside[0], placed))
-    return placed[len(obstacles) :]
+    corners = [
+        [(x1, y1), (x1, y2 - high), (x2 - wide, y1), (x2 - wide, y2 - high), (x1, y1 - high), (x1, y2)]
+        for (x1, y1, x2, y2), (wide, high) in zip(boxes, sizes, strict=True)
+    ]
+    return place_within(corners, sizes, frame, obstacles)
 
 
 def place_numbers(
@@ -53,10 +44,10 @@ def place_numbers(
 def place_within(
     candidates: Sequence[Iterable[_Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
-    """Rectangles for labels whose middle may be at any of several points: at the first free one."""
+    """Rectangles for labels whose first corner may be at any of several points: at a free one, or further down."""
     placed: list[LabelBox] = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
-        inside = [_into(x - width / 2, y - height / 2, width, height, frame) for x, y in points]
+        inside = [_into(x, y, width, height, frame) for x, y in points]
         free = next((label for label in inside if not _covers_any(label, placed)), None)
         placed.append(free or _further(inside[0], placed))
     return placed[len(obstacles) :]

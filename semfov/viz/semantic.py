@@ -105,8 +105,9 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
     for name, region, _ in named:
         centres = grid.centres[region] + 0.5
         order = (centres - centres.mean(0)).norm(dim=-1).argsort(stable=True)
-        candidates.append([(x, y) for x, y in centres[order].tolist()])
-        sizes.append(text_size(axes, name, _NAME_POINTS))
+        wide, high = text_size(axes, name, _NAME_POINTS)
+        candidates.append([(x - wide / 2, y - high / 2) for x, y in centres[order].tolist()])
+        sizes.append((wide, high))
     width, height = grid.extent.tolist()
     lines = LineCollection([side for _, region, _ in named for side in _borders(grid, region)], colors="white")
     lines.set(linewidths=1.3, zorder=3)
