@@ -44,25 +44,23 @@ from semfov.zoom.objects import merge
 _Source = Scenes | str | Path | None
 """Scenes of any kind, or a folder of photographs; None for the embedded scenes."""
 
+_Targets = Sequence[str | int] | None
+
 _VIEWS = 16  # number of pictures that are kept open for glimpses
 
 
 class _Surroundings:
     """What environments of all kinds share: scenes, and an eye that looks at them, `shifts` times after the first."""
 
-    opened: partial[Any] | None = None
-
-    def __init__(self, pictures: Scenes, eye: Any, shifts: int, targets: Sequence[str | int] | None) -> None:
-        names = eye.detector.classes
-        self.pictures, self.eye, self.shifts, self.classes = pictures, eye, shifts, ("background", *names)
-        self.pixels = math.prod(eye.detector.input_size)
+    def __init__(self, looking: Any, shifts: int, targets: _Targets, opened: partial[Any]) -> None:
+        self.pictures, self.eye, self.shifts, self.opened = looking.scenes, looking.eye, shifts, opened
+        classes, names = self.pictures.classes, self.eye.detector.classes
+        check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
+        self.classes, self.pixels = ("background", *names), math.prod(self.eye.detector.input_size)
         self._chosen = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy opens the same scenes again."""
-        check(
-            self.opened is not None, "scenery", "one that a function of semfov.envs has opened, to be copied", "another"
-        )
         return self.opened, ()
 
     def image(self, scene: int) -> Tensor:
@@ -77,9 +75,8 @@ class _Surroundings:
 class Scenery(_Surroundings):
     """Scenes, an eye and a belief that environments share; the looks at a scene that is entered are kept on disk."""
 
-    def __init__(self, looking: PolicyLooking, targets: Sequence[str | int] | None = None) -> None:
-        check(len(looking.policies) == 1, "policy", "a single policy", f"{len(looking.policies)}")
-        super().__init__(looking.scenes, looking.eye, looking.config.protocol.shifts, targets)
+    def __init__(self, looking: PolicyLooking, targets: _Targets, opened: partial[Any]) -> None:
+        super().__init__(looking, looking.config.protocol.shifts, targets, opened)
         self._looking = looking
         self.policy = next(iter(looking.policies))
         belief, self.protocol = looking.config.belief, looking.config.protocol
@@ -218,18 +215,14 @@ def open_scenery(
         )
     check(isinstance(config, RunConfig), "config", "settings of an evaluation", type(config).__name__)
     looking = _SceneLooking(replace(config, policies=config.policies[:1]), task, scenes, mosaics, tiles)
-    classes, names = looking.scenes.classes, looking.eye.detector.classes
-    check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
-    scenery = Scenery(looking, targets)
-    scenery.opened = partial(open_scenery, **arguments)
-    return scenery
+    return Scenery(looking, targets, partial(open_scenery, **arguments))
 
 
 class ZoomScenery(_Surroundings):
     """Large pictures and an eye that zooms, which environments can share; `open_zoom_scenery` makes one."""
 
-    def __init__(self, looking: WindowLooking, passes: int = 24, targets: Sequence[str | int] | None = None) -> None:
-        super().__init__(looking.scenes, looking.eye, passes - 1, targets)
+    def __init__(self, looking: WindowLooking, passes: int, targets: _Targets, opened: partial[Any]) -> None:
+        super().__init__(looking, passes - 1, targets, opened)
         self.evidence, self.annotated = looking.evidence, not isinstance(self.pictures, Pictures)
         # Looks are kept for as long as an environment uses this scenery.
         self.glances = cache(looking.glances)
@@ -376,9 +369,4 @@ def open_zoom_scenery(
         cache=None if cache is None else Path(cache),
         store=store,
     )
-    looking = _PictureLooking(config, scenes)
-    classes, names = looking.scenes.classes, looking.eye.detector.classes
-    check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
-    scenery = ZoomScenery(looking, passes, targets)
-    scenery.opened = partial(open_zoom_scenery, **arguments)
-    return scenery
+    return ZoomScenery(_PictureLooking(config, scenes), passes, targets, partial(open_zoom_scenery, **arguments))

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError, check_shape
+from semfov.errors import InputError
 from semfov.observation.dirichlet import kl_divergence
 from semfov.observation.foveal import FovealObservationModel
 
@@ -61,8 +61,6 @@ def visibility(model: FovealObservationModel) -> Tensor:
 
 def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha)."""
-    check_shape(target, "target", alpha.shape[-1])
-    check_shape(background, "background", alpha.shape[-1])
     # ln p/q under r is KL(r || q) - KL(r || p).
     mean = kl_divergence(alpha, background) - kl_divergence(alpha, target)
     weight = target - background

@@ -22,25 +22,19 @@ def merge_fixations(
 
     The nearest fixation sees a box most sharply, and a closer look more sharply still.
     """
-    boxes, scores, labels, numbers, sharpness, broken = [], [], [], [], [], []
-    for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
-        chosen = detections.mask[0] & (detections.confidence[0] >= FAINTEST)
-        boxes.append(detections.boxes[0, chosen].detach().float().cpu())
-        scores.append(detections.confidence[0, chosen].detach().float().cpu())
-        labels.append(detections.labels[0, chosen].cpu())
-        numbers.append(torch.full((len(boxes[-1]),), number))
-        sharpness.append(-distance[chosen].detach().float().cpu())
-        broken.append(torch.zeros(len(boxes[-1])).bool() if cut is None else cut[number][chosen].cpu())
+    rows = []
+    for number, (seen, distance) in enumerate(zip(looks, distances, strict=True)):
+        chosen = seen.mask[0] & (seen.confidence[0] >= FAINTEST)
+        broken = torch.zeros_like(chosen) if cut is None else cut[number]
+        every = seen.boxes[0], seen.confidence[0], seen.labels[0], torch.full_like(chosen, number, dtype=torch.int64)
+        rows.append([each[chosen].detach().cpu() for each in (*every, broken, -distance)])
     for look in closer:
-        boxes.append(look.box[None].detach().float().cpu())
-        scores.append(torch.tensor([look.place]))
-        labels.append(torch.tensor([look.target]))
-        numbers.append(torch.tensor([look.of_look]))
-        sharpness.append(torch.tensor([1.0]))
-        broken.append(torch.tensor([False]))
-    if not boxes:
+        place = [torch.tensor([each]) for each in (look.place, look.target, look.of_look, False, 1.0)]
+        rows.append([look.box[None].detach().cpu(), *place])
+    if not rows:
         return Objects.none()
-    columns = (torch.cat(column) for column in (boxes, scores, labels, numbers, broken, sharpness))
+    columns = (torch.cat(each) for each in zip(*rows, strict=True))
+    columns = (each.float() if each.is_floating_point() else each for each in columns)
     return merge_looks(*columns, score=0.0, around=around).above(FAINTEST)
 
 

@@ -64,9 +64,9 @@ def styled(plot: Callable[_Arguments, Figure]) -> Callable[_Arguments, Figure]:
             figure = plot(*arguments, **options)
             # Matplotlib makes the labels of ticks when it draws, and would then use the caller's fonts. A figure that
             # the caller has given is left for the caller to draw.
-            if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
-                figure.draw_without_rendering()
             if all(options.get(name) is None for name in _PLACES):
+                if figure not in _laid_out:
+                    figure.draw_without_rendering()
                 _show_in_notebook(figure)
             return figure
 

@@ -44,16 +44,6 @@ class _Table(NamedTuple):
         return values[self.rows].reshape(*self.shape, *values.shape[1:])
 
 
-class _Pooled(NamedTuple):
-    """Pooled hints of windows of one level in a look; scores `(n, K)`, summary `(n, 3)`."""
-
-    step: int
-    scores: Tensor
-    summary: Tensor
-    facts: NDArray[np.generic]
-    stale: NDArray[np.generic]
-
-
 class _Look:
     """A look and its predictions for N windows in it, of up to three closer levels; facts `(N, 6)`, others `(N,)`."""
 
@@ -82,8 +72,8 @@ class _Look:
         self.before, self.odds = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
         self.stale = np.ones(count, np.bool_)
 
-    def pool(self, left: Cells) -> Iterator[_Pooled]:
-        """Pool the hints that are left to see, in the windows where they have changed."""
+    def pool(self, left: Cells) -> Iterator[tuple[int, Tensor, Tensor, NDArray[np.generic], NDArray[np.generic]]]:
+        """Octaves, pooled scores `(n, K)` and summary `(n, 3)` of windows that have changed, and where facts go."""
         before, scale, (x1, y1, x2, y2), (rows, columns) = self.left, self.gist.scale, self.box, self.left.shape
         part = left[y1:y2, x1:x2]
         if part.shape != (y2 - y1, x2 - x1):
@@ -121,7 +111,7 @@ class _Look:
             )
             top, summary = (values[at].flatten(0, 1) for values in maps)
             facts, stale = (table.of(values)[down, across] for values in (self.facts, self.stale))
-            yield _Pooled(level - self.gist.level, top, summary, facts, stale)
+            yield level - self.gist.level, top, summary, facts, stale
 
 
 class _WindowOdds:
@@ -176,13 +166,13 @@ class _WindowOdds:
         pools = [pool for look in looks for pool in look.pool(self._left)]
         if not pools:
             return
-        counts = [len(pool.scores) for pool in pools]
-        scores, summary = torch.cat([pool.scores for pool in pools]), torch.cat([pool.summary for pool in pools])
-        steps = torch.from_numpy(np.repeat([pool.step for pool in pools], counts))
-        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0].numpy()
-        for pool, values in zip(pools, np.split(facts, np.cumsum(counts)[:-1]), strict=True):
-            pool.facts[:] = values.reshape(pool.facts.shape)
-            pool.stale[:] = True
+        octaves, scores, summaries, facts, stale = zip(*pools, strict=True)
+        counts = [len(each) for each in scores]
+        steps = torch.from_numpy(np.repeat(octaves, counts))
+        found = self._evidence.hint_facts(torch.cat(scores), torch.cat(summaries), steps, self._target)[:, 0].numpy()
+        for into, marks, values in zip(facts, stale, np.split(found, np.cumsum(counts)[:-1]), strict=True):
+            into[:] = values.reshape(into.shape)
+            marks[:] = True
 
     def _judge(self, look: _Look) -> None:
         """Compute the log odds of the windows of a look for which the facts or the log odds before have changed."""

@@ -93,12 +93,11 @@ def merge_with_facts(
     every = _detected(glances, target)
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
-    boxes, scores, labels, looks, cut, sharpness = (each[enough] for each in every)
-    index = unlike(boxes, scores, labels, looks, cut, sharpness, inside=_INSIDE)
+    boxes, scores, labels, looks, cut, sharpness = every = tuple(each[enough] for each in every)
+    index = unlike(*every, inside=_INSIDE)
     windows = torch.tensor([glance.window.region(lattice) for glance in glances])
     scale = torch.tensor([glance.window.fixation[2] for glance in glances])
-    finest = lattice.magnifications[-1]
-    facts = _object_facts(index, boxes, scores, labels, looks, cut, windows, scale, lattice.size, finest, latest=latest)
+    facts = _object_facts(index, every, windows, scale, lattice.size, lattice.magnifications[-1], latest=latest)
     own = boxes[index] if latest else _fused(index, boxes, scores, labels, cut, sharpness)
     return Objects(own, scores[index], labels[index], looks[index]), facts
 
@@ -183,13 +182,9 @@ def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> 
 
 def _object_facts(
     index: Tensor,
-    boxes: Tensor,
-    scores: Tensor,
-    labels: Tensor,
-    looks: Tensor,
-    cut: Tensor,
+    every: Sequence[Tensor],
     windows: Tensor,
-    magnifications: Tensor,
+    scales: Tensor,
     size: tuple[int, int],
     finest: float,
     *,
@@ -199,13 +194,13 @@ def _object_facts(
 
     A look should show an object of 6 canvas pixels or more that lies in its window and not at its border.
     """
-    count = len(index)
+    (boxes, scores, labels, looks, cut, *_), count = every, len(index)
     if not count:
         return scores.new_zeros(0, len(FACTS))
-    corners, value, label, look, broken, view, scale = (
-        each.numpy() for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), magnifications)
+    corners, value, label, look, broken, view, scale, chosen = (
+        each.numpy()
+        for each in (boxes.float(), scores.float(), labels, looks, cut, windows.float(), scales.float(), index)
     )
-    chosen, scale = index.numpy(), scale.astype(np.float32)
     first, second, shared, area = _overlapping(corners)
     union = area[first] + area[second] - shared
     overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)

@@ -174,5 +174,3 @@ def test_visibility_is_zero_where_nothing_is_ever_detected():
 def test_a_model_without_miss_rates_is_refused():
     with pytest.raises(InputError, match="model: expected an observation model with miss rates"):
         visibility(FovealObservationModel.identity(["a"], [0.1]))
-    with pytest.raises(InputError, match="target"):
-        _log_ratio_moments(torch.ones(3), torch.ones(2), torch.ones(3))

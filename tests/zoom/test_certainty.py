@@ -107,7 +107,7 @@ def test_facts_equal_a_plain_loop(latest, dtype):
     kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
     assert 5 < len(kept) < count - 5
     every = boxes, scores, labels, looks, cut
-    facts = _object_facts(kept, *every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
+    facts = _object_facts(kept, every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
     plain = plain_facts(kept.tolist(), *(each.tolist() for each in every), latest)
     assert facts.shape == (len(kept), len(FACTS))
     torch.testing.assert_close(facts, torch.tensor(plain), rtol=1e-4, atol=1e-4)
