@@ -17,8 +17,7 @@ from semfov.errors import check, check_number, check_whole
 
 Arrays = dict[str, Any]
 
-_PRICES = {"search": 0.05, "exploration": 0.01}
-"""Cost of a look by default, for each task."""
+_PRICES = {"search": 0.05, "exploration": 0.01}  # cost of a look by default, for each task
 
 
 class Gazes(ABC):

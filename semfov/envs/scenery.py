@@ -41,8 +41,7 @@ from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
-_Source = Scenes | str | Path | None
-"""Scenes of any kind, or a folder of photographs; None for the embedded scenes."""
+_Source = Scenes | str | Path | None  # scenes of any kind, or a folder of photographs; None for the embedded scenes
 
 _Targets = Sequence[str | int] | None
 

@@ -17,9 +17,7 @@ from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
 
-_TRIES = 25
-"""Largest number of frames that are asked for until one is from the right direction."""
-
+_TRIES = 25  # largest number of frames that are asked for until one is from the right direction
 _WIDEST = 8192  # pixels of the panorama in which objects are located
 _DRAWING_WIDTH = 480  # width of the frames that are kept for drawing
 _DRAWN = 1280  # pixels across the panorama of its frames

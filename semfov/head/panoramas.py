@@ -14,12 +14,8 @@ from semfov.io.files import json_sha256
 from semfov.sensor.sphere import Camera, Regions, panorama_directions
 
 _VERSION = 1  # increase it whenever the same seed would give another picture
-
-_SLOT = (640, 480)
-"""Size in pixels of the plane that holds a photograph; its middle touches the sphere."""
-
-_RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))
-"""For each ring, its latitude in degrees and its number of photographs."""
+_SLOT = (640, 480)  # size in pixels of the plane that holds a photograph; its middle touches the sphere
+_RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))  # for each ring, its latitude in degrees and its number of photographs
 
 
 class _Patch(NamedTuple):

@@ -21,11 +21,8 @@ from semfov.io.schema import is_number
 from semfov.sensor.perspective import go_around, sample
 from semfov.sensor.sphere import Boxes, Camera, Regions, panorama_directions, panorama_points
 
-_FIELDS = (60.0,)
-"""Default fields of view in degrees."""
-
-_VIEW = (416, 312)
-"""Default `(width, height)` of a view in pixels."""
+_FIELDS = (60.0,)  # default fields of view in degrees
+_VIEW = (416, 312)  # default `(width, height)` of a view in pixels
 
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:

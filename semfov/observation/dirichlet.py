@@ -26,8 +26,7 @@ __all__ = [
 ]
 
 
-_LARGEST = 1e10
-"""Parameter up to which double precision leaves entropies and divergences to the third decimal."""
+_LARGEST = 1e10  # parameter up to which double precision leaves entropies and divergences to the third decimal
 
 
 def log_normaliser(alpha: Tensor) -> Tensor:

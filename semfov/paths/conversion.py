@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     import pandas
     import supervision
 
-_Table = Literal["looks", "objects"]
-"""Tables of a record."""
+_Table = Literal["looks", "objects"]  # tables of a record
 
 COLUMNS = ("object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look")
 """Columns of the table of objects."""

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_REACH = 0.05
-"""Distance, in longer sides of the picture, within which probability belongs to a peak."""
+_REACH = 0.05  # distance, in longer sides of the picture, within which probability belongs to a peak
 
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""

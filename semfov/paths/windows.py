@@ -27,8 +27,7 @@ _WINDOW_VALUES = {
     "cells": Array(Number(whole=True), 4),
     "within": Maybe(Array(Number(), 4)),
 }
-_WINDOW = Object(_WINDOW_VALUES, None, tuple(_WINDOW_VALUES))
-"""A window in a file."""
+_WINDOW = Object(_WINDOW_VALUES, None, tuple(_WINDOW_VALUES))  # a window in a file
 
 _LATTICE = {
     "size": Array(Number(low=1, whole=True), 2),

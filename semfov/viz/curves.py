@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 _Curves = Mapping[str, NDArray[np.float64]]
 
-_REST = "0.6"
-"""Colour of the curves that the legend does not name."""
+_REST = "0.6"  # colour of the curves that the legend does not name
 
 
 @styled

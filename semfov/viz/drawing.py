@@ -26,11 +26,8 @@ if TYPE_CHECKING:
 CONFIDENT = 0.1
 """Detections of lower confidence are not drawn."""
 
-_Tag = tuple[LabelBox, str, str]
-"""A box, the text of its label, and its colour."""
-
-_LABEL, _SMALL = 6.5, 5.0
-"""Font sizes of the labels of boxes, of few and of many."""
+_Tag = tuple[LabelBox, str, str]  # a box, the text of its label, and its colour
+_LABEL, _SMALL = 6.5, 5.0  # font sizes of the labels of boxes, of few and of many
 
 
 def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor:

@@ -44,9 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-_LegendEntry = tuple[str, str, str]
-"""Colour, line style and text of an entry of a legend."""
-
+_LegendEntry = tuple[str, str, str]  # colour, line style and text of an entry of a legend
 _NAMED = 15  # largest number of objects whose labels name their class where only one class was searched for
 _LABELLED = 60  # largest number of objects that have labels
 

@@ -31,8 +31,7 @@ TIME = "viridis"
 _OVERLAY = "plasma"
 """Colour maps, whose lightness increases steadily, so that they work in grey print too."""
 
-_OPACITY = 0.85
-"""Opacity of an overlay where the probability is 1."""
+_OPACITY = 0.85  # opacity of an overlay where the probability is 1
 
 STYLE: Any = {
     "font.family": "sans-serif",

@@ -18,11 +18,8 @@ from semfov.zoom.lattice import Lattice
 
 Cells = NDArray[np.float32]
 
-_Box = tuple[int, int, int, int]
-"""Cells `(x1, y1, x2, y2)` of a lattice."""
-
-_Place = tuple[slice, slice]
-"""Rows and columns of an array."""
+_Box = tuple[int, int, int, int]  # cells `(x1, y1, x2, y2)` of a lattice
+_Place = tuple[slice, slice]  # rows and columns of an array
 
 
 def _extent(marked: NDArray[np.bool_]) -> _Box:

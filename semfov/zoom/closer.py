@@ -15,8 +15,7 @@ from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 
-_CONTEXT = 3.0
-"""Side of the window of a closer look, in longer sides of the examined box."""
+_CONTEXT = 3.0  # side of the window of a closer look, in longer sides of the examined box
 
 USUAL_WINDOW = 0.6, 2.0
 """Least side of that window in a photograph, in longer sides of the photograph, and its side in those of the box."""
@@ -24,8 +23,7 @@ USUAL_WINDOW = 0.6, 2.0
 MOST_IN_PHOTOGRAPH = 3
 """Default for the largest number of closer looks in a photograph: more would go to the objects of a crowd."""
 
-_WHOLE = 0.9
-"""Share of a photograph from which on a window shows no more than the look at the whole."""
+_WHOLE = 0.9  # share of a photograph from which on a window shows no more than the look at the whole
 
 _SMALLEST = 1e-4
 

@@ -90,8 +90,7 @@ class SearchFacts:
 CLOSER = 100
 """Largest number of closer looks in a large picture: as many as there are passes for."""
 
-_DEFAULTS = Thresholds(0.9, 0.005)
-"""Thresholds of searches whose evidence has none."""
+_DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has none
 
 
 class WindowDecisions:

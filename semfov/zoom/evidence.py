@@ -25,8 +25,7 @@ from semfov.zoom.lattice import Lattice
 STEPS = 3
 """Largest number of octaves between a look and the closer looks that are predicted from it."""
 
-_CROWD = 9
-"""Side in cells of the square over which the networks read the mean of the strongest hints."""
+_CROWD = 9  # side in cells of the square over which the networks read the mean of the strongest hints
 
 _FLOOR = 1e-4
 
@@ -35,8 +34,7 @@ _HINTS, _MEMORY = 11, 2
 _NEAR, _WIDE = 5, (_CROWD, 17)
 """Sides in cells of the squares over which sums of hints are averaged: the neighbours, and the surroundings."""
 _INPUTS = _HINTS + _MEMORY + 2 * _CHANNELS + len(_WIDE) * (_CHANNELS + 2)
-_LOWEST = -0.8
-"""About the feature of a score of 0."""
+_LOWEST = -0.8  # about the feature of a score of 0
 _LARGEST = 1e6
 
 

@@ -31,8 +31,7 @@ Resampled = tuple[Tensor, list[_Frame]]
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
 
-_WIDE_BORDER = 16.0
-"""The same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)."""
+_WIDE_BORDER = 16.0  # the same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)
 
 
 @dataclass(frozen=True)

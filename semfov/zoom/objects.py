@@ -20,14 +20,11 @@ _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
 
 _SAME = 0.5
-_ALIKE = 0.6
-"""Overlap from which on a more probable box stands for one that a look at the whole shows."""
+_ALIKE = 0.6  # overlap from which on a more probable box stands for one that a look at the whole shows
 
 _LEAST, _MOST = 0.01, 0.999
-_SMALLEST = 6.0
-"""Side in canvas pixels from which on a look should show an object."""
-_EDGE = 2.0
-"""Canvas pixels from the border of a window within which it may cut an object."""
+_SMALLEST = 6.0  # side in canvas pixels from which on a look should show an object
+_EDGE = 2.0  # canvas pixels from the border of a window within which it may cut an object
 
 
 def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
