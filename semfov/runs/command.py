@@ -201,24 +201,9 @@ _WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
 def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[str]) -> list[str]:
-    """Bring arguments into the form that the parser understands.
+    """Bring arguments into the form that the parser understands; an option is given once, but for flags and --config.
 
-    Names of options may have dashes instead of underscores. A flag needs no value. A list of words needs no brackets,
-    and `none` is the empty list. An option is given once, but for flags and files of settings,
-    of which the last counts.
-
-    >>> from semfov.runs.settings import Settings
-    >>> from dataclasses import dataclass
-    >>> @dataclass(frozen=True)
-    ... class Example(Settings):
-    ...     give_up: float = 0.1
-    ...     looks: bool = False
-    ...     draw: tuple[str, ...] = ()
-    >>> options = ["--give_up", "--looks", "--draw"]
-    >>> _usual_form(["--give-up", "0.2", "--looks", "--draw", "path,views"], Example, options)
-    ['--give_up', '0.2', '--looks=true', '--draw=[path,views]']
-    >>> _usual_form(["--config", "a.yaml", "--config", "b.yaml", "--looks", "--looks"], Example, [*options, "--config"])
-    ['--config', 'a.yaml', '--config', 'b.yaml', '--looks=true', '--looks=true']
+    Names of options may have dashes, a flag needs no value, a list of words no brackets, and `none` is the empty list.
     """
     hints, option_names, usual = _setting_types(config), set(options), list[str]()
     rest = list(arguments)

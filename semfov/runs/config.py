@@ -127,10 +127,7 @@ class SensorConfig(Settings):
         return self.kind.width(self.whole()) / self.reference
 
     def level_edges(self, levels: int = 8, width: float = 50.0) -> list[float]:
-        """Borders between levels of distance, in units of the image's longer side: the steps of a sensor that has some.
-
-        A level is `width` pixels wide in an image whose longer side is 640, for a fovea of 100 pixels.
-        """
+        """Borders between levels of distance, in longer sides: its own, or by a `width` in px of 640."""
         own = self.kind.borders(self.whole())
         if own is not None:
             # Farther away than the longer side there is hardly anything.

@@ -22,10 +22,7 @@ from semfov.runs.store import cell_store, look_everywhere
 
 
 class Looking(SceneRun):
-    """Scenes, and an eye that looks at each of them from every cell; its detections are stored.
-
-    The settings are those of an `EyeConfig` with `cells`, the columns and rows of the grid.
-    """
+    """Scenes, and an eye that looks at each from every cell; settings are those of an `EyeConfig` with `cells`."""
 
     cells: tuple[int, int]
 

@@ -31,10 +31,7 @@ def one_thread() -> Iterator[None]:
 def photograph_looks(
     eye: Eye, image: Callable[[], Tensor], grid: Grid
 ) -> Callable[[int | tuple[float, ...]], Detections]:
-    """Looks of an eye at a photograph: from the centre of a cell, by its number, or closely at a box, by its corners.
-
-    Shapes: image `(1, 3, H, W)`.
-    """
+    """Looks of an eye at a photograph `(1, 3, H, W)`: from a cell, by number, or closely at a box, by its corners."""
     view: View | None = None
     image = cache(image)
 

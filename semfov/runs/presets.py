@@ -8,7 +8,7 @@ from typing import get_args
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import CellMemory
-from semfov.errors import InputError, check, lookup
+from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Static, Uniform
 from semfov.gaze.policies import policy_names
@@ -84,8 +84,6 @@ def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
     for setting, words in _WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
-    if choice.tempering is not None:
-        check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
     if choice.samples is not None and not (
         choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes
     ):

@@ -38,10 +38,7 @@ _Outcome = tuple[list[int], int]
 def episodes_of(
     scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig, targets: Sequence[int] | None = None
 ) -> list[Trial]:
-    """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
-
-    Starts differ from each other as long as there are enough cells.
-    """
+    """All episodes of one scene: for every target `starts` searches from cells that no object of it overlaps."""
     annotation = scenes.annotation(index)
     labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
     counts = torch.bincount(labels, minlength=1)
@@ -92,15 +89,12 @@ def choose_classes(
 
 
 class DrawnSearch(NamedTuple):
-    """A search for a drawn class, which the photograph may hold or not; `spare` ones serve only some purposes of a fit.
-
-    Shapes: goal `(X·Y,)`, start `(1,)`, noise `(1, shifts+1, X·Y)`.
-    """
+    """A search for a drawn class, which the photograph may hold; `spare` ones serve only some purposes of a fit."""
 
     target: int
-    goal: Tensor
-    start: Tensor
-    noise: Tensor
+    goal: Tensor  # (X·Y,)
+    start: Tensor  # (1,)
+    noise: Tensor  # (1, shifts+1, X·Y)
     spare: bool = False
 
     @property
@@ -135,10 +129,7 @@ def choose_searches(
 def run_episodes(
     episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, *, shifts: int, batch: int
 ) -> list[_Outcome]:
-    """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
-
-    Shapes: noise `(episodes, shifts+1, X·Y)`.
-    """
+    """Run episodes of one scene, each until its target is found or its shifts are spent; noise `(B, shifts+1, X·Y)`."""
     outcomes: list[_Outcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
@@ -216,26 +207,17 @@ def run_explorations(
     shifts: int,
     batch: int,
 ) -> list[tuple[list[int], dict[str, list[int]]]]:
-    """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
+    """Run explorations until their gaze shifts are spent or no cell is left; noise `(episodes, shifts+1, X·Y)`."""
+    starts, progress = torch.tensor([episode.start for episode in episodes]), []
 
-    Shapes: noise `(episodes, shifts+1, X·Y)`.
-    """
-    starts = torch.tensor([episode.start for episode in episodes])
-    progress = []
+    def policy(_: Tensor, cell: Tensor) -> AcquisitionFunction:
+        return strategy.acquisition(None, looks.grid, cell)
+
     for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
-        choice = Greedy(drawn_from(random))
         visits, counts = [], []
-        for step in rollout(
-            looks,
-            strategy.observer,
-            lambda _, cell: strategy.acquisition(None, looks.grid, cell),
-            start,
-            choice,
-            most=shifts + 1,
-        ):
-            probabilities = step.belief.class_probabilities()
+        for step in rollout(looks, strategy.observer, policy, start, Greedy(drawn_from(random)), most=shifts + 1):
             visits.append(step.cell)
-            counts.append(counts_of(probabilities, answers))
+            counts.append(counts_of(step.belief.class_probabilities(), answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
         tables = {name: torch.stack([each[name] for each in counts], 1).tolist() for name in counts[0]}

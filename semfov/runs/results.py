@@ -36,11 +36,7 @@ _DAMAGED = (sqlite3.DatabaseError, UnicodeDecodeError)
 
 
 class SceneResults:
-    """Outcomes of finished scenes, one row each, in a SQLite database; `flush` writes the last ones.
-
-    A row that is damaged, or of a scene that has changed since, counts as missing. So does a whole file that is no
-    database.
-    """
+    """Outcomes of finished scenes in a SQLite database; damaged rows and those of changed scenes count as missing."""
 
     def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
         self.path = folder / f"{key}.sqlite"

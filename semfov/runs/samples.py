@@ -15,11 +15,7 @@ from semfov.observation.matching import match
 
 @dataclass(frozen=True)
 class Samples:
-    """Detections with their true classes, and the looks that they come from.
-
-    Shapes: boxes `(M, 4)`, scores `(M, K+1)`, distance `(M,)`, labels `(M,)`, look `(M,)`, scenes `(R,)`, fixations
-    `(R, 2)`.
-    """
+    """M detections with their true classes, and the R looks that they come from."""
 
     boxes: Tensor
     scores: Tensor

@@ -15,10 +15,7 @@ def generator_for(*what: object) -> torch.Generator:
 
 
 def noise_for(protocol: ProtocolConfig, cells: int, *episode: object) -> Tensor:
-    """Random numbers `(shifts+1, X·Y)` that break the ties of an episode, the same for every policy.
-
-    A scene, a target (None: an exploration) and a repetition identify it.
-    """
+    """Random numbers `(shifts+1, X·Y)` for the ties of an `episode`: scene, target (None: exploration), repetition."""
     what = ("exploration" if each is None else each for each in episode)
     shape = protocol.shifts + 1, cells
     if protocol.ties == "first":

@@ -70,15 +70,10 @@ Workers = Annotated[int, Range(1, 1024)]
 class Settings:
     """Base of dataclasses of settings; it refuses values that are out of range.
 
-    A class documents its own settings, and inherited ones only where they mean something else: `--help` takes the
-    other descriptions from its bases.
-
-    Attributes:
-        unused: inherited settings that mean nothing here. They keep their defaults, and are neither options of the
-            command nor written with its outcomes.
+    A class documents its own settings, and inherited ones only where they mean something else.
     """
 
-    unused: ClassVar[tuple[str, ...]] = ()
+    unused: ClassVar[tuple[str, ...]] = ()  # inherited settings that mean nothing here: no options, and not written
 
     def __post_init__(self) -> None:
         """Check all values (`check_settings`)."""

@@ -14,7 +14,7 @@ from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
 from semfov.io.compatibility import learned_for
-from semfov.io.files import check_regular
+from semfov.io.files import read_text
 from semfov.io.pretrained import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.presets import PUBLISHED_SENSORS, published_model
@@ -26,10 +26,7 @@ _Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
-    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded.
-
-    The settings may name neither photographs nor annotations.
-    """
+    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
     if (data.root is None) != (data.annotations is None):
         present, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
         raise InputError(
@@ -44,31 +41,15 @@ def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> N
         check_detector(detector.name)
 
 
-def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
-    """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
+def make_scenes(data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] | None = None) -> Scenes:
+    """The scenes of the settings: photographs if a root is given, of which some ids are chosen, else embedded ones."""
     check_sources(data)
-    if data.root is None:
+    if data.root is None or data.annotations is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
-    ids = None
-    if data.ids is not None:
-        check_regular(data.ids)
-        try:
-            ids = data.ids.read_text(encoding="utf-8").split()
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataError(
-                f"{data.ids}: expected a text file with one id per line; it cannot be read ({error})"
-            ) from None
-    return _photographs(data, classes, ids, data.limit)
-
-
-def _photographs(
-    data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] | None, limit: int | None = None
-) -> Scenes:
-    """The photographs with these ids (None: all) that the settings select."""
-    assert data.root is not None
-    assert data.annotations is not None
-    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
-    return CocoScenes(data.root, data.annotations, classes, ids=ids, limit=limit, **selection)
+    if ids is None and data.ids is not None:
+        ids = read_text(data.ids).split()  # one a line
+    options: dict[str, Any] = {name: getattr(data, name) for name in ("limit", "min_instances", "max_target_area")}
+    return CocoScenes(data.root, data.annotations, classes, ids=ids, **options)
 
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
@@ -81,7 +62,7 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
     ids = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
     others = [name for number, name in enumerate(ids) if number % every]
-    return _photographs(data, classes, others), _photographs(data, classes, ids[::every])
+    return make_scenes(data, classes, others), make_scenes(data, classes, ids[::every])
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
@@ -129,11 +110,7 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
 
 
 def observation_name(eye: Eye) -> str:
-    """Name of the observation model that is shipped for an eye.
-
-    For a published sensor it is the model of `semfov.ActivePerception.published`, which is fitted by maximum
-    likelihood. For any other sensor it is the model of our own for the growth of its fovea.
-    """
+    """Name of the observation model that is shipped for an eye: the published one, or ours for the fovea's growth."""
     detector, settings = eye.detector, eye.sensor.settings()
     for sensor in PUBLISHED_SENSORS:
         published = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()

@@ -30,11 +30,7 @@ _StoredLook = TypeVar("_StoredLook")
 
 
 class SceneStore:
-    """A folder of tensors with one file for each scene, in folders by the first digits of their names.
-
-    Files are written atomically and carry a checksum. A file that is damaged, truncated, of another version or of
-    another schema counts as missing, and its tensors are computed again.
-    """
+    """A folder of tensors with a file for each scene; one that is damaged or of another version counts as missing."""
 
     def __init__(self, folder: Path, what: Mapping[str, object], code: str, schema: Schema) -> None:
         described = json.dumps({**what, "versions": {**versions(), "code": code}}, sort_keys=True)
@@ -56,10 +52,7 @@ class SceneStore:
 
 
 class DetectionStore(SceneStore):
-    """Looks at scenes by action, with the looks at a scene in one file.
-
-    The looks consist of detections. An action is a number, such as that of a cell, or the box of a closer look.
-    """
+    """Looks at scenes, detections by action: a number, such as that of a cell, or the box of a closer look."""
 
     width = 5
     """Number of numbers of an action."""
@@ -130,11 +123,7 @@ def cell_store(
 
 
 class RememberedLooks(Generic[_Action, _StoredLook]):
-    """Looks at one scene by action, each made once: read from a store, or computed when it is first asked for.
-
-    Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
-    batch nor on the number of CPU cores.
-    """
+    """Looks at one scene by action, each made once, one at a time and on one thread, on which its last bits depend."""
 
     def __init__(
         self,
@@ -181,10 +170,7 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
 def look_everywhere(
     eye: Eye, image: Callable[[], Tensor], grid: Grid, store: DetectionStore | None, digest: Callable[[], str]
 ) -> Detections:
-    """Detections from the centre of every cell of a photograph, read from a store, or computed and stored.
-
-    Shapes: image `(1, 3, H, W)`.
-    """
+    """Detections from every cell of a photograph `(1, 3, H, W)`, read from a store, or computed and stored."""
     looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)
     detections = Detections.stack([looks(cell) for cell in range(len(grid))])
     looks.save()

@@ -80,10 +80,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
 def prepare_worker() -> None:
-    """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
-
-    Only worker processes are silenced: the main process has logged the same messages already.
-    """
+    """Set one thread per process, on which results depend, and silence messages that the main process has logged."""
     torch.set_num_threads(1)
     # Otherwise glibc would return and request memory at every look. Dask's workers return memory at once, by a variable
     # of the environment, which also takes away glibc's own rule.
@@ -128,11 +125,9 @@ def run_tasks(
     hidden: bool = False,
     made: _Made | None = None,
 ) -> Generator[tuple[_Task, _Result], None, None]:
-    """Run `function(made, task)` for every task, and yield tasks and results in any order; a bar shows the progress.
+    """Run `function(made, task)` for every task, and yield tasks and results in any order; closing it ends the work.
 
     Each process makes `made` once, by `make(*settings)`; this one does not where it is given.
-    Results come back to this process, which stores them: workers need not see its folders. Close the generator if you
-    stop early: that ends the work.
     """
     if not tasks:
         return
@@ -303,11 +298,7 @@ def _in_turn(function: Callable[[_Task], _Result], batch: Sequence[_Task]) -> li
 
 @contextmanager
 def _deaf_children() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C.
-
-    A terminal sends Ctrl-C to all of its processes, but only the main one may handle it; it then ends the others. The
-    children inherit the blocked signal, and so ignore it even before any of their code has run.
-    """
+    """Start processes that ignore Ctrl-C, as the main one ends them: they inherit the blocked signal."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -30,11 +30,10 @@ class GlanceStore(DetectionStore):
             "cut": Field(("M",), torch.bool),
             "show": Field(("N", classes), torch.float32, low=0, high=1),
             "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
-            "gist.counts": Field(("N", 2), torch.int64, low=0),
-            "gist.cells": Field(("P",), torch.int32, low=0),
+            "gist.cells": Field(("P",), torch.int64, low=0),
             "gist.scores": Field(("P", classes), torch.float32, low=0, high=1),
             "gist.sizes": Field(("P",), torch.float32, low=0),
-            "gist.found": Field(("Q",), torch.int32, low=0),
+            "gist.found": Field(("Q",), torch.int64, low=0),
         }
         super().__init__(folder, {"settings": settings}, self.sources, classes + 1)
 
@@ -89,54 +88,34 @@ class StoredGlances(Glances):
 
 
 def _pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Pack gists into tensors for a file; a look without a gist has no cells."""
-    frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
-    cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
-    scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]
-    for number, look in enumerate(gists):
-        if look is None:
-            continue
-        full = (look.scores > 0).any(-1).flatten()
-        cells.append(full.nonzero()[:, 0].int())
-        scores.append(look.scores.flatten(0, 1)[full].float())
-        sizes.append(look.size.flatten()[full].float())
-        found.append(look.found.flatten().nonzero()[:, 0].int())
-        frames[number] = torch.tensor([look.scale, *look.scores.shape[:2]])
-        counts[number] = torch.tensor([len(cells[-1]), len(found[-1])])
+    """Pack gists into tensors for a file, without their empty cells; a look without a gist has a scale of 0."""
+    some = [look for look in gists if look is not None]
+    frames = [[0, 0, 0] if look is None else [look.scale, *look.scores.shape[:2]] for look in gists]
+    scores = torch.cat([torch.zeros(0, kinds), *(look.scores.flatten(0, 1) for look in some)])
+    sizes = torch.cat([torch.zeros(0), *(look.size.flatten() for look in some)])
+    found = torch.cat([torch.zeros(0, kinds, dtype=torch.bool), *(look.found.flatten(0, 1) for look in some)])
+    full = (scores > 0).any(-1)
     return {
-        "gist.frames": frames,
-        "gist.counts": counts,
-        "gist.cells": torch.cat(cells),
-        "gist.scores": torch.cat(scores),
-        "gist.sizes": torch.cat(sizes),
-        "gist.found": torch.cat(found),
+        "gist.frames": torch.tensor(frames),
+        "gist.cells": full.nonzero()[:, 0],
+        "gist.scores": scores[full].float(),
+        "gist.sizes": sizes[full].float(),
+        "gist.found": found.flatten().nonzero()[:, 0],
     }
 
 
 def _unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
     """Unpack the tensors of `_pack_gists`."""
-    cell_counts, found_counts = (column.tolist() for column in tensors["gist.counts"].unbind(1))
-    looks = zip(
-        windows,
-        tensors["gist.frames"].tolist(),
-        tensors["gist.cells"].split(cell_counts),
-        tensors["gist.scores"].split(cell_counts),
-        tensors["gist.sizes"].split(cell_counts),
-        tensors["gist.found"].split(found_counts),
-        strict=True,
-    )
-    kinds = tensors["gist.scores"].shape[-1]
-    gists: list[Gist | None] = []
-    for window, (scale, rows, columns), cells, scores, sizes, found in looks:
-        if not scale:
-            gists.append(None)
-            continue
-        values, size = torch.zeros(rows * columns, kinds), torch.zeros(rows * columns)
-        sure = torch.zeros(rows * columns * kinds, dtype=torch.bool)
-        values[cells.long()], size[cells.long()], sure[found.long()] = scores.float(), sizes.float(), True
-        shape = rows, columns
-        look = Gist(
-            window.level, window.cells[:2], scale, values.view(*shape, -1), size.view(shape), sure.view(*shape, -1)
-        )
-        gists.append(look)
-    return gists
+    frames, kinds = tensors["gist.frames"].tolist(), tensors["gist.scores"].shape[-1]
+    counts = [rows * columns for _, rows, columns in frames]
+    scores, size = torch.zeros(sum(counts), kinds), torch.zeros(sum(counts))
+    found = torch.zeros(sum(counts) * kinds, dtype=torch.bool)
+    cells = tensors["gist.cells"]
+    scores[cells], size[cells], found[tensors["gist.found"]] = tensors["gist.scores"], tensors["gist.sizes"], True
+    parts = scores.split(counts), size.split(counts), found.view(-1, kinds).split(counts)
+    return [
+        Gist(window.level, window.cells[:2], scale, *(part.unflatten(0, (rows, columns)).clone() for part in three))
+        if scale
+        else None
+        for window, (scale, rows, columns), *three in zip(windows, frames, *parts, strict=True)
+    ]

@@ -122,12 +122,12 @@ def test_ids_that_are_missing_or_cannot_be_read_are_named(photographs):
         choose(photographs, ids=[7, 14, 16])
     with pytest.raises(DataError, match="each of 9 ids, got none for 9 of them: 100, 101, 102, 103, 104, …"):
         choose(photographs, ids=range(100, 109))
-    for content in [None, b"\xff\xfe\x00"]:
+    for content, told in ((None, "no such file"), (b"\xff\xfe\x00", "expected a file of text")):
         listed = photographs / "ids.txt"
         if content is not None:
             listed.write_bytes(content)
         data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed)
-        unusable(r"ids\.txt: expected a text file with one id per line", make_scenes, data, ("cup",))
+        unusable(rf"ids\.txt: {told}", make_scenes, data, ("cup",))
 
 
 TASKS = get_args(Task)
