@@ -14,7 +14,7 @@ from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, TextIO
+from typing import Any
 
 from semfov.cli.help import HELP
 from semfov.version import __version__
@@ -122,12 +122,7 @@ complete -c semfov -n __fish_use_subcommand -a "{commands}"
 
 
 def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
-    """The script with which a shell completes the command, from the options of each subcommand.
-
-    >>> print(_completion("fish", {"find": ["give_up"]}), end="")
-    complete -c semfov -n __fish_use_subcommand -a "find"
-    complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up
-    """
+    """The script with which a shell completes the command, from the options of each subcommand."""
     script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
     if script is None:
         return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
@@ -196,17 +191,7 @@ _COMMANDS = {
 
 
 def _in_command_words(message: str, options: Iterable[str]) -> str:
-    """Say a message of the library in the words of the command: arguments become options.
-
-    >>> _in_command_words("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"])
-    'use --how windows or --give-up 0.1, or `semfov find`'
-    >>> _in_command_words("give its path as weights=", ["weights"])
-    'give its path as --weights'
-    >>> _in_command_words("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"])
-    '--recursive, or --detector.classes cat,dog'
-    >>> _in_command_words("name them by columns={…} or give size=", ["size"])
-    'give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too) or give --size'
-    """
+    """Say a message of the library in the words of the command: arguments become options."""
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)
     by_name = {name.rpartition(".")[2]: name for name in options}
@@ -223,14 +208,7 @@ def _in_command_words(message: str, options: Iterable[str]) -> str:
 def _plain_warnings(words: Callable[[str], str]) -> Iterator[None]:
     """Print each warning as one line in the words of the command, without the place in the code."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, *_: object, **__: object) -> None:
         print(f"warning: {words(str(message))}", file=sys.stderr)
 
     with warnings.catch_warnings():

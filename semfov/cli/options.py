@@ -296,11 +296,7 @@ class DetectorsOptions(Settings):
 
 
 def start_of(text: str | None) -> int | tuple[int, int] | None:
-    """The first cell as a number, or as column and row.
-
-    >>> start_of("5,7"), start_of("47"), start_of(None)
-    ((5, 7), 47, None)
-    """
+    """The first cell as a number, or as column and row."""
     if text is None:
         return None
     try:
@@ -313,11 +309,7 @@ def start_of(text: str | None) -> int | tuple[int, int] | None:
 
 
 def white_of(text: str | None) -> White | None:
-    """The values that are black and white.
-
-    >>> white_of("300,3000"), white_of("4095"), white_of("auto")
-    ((300.0, 3000.0), 4095.0, 'auto')
-    """
+    """The values that are black and white."""
     if text is None:
         return None
     try:

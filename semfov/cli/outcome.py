@@ -120,21 +120,14 @@ def _looks_text(record: Record) -> str:
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows of equal length as lines with aligned columns.
-
-    >>> table_lines([["name", "size"], ["a", "12"]])
-    ['name  size', 'a     12']
-    """
+    """Rows of equal length as lines with aligned columns."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 @dataclass(frozen=True)
 class PictureOutcome:
-    """Outcome of a look at a picture: text, row of results, part of a page (as JSON values), figures, and other files.
-
-    Figures lie in the folder of the picture, `files` where their paths say.
-    """
+    """Outcome of a look at a picture, as JSON values and files: figures in its folder, others where their paths say."""
 
     ended: str
     text: str

@@ -35,11 +35,7 @@ _OBJECTS = ("picture", "width", "height", *COLUMNS, *_EXPECTED)
 
 
 def kind_of(path: Path) -> str | None:
-    """The kind of a file of results by its name; None for a folder.
-
-    >>> kind_of(Path("boxes.json")), kind_of(Path("boxes.coco.json")), kind_of(Path("runs/one"))
-    ('.json', '.coco.json', None)
-    """
+    """The kind of a file of results by its name; None for a folder."""
     if path == STDOUT:
         return ".jsonl"
     name = path.name.lower()

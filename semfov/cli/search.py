@@ -9,7 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import fields, replace
 from os import PathLike, fspath
@@ -77,12 +77,8 @@ class _PictureJob(ABC):
         if self.truth is not None:
             for source in self.sources:
                 self.truth.image_id(source.name)
-        check(
-            not self.every or options.start is None,
-            "start",
-            "none for find, which begins with the whole picture",
-            repr(options.start),
-        )
+        first = "none for find, which begins with the whole picture"
+        check(not self.every or options.start is None, "start", first, repr(options.start))
         self.start = _check(options)
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
@@ -278,11 +274,7 @@ def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
 
 
 def _worth_starting(processes: int | None, tasks: int, seconds: float, start: float) -> int:
-    """The number of processes for tasks of some seconds; 1 where starting them would take longer than they save.
-
-    >>> _worth_starting(2, 7, 0.5, 4.0), _worth_starting(2, 99, 0.5, 4.0)
-    (1, 2)
-    """
+    """The number of processes for tasks of some seconds; 1 where starting them would take longer than they save."""
     most = min(available_cores() if processes is None else processes, tasks)
     return most if most > 1 and tasks * seconds * (1 - 1 / most) > start else 1
 
@@ -379,13 +371,11 @@ class _ExploreJob(_PictureJob):
         return self.agent.explore(picture, start=self.start, **settings, **shared)
 
 
-_JOBS: dict[type[PictureOptions], Callable[..., _PictureJob]] = {
-    SearchOptions: _SearchJob,
-    FindOptions: _FindJob,
-    ExploreOptions: _ExploreJob,
+_TASKS: dict[str, tuple[type[PictureOptions], type[_PictureJob]]] = {
+    "search": (SearchOptions, _SearchJob),
+    "find": (FindOptions, _FindJob),
+    "explore": (ExploreOptions, _ExploreJob),
 }
-
-_TASKS: dict[str, type[PictureOptions]] = {"search": SearchOptions, "find": FindOptions, "explore": ExploreOptions}
 
 _turn = threading.Lock()
 """Calls of several threads take turns: a process has one job, and one standard output."""
@@ -393,8 +383,8 @@ _turn = threading.Lock()
 
 def look_at(options: PictureOptions, stream: TextIO) -> int:
     """Search pictures, find all objects in them or explore them, as the options say; returns the exit code."""
-    options = _with_target(options)
-    return int(any("error" in row for row in _look_at_pictures(_JOBS[type(options)](options), stream)))
+    job = next(job for kind, job in _TASKS.values() if isinstance(options, kind))
+    return int(any("error" in row for row in _look_at_pictures(job(_with_target(options)), stream)))
 
 
 def _with_target(options: PictureOptions) -> PictureOptions:
@@ -449,7 +439,7 @@ def run(
         rows = semfov.run("flight", "person", out="people.csv", agent=agent, passes=16)
         print(sum(row["expected"]["person"] or 0 for row in rows if "error" not in row))
     """
-    kind = _TASKS[lookup(task, _TASKS, "task")]
+    kind, job = _TASKS[lookup(task, _TASKS, "task")]
     listed = [pictures] if isinstance(pictures, str | PathLike) else list(pictures)
     fits = bool(listed) and all(isinstance(each, str | PathLike) for each in listed)
     expected = "files, folders or patterns (the methods of an agent take arrays and Pillow images)"
@@ -479,7 +469,7 @@ def run(
     with _turn, open(os.devnull, "w", encoding="utf-8") as nothing:
         stream = sys.stdout
         with redirect_stdout(nothing) if quiet else nullcontext():
-            return _look_at_pictures(_JOBS[kind](settings, made), stream)
+            return _look_at_pictures(job(settings, made), stream)
 
 
 def _check(options: PictureOptions) -> Any:

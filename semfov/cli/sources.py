@@ -74,11 +74,7 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
 
 
 def _shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
-    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given.
-
-    >>> _shown_by(PictureOptions(white="300,3000", bands="4,3,2"))
-    {'white': (300.0, 3000.0), 'bands': (4, 3, 2)}
-    """
+    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given."""
     white = white_of(options.white)
     shown: dict[str, Any] = {} if white is None else {"white": white}
     if options.bands is not None:

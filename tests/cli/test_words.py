@@ -4,14 +4,17 @@ import importlib
 import re
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 
 import semfov
-from semfov.cli import agent, live, search, start
-from semfov.cli.main import _SUBCOMMANDS, _options_of, main
+from semfov.cli import agent, live, options, search, sources, start
+from semfov.cli.main import _SUBCOMMANDS, _completion, _in_command_words, _options_of, main
+from semfov.cli.outcome import table_lines
+from semfov.cli.results import kind_of
 from semfov.errors import InputError
-from semfov.runs.command import make_parser
+from semfov.runs.command import _usual_form, make_parser
 
 REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
@@ -187,3 +190,44 @@ def test_ctrl_c_while_the_command_is_imported_ends_in_one_line(program, changes,
         assert (signal.getsignal(signal.SIGINT) is start._leave) == changes
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_texts_of_options_are_read():
+    assert agent.several_classes("Cups, fork", ("cup", "fork")) == ["cup", "fork"]
+    assert [options.start_of(text) for text in ("5,7", "47", None)] == [(5, 7), 47, None]
+    assert [options.white_of(text) for text in ("300,3000", "4095", "auto")] == [(300.0, 3000.0), 4095.0, "auto"]
+    shown = sources._shown_by(options.PictureOptions(white="300,3000", bands="4,3,2"))
+    assert shown == {"white": (300.0, 3000.0), "bands": (4, 3, 2)}
+    assert [kind_of(Path(name)) for name in ("a.json", "a.coco.json", "runs/one")] == [".json", ".coco.json", None]
+    assert table_lines([["name", "size"], ["a", "12"]]) == ["name  size", "a     12"]
+    assert [search._worth_starting(2, tasks, 0.5, 4.0) for tasks in (7, 99)] == [1, 2]
+
+
+def test_messages_name_options_as_the_command_does():
+    for message, names, told in (
+        ("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"],
+         "use --how windows or --give-up 0.1, or `semfov find`"),
+        ("give its path as weights=", ["weights"], "give its path as --weights"),
+        ("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"],
+         "--recursive, or --detector.classes cat,dog"),
+        ("name them by columns={…} or give size=", ["size"],
+         "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too) or give "
+         "--size"),
+    ):  # fmt: skip
+        assert _in_command_words(message, names) == told
+
+
+def test_options_are_written_as_in_other_commands():
+    given = ["--give-up", "0.2", "--looks", "--draw", "path,views", "--config", "a.yaml", "--config", "b.yaml"]
+    usual = ["--give_up", "0.2", "--looks=true", "--draw=[path,views]", "--config", "a.yaml", "--config", "b.yaml"]
+    known = ["--give_up", "--looks", "--draw", "--config"]
+    assert _usual_form(given, options.SearchOptions, known) == usual
+    assert _usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
+
+
+def test_a_shell_completes_commands_and_options():
+    lines = _completion("fish", {"find": ["give_up"]}).splitlines()
+    assert lines == [
+        'complete -c semfov -n __fish_use_subcommand -a "find"',
+        'complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up',
+    ]
