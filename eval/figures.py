@@ -31,6 +31,7 @@ from semfov.gaze.choice import select_fixation
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency import VOCUS2, cell_saliency
 from semfov.observation.matching import box_iou
+from semfov.paths.look import confident_detections
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.settings import Settings, Shifts, Side
@@ -40,7 +41,6 @@ from semfov.sensor.named import SensorName, named_sensor
 from semfov.viz import plot_belief_bars, plot_foveated_strip
 from semfov.viz.drawing import (
     choose_fixations,
-    confident_detections,
     draw_boxes,
     draw_cells,
     draw_cross,

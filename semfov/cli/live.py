@@ -17,7 +17,6 @@ from semfov.errors import InputError, check
 from semfov.live import LivePerception
 from semfov.paths import Moment
 from semfov.paths.look import detections_in_words
-from semfov.viz.drawing import CONFIDENT
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
 _UNKNOWN_RATE = 15.0
@@ -104,7 +103,7 @@ def _moment_line(moment: Moment) -> str:
         at = f"cell ({row['column']}, {row['row']})"
         likely = f", most likely at cell ({row['highest_cell'] % columns}, {row['highest_cell'] // columns})"
     if moment.examined is None:
-        look = f"at {at}: {detections_in_words(moment.seen, moment.classes, 2, CONFIDENT)}"
+        look = f"at {at}: {detections_in_words(moment.seen, moment.classes, 2)}"
     else:
         look = f"closely at {at}: p {moment.examined.place:.2f} there"
     return f"{f'{moment.number:4d}  {look}':60s}  {moment.describe()}{likely}"

@@ -21,10 +21,9 @@ from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
 from semfov.paths import Record, Scanpath
 from semfov.paths.conversion import coco_categories
-from semfov.paths.look import detections_in_words
+from semfov.paths.look import CONFIDENT, detections_in_words
 from semfov.report.episode import jpeg
 from semfov.viz.belief import plot_belief, plot_belief_bars
-from semfov.viz.drawing import CONFIDENT
 from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.semantic import named_regions, plot_semantic_map
 from semfov.viz.style import save_figure
@@ -100,13 +99,13 @@ def _looks_text(record: Record) -> str:
             str(look.number),
             f"({look.fixation[0]:.0f}, {look.fixation[1]:.0f})",
             "the whole picture" if record.is_whole(look.region) else box_text(look.region),
-            detections_in_words(look.detections, record.classes, score=CONFIDENT),
+            detections_in_words(look.detections, record.classes, target=record.target),
             "" if look.value is None else f"{look.value:.3f}",
             "" if look.seconds is None else f"{look.seconds:.2f}",
         ]
         for look in record
     ]
-    head = ["look", "at (x, y)", "shows", "detections", "value", "s"]
+    head = ["look", "at (x, y)", "shows", f"detections from score {CONFIDENT:g} on", "value", "s"]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     if any(look.value is not None for look in record):
         lines.append(f"  value: {record.value_in_words}")

@@ -22,6 +22,7 @@ from semfov.errors import InputError, check
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
+from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
 from semfov.words import not_there
 
@@ -63,22 +64,24 @@ class Conversion(Outcome):
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each, whose first columns all kinds of records have.
 
-        `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of the picture that it shows. `seen`
-        and `score` are of the most confident detection. `closer` is the probability that the target is there, by a
-        closer look that this is, or that follows it. `brought` is the number of objects that it shows most sharply.
+        `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of the picture that it shows.
+        `detections` counts those from score 0.1 on; `seen` and `score` are of the most confident one. `closer` is the
+        probability that the target is there, by a closer look that this is, or that follows it. `brought` is the number
+        of objects that it shows most sharply.
         """
         closer = {look.of_look: look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
         rows: list[dict[str, Any]] = []
         for look in self:
-            count = int(look.detections.count.sum())
+            seen = confident_detections(look.detections)
+            count = int(seen.count)
             rows.append(
                 {
                     "look": look.number,
                     **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
                     "detections": count,
-                    "seen": self.classes[int(look.detections.labels.flatten()[0])] if count else None,
-                    "score": float(look.detections.confidence.flatten()[0]) if count else None,
+                    "seen": self.classes[int(seen.labels[0, 0])] if count else None,
+                    "score": float(seen.confidence[0, 0]) if count else None,
                     "seconds": look.seconds,
                     "value": look.value,
                     "closer": closer.get(look.number),

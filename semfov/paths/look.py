@@ -14,6 +14,9 @@ from semfov.detection.objects import box_text
 Box = tuple[float, float, float, float]
 """`(x1, y1, x2, y2)`."""
 
+CONFIDENT = 0.1
+"""Score from which on the detections of a look are counted, told and drawn."""
+
 
 @dataclass(frozen=True, repr=False)
 class RecordedLook:
@@ -83,10 +86,26 @@ def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]
     }
 
 
-def detections_in_words(detections: Detections, classes: Sequence[str], most: int = 3, score: float = 0.0) -> str:
-    """Name the most confident detections of a look."""
-    columns = (detections.labels, detections.confidence, detections.mask)
-    looks = zip(*(column.flatten().tolist() for column in columns), strict=True)
-    sure = [f"{classes[label]} {confidence:.2f}" for label, confidence, real in looks if real and confidence >= score]
-    more = f" and {len(sure) - most} more" if len(sure) > most else ""
-    return ", ".join(sure[:most]) + more or "nothing"
+def confident_detections(detections: Detections, most: int | None = None) -> Detections:
+    """The most confident detections of a look, a batch of one, without padding."""
+    chosen = slice(int((detections.confidence[0] >= CONFIDENT).sum()))
+    boxes, scores, mask = (each[:, chosen][:, :most] for each in (detections.boxes, detections.scores, detections.mask))
+    return Detections(boxes, scores, mask).to("cpu")
+
+
+def detections_in_words(
+    detections: Detections, classes: Sequence[str], most: int = 3, target: int | None = None
+) -> str:
+    """Name the most confident detections of a look, before them the best one of the target with its box."""
+    told = confident_detections(detections)
+    labels, scores = told.labels[0].tolist(), told.confidence[0].tolist()
+    names = [f"{classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
+    if target is not None and bool(detections.mask.any()):
+        chances = detections.scores[0, :, target].masked_fill(~detections.mask[0], 0)
+        best = int(chances.argmax())
+        if best < len(names) and labels[best] == target:
+            del names[best]
+        place = box_text(detections.boxes[0, best].tolist())
+        names.insert(0, f"{classes[target]} {chances[best]:.2f} in {place}")
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more or "nothing"

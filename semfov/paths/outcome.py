@@ -263,15 +263,21 @@ class Outcome(ABC):
             return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
         return sentences.get(self.ending or "", "")
 
+    @property
+    def best_place(self) -> tuple[Tensor, float] | None:
+        """Where the target of an undecided search is most likely, a box `(4,)`, and its probability or score."""
+        if self.decision is None or self.decision.outcome != "undecided":
+            return None
+        seen = self.candidates.of(self._sought)
+        places = [(look.box, look.place) for look in self.closer]
+        places = places or list(zip(seen.boxes, seen.scores.tolist(), strict=True))
+        return max(places, key=lambda place: place[1], default=None)
+
     def best_place_in_words(self) -> str:
         """Name the most likely place of the target of an undecided search; empty for others and without one."""
-        if self.decision is None or self.decision.outcome != "undecided":
+        if self.best_place is None:
             return ""
-        seen, of = self.candidates.of(self._sought), "probability" if self.closer else self.measure
-        places = [(look.place, look.box) for look in self.closer] or list(zip(seen.scores, seen.boxes, strict=True))
-        if not places:
-            return ""
-        best, box = max(places, key=lambda place: float(place[0]))
+        (box, best), of = self.best_place, "probability" if self.closer else self.measure
         return f"best place: box {box_text(box.tolist())}, {of} {best:.2f}"
 
     def summary(self) -> str:

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.detection.objects import FAINTEST
 from semfov.detection.placement import resize
 from semfov.paths import Record, Scanpath
+from semfov.paths.look import confident_detections
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import cell_entropy
@@ -65,6 +65,8 @@ def episode_data(
     grid, decision = scanpath.grid, scanpath.decision
     size = grid.extent.tolist()
     found = decision if decision is not None and decision.outcome == "found" else None
+    best = None if found is None else found.box
+    best = scanpath.best_place[0] if scanpath.best_place is not None else best
     timed = len(scanpath.seconds) > 0
     after = [*scanpath.cells.tolist()[1:], None]
     every_view: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views
@@ -87,7 +89,7 @@ def episode_data(
         "outcome": {
             "why": scanpath.why_it_ended(),
             "cell": None if found is None else found.cell,
-            "box": None if found is None or found.box is None else [round(x, 1) for x in found.box.tolist()],
+            "box": None if best is None else [round(x, 1) for x in best.tolist()],
         },
         "presence": None if scanpath.presence is None else [rounded(p, 9) for p in scanpath.presence.tolist()],
         "size": size,
@@ -122,6 +124,7 @@ def object_data(record: Record) -> Data:
         "listed_by_score": record.listed_by_score.tolist()[:_DRAWN],
         "confirmable": record.confirmable,
         "turns": record.how == "head",
+        "best": None if record.best_place is None else record.best_place[0].tolist(),
     }
 
 
@@ -150,15 +153,14 @@ def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
 
 def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     """The most confident detections of a look, each with its highest class scores and the position of its label."""
-    looked, classes = scanpath.detections[fixation][0], scanpath.classes
+    looked, classes = confident_detections(scanpath.detections[fixation], _MOST)[0], scanpath.classes
     detections = []
-    for box, vector in zip(looked.boxes[:_MOST], looked.scores[:_MOST], strict=True):
-        if float(vector[1:].max()) >= FAINTEST:
-            best = vector.topk(min(_SCORES, len(vector)))
-            pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
-            top = [[classes[index], rounded(score, 9)] for score, index in pairs]
-            label = classes[int(vector[1:].argmax()) + 1]
-            detections.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
+    for box, vector in zip(looked.boxes, looked.scores, strict=True):
+        best = vector.topk(min(_SCORES, len(vector)))
+        pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
+        top = [[classes[index], rounded(score, 9)] for score, index in pairs]
+        label = classes[int(vector[1:].argmax()) + 1]
+        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
     width, height = scanpath.grid.extent.tolist()
     unit = width / 640
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()

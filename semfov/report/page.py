@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from semfov.detection.objects import box_text
 from semfov.errors import check
 from semfov.io.files import write_text
+from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
 from semfov.viz.labels import place_labels, place_within
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
@@ -126,6 +127,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             for number, episode in enumerate(episodes)
             if "looks" not in episode
         ),
+        "least": f"{CONFIDENT:g}",
         "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
     return filled("page", data, contents)
@@ -193,6 +195,7 @@ def _looks_html(data: Data, place: str, *, headed: bool = True) -> str:
     entries = [("objects", "object that was found")]
     if data["confirmable"]:
         entries.append(("sure", "confirmed by the decision or a closer look"))
+    entries += [("best", "best place, not sure enough")] if data["best"] else []
     entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
     entries += [("truth", "true box")] if data["truth"] else []
     legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in entries)
@@ -237,6 +240,8 @@ def _picture(data: Data, place: str) -> str:
         title = f"<title>{escape(text)}{sure}, look {each['look']}</title>"
         inside = f"{title}{_framed(each['box'])}{name}"
         shapes.append(f'<g class="{kind}" data-look="{each["look"]}" data-object="{order}">{inside}</g>')
+    if data["best"]:
+        shapes.append(f'<g class="best"><title>best place</title>{_framed(data["best"])}</g>')
     for (number, look), tag in zip(windows, tags, strict=True):
         x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
@@ -286,9 +291,10 @@ def _look(data: Data, number: int, place: str) -> str:
     if look["closer"] is not None:
         facts["Closer look"] = look["closer"]
     facts_html = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
-    table = "<p>No detections.</p>"
+    least = f"from score {CONFIDENT:g} on"
+    table = f"<p>No detections {least}.</p>"
     if len(rows) > 1:
-        table = table_html(rows, f"Detections of look {number}, with boxes x1,y1–x2,y2 in picture pixels")
+        table = table_html(rows, f"Detections of look {number} {least}, with boxes x1,y1–x2,y2 in picture pixels")
     left = look["count"] - len(look["detections"])
     label = f"The window of look {number} with {look['count']} detection{'s' if look['count'] != 1 else ''}"
     return (

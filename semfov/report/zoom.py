@@ -13,10 +13,9 @@ from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.errors import check
 from semfov.paths import Record, RecordedLook
-from semfov.paths.look import LookView, read_region
+from semfov.paths.look import CONFIDENT, LookView, read_region
 from semfov.report.episode import Data, jpeg_uri, object_data, tagged
 from semfov.viz.drawing import photograph_of
-from semfov.zoom.hints import DETECTION_SCORE
 
 _MOST_DETECTIONS = 15
 """Largest number of detections of a look that are drawn and listed."""
@@ -115,9 +114,9 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     )
     for box, place, vector, label, score in columns:
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label and float(vector[path.target]) >= DETECTION_SCORE:
+        if path.target is not None and label and float(vector[path.target]) >= CONFIDENT:
             label, score = path.target, float(vector[path.target])
-        if score >= DETECTION_SCORE:
+        if score >= CONFIDENT:
             first = label == path.target
             rows.append((first, score, {"box": box, "place": place, "label": path.classes[label], "score": score}))
     rows.sort(key=lambda row: row[:2], reverse=True)

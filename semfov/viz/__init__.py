@@ -4,10 +4,10 @@ Save a figure with `save_figure(figure, "name.pdf")` (PNG and SVG too). In a not
 last value of a cell. To draw in an existing figure, give its axes as `ax=` or `axes=`.
 """
 
+from semfov.paths.look import CONFIDENT
 from semfov.viz.animation import animate
 from semfov.viz.belief import plot_belief, plot_belief_bars
 from semfov.viz.curves import plot_curves, plot_reliability
-from semfov.viz.drawing import CONFIDENT
 from semfov.viz.scanpath import plot_episode, plot_fixation, plot_foveated_strip, plot_scanpath
 from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-CONFIDENT = 0.1
-"""Detections of lower confidence are not drawn."""
-
 _Tag = tuple[LabelBox, str, str]  # a box, the text of its label, and its colour
 _LABEL, _SMALL = 6.5, 5.0  # font sizes of the labels of boxes, of few and of many
 
@@ -123,12 +120,6 @@ def draw_cross(axes: Axes, point: Tensor | Sequence[float]) -> list[Artist]:
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
         *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
     ]
-
-
-def confident_detections(detections: Detections, most: int) -> Detections:
-    """The most confident detections of a look, a batch of one, without padding."""
-    count = min(most, int((detections.confidence[0] >= CONFIDENT).sum()))
-    return Detections(detections.boxes[:, :count], detections.scores[:, :count], detections.mask[:, :count]).to("cpu")
 
 
 def draw_look(

@@ -15,13 +15,12 @@ from semfov.data.large import open_large
 from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.paths import Record, Scanpath
-from semfov.paths.look import LookView
+from semfov.paths.look import LookView, confident_detections
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     check_fixation,
     check_foveal,
     choose_fixations,
-    confident_detections,
     draw_boxes,
     draw_cells,
     draw_cross,
@@ -75,6 +74,12 @@ def _draw_objects(
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
             drawn += draw_boxes(axes, Tensor([box]), colour, "--" if lower[row["object"]] else "-", line)
             tags.append((box, text, colour))
+    if record.best_place is not None and last >= len(record) - 1:
+        best, chance = record.best_place
+        drawn += draw_boxes(axes, best[None], FOUND, "--", 2.4)
+        if not (record.objects.boxes == best).all(-1).any():  # otherwise it has a label
+            x1, y1, x2, y2 = best.tolist()
+            tags.append(((x1, y1, x2, y2), f"best place {chance:.2f}", FOUND))
     if tagged:
         drawn += draw_tags(axes, tags[::-1][:_LABELLED], (width, height), obstacles, many=many)
     return drawn
@@ -93,7 +98,7 @@ def _draw_legend(axes: Axes, entries: Sequence[_LegendEntry]) -> None:
         [text for _, _, text in entries],
         loc="upper center",
         bbox_to_anchor=(0.5, 0),
-        ncols=len(entries) if len(entries) < 4 else 2,
+        ncols=len(entries) if sum(len(text) + 6 for _, _, text in entries) < 115 else 2,
         frameon=False,
         handlelength=1.6,
     )
@@ -161,7 +166,10 @@ def plot_scanpath(
         entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
     if objects and (lower := int(scanpath.listed_by_score.sum())):
         entries.append((TARGET, "--", f"by score alone ({lower})"))
-    if objects and scanpath.refuted:
+    best = scanpath.best_place
+    if objects and best is not None:
+        entries.append((FOUND, "--", "best place, not sure enough"))
+    if objects and any(best is None or not look.box.equal(best[0]) for look in scanpath.refuted):
         entries.append((FOUND, ":", "not confirmed by a closer look"))
     _draw_legend(axes, [*([(GAZE, "-", "shown by the looks")] if outlined else []), *entries])
     lay_out(figure)

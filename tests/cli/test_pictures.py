@@ -557,7 +557,7 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
         printed.out,
     )
     assert "A closer look confirmed the target." in printed.out
-    assert re.search(r"^  look +at \(x, y\) +shows +detections +value +s$", printed.out, re.M)
+    assert re.search(r"^  look +at \(x, y\) +shows +detections from score 0.1 on +value +s$", printed.out, re.M)
     assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
     assert "\n  value: the probability that it shows the target" in printed.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}

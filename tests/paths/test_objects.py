@@ -12,6 +12,8 @@ from semfov.cli.outcome import _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
+from semfov.paths.look import detections_in_words
+from semfov.report.episode import episode_data
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
 from semfov.zoom.glances import Glance, Window
@@ -82,12 +84,29 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     path = replace(path, closer=closer)
     assert path.best_place_in_words() == "best place: box 50,40–70,55, probability 0.30"
     assert "Best place: box 50,40–70,55, probability 0.30." in repr(path)
+    box, probability = path.best_place
+    assert (box.tolist(), probability) == (RIGHT, 0.3)
     assert path.to_dict()["summary"].endswith(" Best place: box 50,40–70,55, probability 0.30.")
     told = _looks_text(path).splitlines()
     assert [line.endswith(", which the decision takes") for line in told if "closer look " in line][:2] == [False, True]
     for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
         assert replace(path, decision=other).best_place_in_words() == ""
     assert replace(path, closer=(), detections=(look(), look())).best_place_in_words() == ""
+
+
+def test_looks_tell_the_target_first_and_count_detections_from_one_score_on():
+    """However faint it is; what is fainter than 0.1 is told and counted nowhere else."""
+    seen = look((LEFT, 2, 0.8), (RIGHT, 2, 0.5), (shifted(RIGHT, 4), 2, 0.3), (shifted(LEFT, 4), 1, 0.06))
+    classes = list(CLASSES)
+    assert detections_in_words(seen, classes, 2) == "cat 0.80, cat 0.50 and 1 more"
+    assert detections_in_words(seen, classes, 2, target=1) == "cup 0.06 in 14,14–34,34, cat 0.80 and 2 more"
+    assert detections_in_words(seen, classes, target=2) == "cat 0.80 in 10,10–30,30, cat 0.50, cat 0.30"
+    assert detections_in_words(look(), classes, target=1) == detections_in_words(look((LEFT, 1, 0.09)), classes)
+    path = scanpath(seen, look((LEFT, 1, 0.09)), target=1)
+    assert [row["detections"] for row in path.rows()] == [3, 0]
+    assert [row["seen"] for row in path.rows()] == ["cat", None]
+    fixations = episode_data(path, None, None, name="a")["fixations"]
+    assert [len(each["detections"]) for each in fixations] == [3, 0]
 
 
 def test_the_text_form_tells_where_the_objects_are():

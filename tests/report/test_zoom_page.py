@@ -208,7 +208,11 @@ def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_p
     path = replace(zoom_path, decision=Decision("undecided", 0.6), ending="passes")
     place = path.best_place_in_words()
     assert place
-    assert f" {place.capitalize()}." in zoom_data(path, large_picture, name="field.png")["decision"]
+    data = zoom_data(path, large_picture, name="field.png")
+    assert f" {place.capitalize()}." in data["decision"]
+    assert data["best"] == path.best_place[0].tolist()
+    assert len(Elements(page_html("t", [data])).of("best")) == 1
+    assert not Elements(page_html("t", [zoom_data(zoom_path, large_picture, name="field.png")])).of("best")
 
 
 def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpath, image):

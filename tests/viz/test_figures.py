@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import Axes3D
 
 from semfov import Detections, Grid, Scanpath
-from semfov.decision import Decision
+from semfov.decision import CloseUp, Decision
 from semfov.viz import (
     COLOURS,
     plot_belief,
@@ -132,6 +132,20 @@ def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
         assert [line.get_linestyle() for line in near] == [box.get_linestyle()]
     (bare,) = draw(plot_scanpath(scanpath, image, objects=False)).axes
     assert bare.get_legend() is None
+
+
+def test_the_best_place_of_an_undecided_search_is_told_apart_from_other_closer_looks(scanpath, image):
+    places = ([50.0, 40, 70, 55], 0.26), ([5.0, 5, 20, 20], 0.2)
+    closer = tuple(CloseUp(0, 1, 0, torch.tensor(box), place, 0.8) for box, place in places)
+    path = replace(scanpath, decision=Decision("undecided", 0.8), ending="decision", closer=closer, least=0.9)
+    for shown, expected in ((path, ["--", ":"]), (replace(path, closer=closer[:1]), ["--"])):
+        (axes,) = draw(plot_scanpath(shown, image)).axes
+        best = [box for box in axes.patches if box.get_linestyle() == "--"]
+        assert [box.get_bbox().extents.tolist() for box in best] == [places[0][0]]
+        assert "best place 0.26" in [text.get_text() for text in axes.texts]
+        assert [line.get_linestyle() for line in axes.get_legend().get_lines()] == expected
+    (early, *_) = draw(plot_fixation(path, 0, image, image)).axes
+    assert not [box for box in early.patches if box.get_linestyle() == "--"]
 
 
 def test_belief_refuses_unknown_fixations_and_targets(scanpath):
