@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 	$(patsubst %,tests/head/test_%.py,belief modules world) \
-	$(patsubst %,tests/zoom/test_%.py,belief certainty modules survey)
+	$(patsubst %,tests/zoom/test_%.py,belief decision modules survey)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup search test numeric library lab app test-all test-quick gpu coverage mutation docs lint types constraints clean

@@ -1,9 +1,16 @@
-"""Scenes seen through a window: conversion of points, poses that cover the scene, boxes as regions."""
+"""The world of a head: its views, panoramas of photographs, and how fast eye and head are."""
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional as F
 
-from semfov.head import Flat, Panorama
+from semfov import EmbeddedScenes, InputError, TargetEvidence
+from semfov.belief.observers import Target
+from semfov.head import Flat, Panorama, Panoramas, PerSecond, SearchGain, Speeds
+from semfov.head.belief import SceneObserver
+from semfov.head.gain import OUT
 from semfov.head.views import Views
 from semfov.sensor import glimpse, perspective
 from tests.refusals import refused
@@ -135,3 +142,135 @@ def test_windows_beyond_a_picture_are_refused():
     refused("pose: expected a window inside 64 × 48 pixels", flat.look_at, (-16.0, 0.0), 20.0)
     refused("field: expected a window inside the picture", flat.poses, 60.0)
     refused("fields: expected", Views, flat, (30.0, 20.0))
+
+
+CLASSES = ("person", "cat", "cup")
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return EmbeddedScenes(CLASSES, count=5)
+
+
+@pytest.mark.slow
+def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
+    panoramas = Panoramas(scenes, width=1024, count=1)
+    panorama = panoramas[0].image[None]
+    for patch in panoramas.patches(0):
+        seen = perspective(panorama, torch.tensor([patch.pose]), (160, 120))[0]
+        photograph = F.interpolate(scenes[patch.scene].image[None], (120, 160), mode="bilinear", antialias=True)[0]
+        inner = slice(3, -3)
+        apart = (seen - photograph)[:, inner, inner].abs()
+        assert apart.mean() < 0.02
+        # Another photograph differs much more.
+        other = scenes[(patch.scene + 1) % 5].image[None]
+        other = F.interpolate(other, (120, 160), mode="bilinear", antialias=True)[0]
+        assert (seen - other)[:, inner, inner].abs().mean() > 3 * apart.mean()
+
+
+def test_regions_match_the_boxes_of_the_photographs(scenes):
+    """A camera that looks at a patch sees each object where the photograph has it."""
+    panoramas = Panoramas(scenes, width=512, count=2, seed=4)
+    regions, labels = panoramas.regions(1), panoramas.annotation(1).labels
+    start = 0
+    from semfov.sensor.sphere import Camera
+
+    for patch in panoramas.patches(1):
+        annotation = scenes.annotation(patch.scene)
+        own = regions[torch.arange(start, start + len(annotation.boxes))]
+        assert torch.equal(labels[start : start + len(own)], annotation.labels)
+        start += len(own)
+        corners = own.samples(2)
+        camera = Camera(torch.tensor(patch.pose), (640, 480))
+        points, _ = camera.points(corners.flatten(0, 1))
+        seen = points.view(-1, 4, 2) + 0.5
+        scale = torch.tensor([640 / annotation.size[0], 480 / annotation.size[1]]).repeat(2)
+        expected = annotation.boxes * scale
+        torch.testing.assert_close(torch.cat([seen[:, 0], seen[:, 3]], -1), expected, atol=1e-2, rtol=0)
+    assert start == len(regions)
+
+
+def test_a_seed_repeats_a_panorama_and_uses_each_photograph_once(scenes):
+    one, same, other = (Panoramas(scenes, rings=((0.0, 5),), width=256, count=3, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one[2].image, same[2].image)
+    assert one.fingerprint == same.fingerprint != other.fingerprint
+    assert one.digest(2) == same.digest(2) != one.digest(1)
+    assert one.patches(0) != other.patches(0)
+    assert sorted(patch.scene for patch in one.patches(0)) == [0, 1, 2, 3, 4]
+
+
+def test_no_two_photographs_overlap(scenes):
+    from semfov.sensor.sphere import Camera, Regions
+
+    patches = Panoramas(scenes, width=256, count=1).patches(0)
+    slots = Regions(torch.tensor([p.box for p in patches]), Camera(torch.tensor([p.pose for p in patches]), (640, 480)))
+    held = slots.contain(slots.samples(21).flatten(0, 1)).view(len(patches), len(patches), -1)
+    for number in range(len(patches)):
+        others = torch.cat([held[number, :number], held[number, number + 1 :]])
+        assert not others.any()
+
+
+def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
+    panoramas = Panoramas(scenes, width=1024, count=1)
+    annotation = panoramas.annotation(0)
+    assert annotation.size == (1024, 512)
+    assert (annotation.boxes[:, 2:] > annotation.boxes[:, :2]).all()
+    assert (annotation.boxes[:, 0] >= 0).all()
+    assert (annotation.boxes[:, 0] <= 1024).all()
+    assert panoramas.targets(0) == sorted(set(annotation.labels.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"width": 101}, "width"), ({"slot": 180.0}, "slot"), ({"rings": ((95.0, 1),)}, "rings"), ({"count": 0}, "count")],
+)
+def test_invalid_settings_are_refused(scenes, settings, message):
+    with pytest.raises(InputError, match=message):
+        Panoramas(scenes, **settings)
+
+
+@given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
+def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, speed, acceleration):
+    found = float(Speeds(head=speed, acceleration=acceleration).turn(torch.tensor(angle, dtype=torch.float64)))
+    # Step by step: accelerate as long as there is room to brake.
+    step, time, done, pace = found / 20_000, 0.0, 0.0, 0.0
+    while done < angle and time < 2 * found:
+        braking = pace**2 / (2 * acceleration) >= angle - done
+        pace = max(pace - acceleration * step, 1e-9) if braking else min(pace + acceleration * step, speed)
+        done, time = done + pace * step, time + step
+        if braking and pace <= acceleration * step:
+            break
+    assert time == pytest.approx(found, rel=0.01)
+
+
+def test_durations_of_movements_follow_the_main_sequence_and_settling():
+    speeds = Speeds()
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
+    none = torch.tensor(0.0)
+    assert float(speeds.duration(none, none, none)) == speeds.look
+    assert float(speeds.duration(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
+    assert float(speeds.duration(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
+    assert float(speeds.duration(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
+    # 21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time.
+    found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
+    plain, slow, none = Speeds(), Speeds(settle=0.4), torch.tensor(0.0)
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-1.0)
+    for moved, later in (((eye, none, none), 0.0), ((eye, head, none), 0.4), ((none, none, zoom), 0.4)):
+        assert float(slow.duration(*moved) - plain.duration(*moved)) == pytest.approx(later)
+
+
+def test_turns_within_the_dead_zone_are_not_made():
+    views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    every = range(len(views))
+    for dead_zone in (0.0, 15.0, 25.0):
+        gain = PerSecond(SearchGain(views), Speeds(dead_zone=dead_zone), 55, every)
+        made = (gain(belief, torch.zeros(1, len(views.grid), dtype=torch.bool))[0] > OUT).unflatten(0, (-1, 100)).any(1)
+        turns = (views.poses[:, :2] - views.poses[0, :2]).norm(dim=-1)
+        assert made.tolist() == [turn == 0 or turn >= dead_zone for turn in turns.tolist()]
+
+
+@pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])
+def test_invalid_speeds_are_refused(settings):
+    refused(next(iter(settings)), Speeds, **settings)

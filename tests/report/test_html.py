@@ -1,9 +1,11 @@
-"""Pages contain the computed results in one file, and names are never interpreted as markup."""
+"""Pages of episodes and of places of gaze, and views in a notebook: well-formed, with the numbers of records."""
 
 import base64
+import html
 import io
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -11,13 +13,20 @@ import torch
 from PIL import Image
 
 from eval.comparison.curves_html import curves_html
-from semfov import Detections
+from semfov import Detections, Grid
 from semfov.decision import Decision
-from semfov.report import page_html, write_page
+from semfov.detection import Placement
+from semfov.gaze.saliency import FixationDensity
+from semfov.paths import GazePrediction
+from semfov.paths.stimulus import Stimulus, in_bytes
+from semfov.report import notebook, page_html, write_page
 from semfov.report.episode import episode_data
+from semfov.report.gaze import gaze_part, write_gaze_page
 from semfov.report.page import table_html
 from tests import small
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
+from tests.report.test_browser import axe, chromium, pytestmark, watched  # noqa: F401
+from tests.small import rand
 
 
 @pytest.fixture
@@ -204,3 +213,185 @@ def test_the_page_contains_the_outcome(scanpath, image):
         assert data["outcome"] == {"why": ended.why_it_ended(), "cell": None, "box": None}
         assert data["outcome"]["why"].endswith(".")
     assert replace(scanpath, ending=None).why_it_ended() == ""
+
+
+def predicted(name, size=(104, 78), seed=0):
+    torch.manual_seed(seed)
+    model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
+    model.oculomotor.saccade.normal_(0, 0.5)
+    terms = {"map": 4 * torch.randn(1, 39, 52), "centre bias": -rand(1, 39, 52)}
+    return GazePrediction(model, terms, size, (rand(3, 78, 104) * 255).byte(), name)
+
+
+def drawn(name, seed=0):
+    prediction = predicted(name, seed=seed)
+    return gaze_part(prediction, prediction.scanpaths(5, seed=seed))
+
+
+@pytest.fixture
+def opened(chromium, hostile, tmp_path):  # noqa: F811
+    """The page of two pictures."""
+    pictures = [drawn(hostile), drawn("b.png", seed=1)]
+    path = write_gaze_page(tmp_path / "gaze.html", f"where people look in {hostile}", pictures)
+    with watched(chromium, path) as page:
+        yield page
+
+
+def circles(page):
+    return page.locator("#drawing circle").count()
+
+
+def heat(page):
+    return page.locator("#map").evaluate("each => each.toDataURL()")
+
+
+def test_the_slider_steps_through_the_fixations(opened):
+    most = int(opened.locator("#fixation").get_attribute("max"))
+    assert opened.locator("#number").inner_text() == f"0 of {most}"
+    assert circles(opened) == 0
+    before = heat(opened)
+    opened.keyboard.press("ArrowRight")
+    assert opened.locator("#number").inner_text() == f"1 of {most}"
+    assert circles(opened) == 5
+    assert heat(opened) != before
+    assert "after 1 fixation," in opened.locator("#status").inner_text()
+    opened.keyboard.press("End")
+    assert opened.locator("#forward").is_disabled()
+    opened.keyboard.press("Home")
+    assert heat(opened) == before
+
+
+def test_one_viewer_can_be_followed(opened):
+    """By the list and by keys, up to the viewer's own last fixation."""
+    lengths = [len(each) for each in predicted("a.png").scanpaths(5, seed=0)]
+    most = int(opened.locator("#fixation").get_attribute("max"))
+    opened.keyboard.press("ArrowDown")
+    opened.keyboard.press("ArrowDown")
+    assert opened.locator("#who").input_value() == "2"
+    opened.keyboard.press("End")
+    assert opened.locator("#number").inner_text() == f"{min(lengths[1], most)} of {min(lengths[1], most)}"
+    assert circles(opened) == min(lengths[1], most)
+    assert opened.locator("#status").inner_text().startswith("Viewer 2. ")
+    opened.locator("#who").select_option(label="viewer 5")
+    assert circles(opened) <= lengths[4]
+    opened.locator("#picture").select_option(label="b.png")
+    assert opened.locator("#who").input_value() == "5"
+    opened.locator("#who").select_option(label="all viewers")
+    assert not opened.locator("#status").inner_text().startswith("Viewer")
+
+
+def test_layers_can_be_switched(opened):
+    opened.keyboard.press("ArrowRight")
+    opened.locator("#paths").uncheck()
+    assert circles(opened) == 0
+    assert opened.locator("#drawing .contour").count() == 0
+    opened.locator("#contours").check()
+    assert opened.locator("#drawing .contour").count() == 6
+    opened.locator("#heat").uncheck()
+    assert not opened.locator("#map").is_visible()
+
+
+def test_another_picture_can_be_chosen(opened, hostile):
+    before = heat(opened)
+    assert opened.locator("#facts-0").is_visible()
+    opened.locator("#picture").select_option(label="b.png")
+    assert heat(opened) != before
+    assert opened.locator("#facts-1").is_visible()
+    assert not opened.locator("#facts-0").is_visible()
+    assert opened.locator("#image").get_attribute("alt") == "b.png"
+
+
+def test_the_heat_map_has_the_densities(opened):
+    """The most opaque pixel is the cell of the largest probability."""
+    cells = predicted("b.png").cells
+    context = 'each.getContext("2d").getImageData(0, 0, each.width, each.height).data'
+    read = f"each => [...{context}].filter((_, n) => n % 4 == 3)"
+    opacity = torch.tensor(opened.locator("#map").evaluate(read)).view(39, 52)
+    assert int(opacity.max()) == int(opacity.flatten()[cells.argmax()])
+    assert float(torch.corrcoef(torch.stack([opacity.flatten().float(), cells.flatten()]))[0, 1]) > 0.6
+
+
+def test_it_fits_a_phone_and_is_accessible(opened):
+    opened.set_viewport_size({"width": 360, "height": 700})
+    assert opened.evaluate("document.documentElement.scrollWidth") <= 360
+    results = axe.Axe().run(opened)
+    assert [each["id"] for each in results.response["violations"]] == []
+
+
+def test_play_goes_to_the_end(opened):
+    opened.locator("#play").click()
+    assert opened.locator("#play").inner_text() == "Pause"
+    opened.locator("#play").click()
+    assert opened.locator("#play").inner_text() == "Play"
+
+
+class Frame(HTMLParser):
+    """The elements in the output of a cell."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+
+def with_photograph(scanpath, image):
+    """The scanpath with its photograph."""
+    height, width = image.shape[-2:]
+    sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
+    settings = {"sensor": sensor, "detector": {"name": "none"}}
+    placement = Placement((80, 60), (width / 80, height / 60), (0, 0))
+    pixels = in_bytes(image)
+    return replace(scanpath, photograph=pixels, stimulus=Stimulus(pixels, placement, settings))
+
+
+def test_the_frame_contains_the_page(scanpath, image, hostile):
+    text = with_photograph(scanpath, image)._repr_html_()
+    ((tag, attributes),) = Frame(text).tags
+    assert tag == "iframe"
+    assert attributes["sandbox"] == "allow-scripts"
+    assert hostile in attributes["title"]
+    page = attributes["srcdoc"]
+    assert page.startswith("<!DOCTYPE html>")
+    data = data_of(page)
+    (episode,) = data["episodes"]
+    assert len(episode["fixations"]) == 3
+    assert (episode["name"], episode["detector"]) == ("80 × 60 px", "none")
+    assert len(data["pictures"]) == 4
+    assert html.unescape(re.search('srcdoc="([^"]*)"', text)[1]) == page
+
+
+def test_without_a_photograph_there_are_no_pictures(scanpath):
+    page = Frame(scanpath._repr_html_()).tags[0][1]["srcdoc"]
+    data = data_of(page)
+    assert data["pictures"] == []
+    assert data["episodes"][0]["image"] is None
+    assert data["episodes"][0]["detector"] is None
+
+
+def scanpath_of(looks, columns, classes):
+    grid = Grid(columns, columns, (80, 60))
+    names = ("background", *(f"class {number}" for number in range(classes)))
+    return small.scanpath(grid, torch.arange(looks) % len(grid), names, target=1)
+
+
+@pytest.mark.parametrize(
+    ("looks", "columns", "classes", "size", "shown"),
+    [(31, 10, 80, 200, True), (120, 10, 80, 416, True), (31, 40, 80, 200, True), (900, 40, 2, 20, False)],
+)
+def test_the_size_of_the_output_is_limited(looks, columns, classes, size, shown):
+    """If the output is too large: coarser pictures and fewer classes, then only text."""
+    noise = torch.rand(3, size * 3 // 4, size)
+    text = with_photograph(scanpath_of(looks, columns, classes), noise)._repr_html_()
+    assert len(text.encode()) <= notebook._MOST_CHARACTERS
+    if shown:
+        episode = data_of(Frame(text).tags[0][1]["srcdoc"])["episodes"][0]
+        assert len(episode["fixations"]) == looks
+        labels = [each["label"] for each in episode["maps"]]
+        assert labels[0] == "class 0"
+        assert labels[-1] == "background"
+    else:
+        assert Frame(text).tags == [("pre", {})]
+        assert "class 0" in text

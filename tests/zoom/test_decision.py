@@ -1,24 +1,45 @@
-"""Deciding whether a large picture holds a class: features of a search, and decisions."""
+"""Whether a large picture holds a class, probabilities of its objects, and numbers of those not shown."""
 
+import json
 import math
+from dataclasses import replace
+from itertools import islice, product
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import nbinom
 from torch.nn import functional as F
 
-from semfov.agents import ZoomAgent
+from semfov import Detections, EmbeddedScenes, Objects, WindowEye, ZoomAgent
 from semfov.belief.target_evidence import Thresholds
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES, settle
+from semfov.detection.objects import unlike
 from semfov.fit.windows import _fit_judge, _judge_searches, _Searches
+from semfov.fit.windows_certainty import (
+    _fit_unseen,
+    _Numbers,
+    explorations_of_kinds,
+    fit_spread,
+    logistic_regression,
+)
 from semfov.metrics.calibration import calibration_error
-from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.paths import ZoomPath
+from semfov.runs.window_looking import right_boxes
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom import GlimpseEvidence, Lattice
+from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.decision import SearchFacts
-from semfov.zoom.episode import look_for
+from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import CASE, features
-from semfov.zoom.glances import LiveGlances
+from semfov.zoom.glances import Glance, LiveGlances, Window
 from semfov.zoom.lattice import CELLS
+from semfov.zoom.objects import _object_facts, merge, merge_with_facts
+from tests.refusals import refused
+from tests.small import Tiles, area, iou, shared
 
 SHARE = st.floats(0, 1, width=32)
 
@@ -157,3 +178,264 @@ def test_a_fitted_probability_is_calibrated():
     assert "ECE" in rows[0]
     sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
     assert sure[~new.there].double().mean() <= 0.05
+
+
+SCALES = torch.tensor([0.25, 0.5, 1.0, 0.5])
+WINDOWS = torch.tensor([[0.0, 0, 400, 300], [0, 0, 200, 200], [50, 50, 150, 150], [100, 100, 300, 300]])
+SIZE = (400, 300)
+
+
+def logit(score):
+    score = min(max(score, 0.01), 0.999)
+    return math.log(score / (1 - score))
+
+
+def visible(box, look):
+    window, edge, scale = WINDOWS[look].tolist(), 2 / float(SCALES[look]), float(SCALES[look])
+    low = [n + edge if n > 0 else -math.inf for n in window[:2]]
+    high = [n - edge if n < side else math.inf for n, side in zip(window[2:], SIZE, strict=True)]
+    inside = box[0] >= low[0] and box[1] >= low[1] and box[2] <= high[0] and box[3] <= high[1]
+    return inside and math.sqrt(area(box)) * scale >= 6
+
+
+def shown_in(number, look, boxes, scores, labels, looks, cut):
+    """Best score with which a look shows an object, and the overlaps of other whole boxes with it."""
+    box, best, overlaps = boxes[number], scores[number] if looks[number] == look else 0, []
+    for other in range(len(boxes)):
+        if looks[other] == look and labels[other] == labels[number] and other != number:
+            whole = iou(box, boxes[other]) >= 0.5
+            part = (
+                cut[other] and looks[other] != looks[number] and shared(box, boxes[other]) >= 0.8 * area(boxes[other])
+            )
+            best = max(best, scores[other]) if whole or part else best
+            overlaps += [iou(box, boxes[other])] if whole and not cut[other] else []
+    return best, overlaps
+
+
+def plain_facts(kept, boxes, scores, labels, looks, cut, latest):
+    """The facts of object after object, look after look."""
+    rows, bests = [], []
+    for number in kept:
+        box = boxes[number]
+        seen = [look for look in range(len(SCALES)) if visible(box, look)]
+        if latest:
+            seen = [n for n in seen if not any(m > n and SCALES[m] >= SCALES[n] for m in seen)]
+        told = [shown_in(number, look, boxes, scores, labels, looks, cut) for look in range(len(SCALES))]
+        best = [score for score, _ in told]
+        use = [look for look in range(len(SCALES)) if best[look] > 0 or look in seen]
+        agreement = [each for _, overlaps in told for each in overlaps]
+        finest = max(float(SCALES[look]) for look in use)
+        sharpest = max(logit(best[look]) for look in use if SCALES[look] == finest)
+        size = (math.log2(math.sqrt(area(box))) + math.log2(finest) - 5) / 2
+        mean = sum(agreement) / len(agreement) - 0.6 if agreement else 0
+        missed = sum(best[look] == 0 for look in seen)
+        bests.append(logit(max(best)))
+        numbers = math.log1p(sum(score > 0 for score in best)), math.log1p(missed)
+        first = logit(scores[number]), bests[-1], sharpest, *numbers, float(cut[number])
+        rows.append([*first, size, size**2, mean, 0, 0, 0, -math.log2(finest), 0])
+    for (one, number), (other, rival) in product(enumerate(kept), repeat=2):
+        if (bests[other], -other) <= (bests[one], -one):
+            continue
+        weight, box, better = 1 / (1 + math.exp(-bests[other])), boxes[number], boxes[rival]
+        both, overlap = shared(box, better), iou(box, better)
+        alike = (9, overlap), (10, both / area(box)), (11, both / area(better))
+        for place, value in alike if labels[number] == labels[rival] else ((13, overlap),):
+            rows[one][place] = max(rows[one][place], weight * value)
+    return rows
+
+
+@pytest.mark.parametrize("latest", [False, True])
+def test_facts_equal_a_plain_loop(latest, dtype):
+    generator = torch.Generator().manual_seed(3)
+    count = 60
+    corner = 40 + torch.rand(count, 2, generator=generator) * 90
+    boxes = torch.cat([corner, corner + 8 + torch.rand(count, 2, generator=generator) * 50], -1).to(dtype)
+    scores = (0.06 + 0.9 * torch.rand(count, generator=generator)).to(dtype)
+    labels = torch.randint(1, 3, (count,), generator=generator)
+    looks, cut = torch.randint(0, 4, (count,), generator=generator), torch.rand(count, generator=generator) < 0.3
+    kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
+    assert 5 < len(kept) < count - 5
+    every = boxes, scores, labels, looks, cut
+    facts = _object_facts(kept, every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
+    plain = plain_facts(kept.tolist(), *(each.tolist() for each in every), latest)
+    assert facts.shape == (len(kept), len(FACTS))
+    torch.testing.assert_close(facts, torch.tensor(plain), rtol=1e-4, atol=1e-4)
+    assert (facts.std(0) > 0).all()  # every fact differs between these objects
+
+
+def test_objects_have_the_facts_of_their_looks():
+    lattice = Lattice.over((1280, 960), (160, 160))
+
+    def look(level, box, score):
+        vectors = torch.tensor([[[1 - score, score, 0.0]]])
+        seen = Detections(torch.tensor([[box]]), vectors, torch.ones(1, 1, dtype=torch.bool))
+        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
+
+    near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
+    faint = look(2, [21.0, 20, 90, 92], 0.04)
+    objects, facts = merge_with_facts([far, near, faint], lattice)
+    sharp = merge([far, near, faint])
+    assert objects.scores.tolist() == sharp.scores.tolist()
+    weights = torch.tensor([0.9, 0.6 / 4**2])  # two octaves, of which each has a quarter of the pixels
+    mean = weights / weights.sum() @ torch.tensor([[20.0, 20, 90, 90], [22.0, 20, 92, 91]])
+    torch.testing.assert_close(objects.boxes, mean[None])
+    assert merge_with_facts([far, near], lattice, latest=True)[0].boxes.tolist() == sharp.boxes.tolist()
+    told = dict(zip(FACTS, facts[0].tolist(), strict=True))
+    assert told["score"] == told["best"] == told["sharpest"] == pytest.approx(logit(0.9))
+    assert told["shown"] == pytest.approx(math.log(3))
+    assert told["missed"] == pytest.approx(math.log(2))  # a box of so low a score is none
+    assert merge_with_facts([], lattice)[1].shape == (0, len(FACTS))
+
+
+@pytest.mark.parametrize(("x", "count"), [(60.0, 1), (30.0, 2)])
+def test_a_cut_box_is_the_same_object_from_half_of_its_area_on(x, count):
+    """The finest window of 160 pixels cuts a box from x on, of which 60 pixels lie in one that another look shows."""
+    lattice = Lattice.over((1280, 960), (160, 160))
+
+    def look(level, box, cut):
+        seen = Detections(torch.tensor([[box]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool))
+        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
+
+    whole = look(1, [100.0, 20, 300, 90], False)
+    objects, _ = merge_with_facts([whole, look(3, [x, 20.0, 160, 90], True)], lattice)
+    assert len(objects) == count
+    assert objects.boxes[objects.passes == 0].tolist() == [[100.0, 20, 300, 90]]  # the cut box does not count for it
+
+
+def test_what_further_looks_show_is_fitted_by_the_number_in_all():
+    """Pictures whose looks show half of what clear cells promise, and nothing else, teach this."""
+
+    class Exploration:
+        target, looks = None, 9
+
+        def __init__(self, clear, faint):
+            self.remaining = [(clear * (1 - n / 8), faint) for n in range(9)]
+            self.promised = [clear * n / 8 for n in range(9)]
+            self.after = [1 + clear / 2 * n / 8 for n in range(9)]
+
+        def sums(self, certainty, number):
+            return self.after[0], self.after[number - 1]
+
+    fitted = _fit_unseen(
+        Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]
+    )
+    for clear, faint in ((10.0, 30.0), (4.0, 5.0)):
+        assert fitted.unseen((clear, faint), promised=0.0, discoveries=0.0)[0] == pytest.approx(clear / 2, rel=0.15)
+        after = fitted.unseen((clear / 2, faint), promised=clear / 2, discoveries=clear / 4)[0]
+        assert after == pytest.approx(clear / 4, rel=0.15)
+
+
+def test_the_spread_covers_four_of_five_pictures():
+    """Pictures whose number is off by a share that is uniform from 0 to 1/2 or 1: four fifths of the most."""
+    for most, spread in ((0.5, 0.2), (1.0, 0.4)):
+        mean = torch.full((200,), 20.0).double()
+        shown = mean * (1 + most * torch.linspace(-1, 1, 200).double())
+        kinds = {("mosaics", 8): _Numbers(mean, torch.zeros(200).double(), shown)}
+        assert fit_spread(kinds)[0] == pytest.approx(spread)
+        # A kind whose numbers are right needs less, and both count as much.
+        kinds["scattered", 8] = _Numbers(mean, torch.ones(200).double(), mean)
+        assert fit_spread(kinds)[0] == pytest.approx(0.15 if most == 0.5 else 0.3)
+    few = _Numbers(*(each[:30] for each in kinds["scattered", 8]))
+    assert fit_spread({("scattered", 8): few})[0] == pytest.approx(SPREAD)
+
+
+def test_the_spread_is_fitted_on_the_numbers_of_records():
+    eye = WindowEye(Tiles(name="bright"))
+    mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 4, 4, tile=(96, 72), count=1)
+    certainty = Certainty(2.0, (1.0, *[0.0] * (len(FACTS) - 1)), scale=0.5, strength=2.0)
+    torch.manual_seed(0)
+    evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()
+    glances = StoredGlances(eye, mosaics, 0, None)
+    _, sought = explorations_of_kinds(evidence, {"mosaics": (mosaics, [glances])}, 4)["mosaics"]
+    looked = [turn.glance for turn in islice(find_everything(glances, evidence, sought.target), 8)]
+    right = right_boxes(merge_with_facts(looked, glances.lattice, sought.target)[0], mosaics.annotation(0))
+    assert sought.held == int((mosaics.annotation(0).labels == sought.target).sum())
+    assert torch.equal(sought.objects[sought.looks][1], right)
+    for passes in (2, 4):
+        record = ZoomAgent(eye, evidence).find_all(mosaics[0].image, sought.target, passes=passes, worth=0.0)
+        (expected,), (error,) = record.expected.values(), replace(record, spread=0.0).expected_error.values()
+        assert sought.number(certainty, passes) == pytest.approx((expected, error**2), rel=1e-5)
+    assert sought.number(replace(certainty, offset=-9.0), 4) is None
+
+
+def test_probabilities_of_the_fit_maximise_the_likelihood():
+    generator = torch.Generator().manual_seed(0)
+    facts = torch.randn(500, len(FACTS), generator=generator)
+    right = torch.rand(500, generator=generator) < facts[:, 0].sigmoid()
+    parameters = torch.tensor(logistic_regression(facts, right), dtype=torch.float64, requires_grad=True)
+    inputs = torch.cat([torch.ones(500, 1), facts], -1).double()
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(inputs @ parameters, right.double(), reduction="sum")
+    empty = parameters[0].sigmoid()
+    loss = loss + 0.5 * parameters[1:].square().sum() - 0.5 * (empty * (1 - empty)).log()
+    (gradient,) = torch.autograd.grad(loss, parameters)
+    assert gradient.abs().max() < 1e-3
+    assert all(map(math.isfinite, logistic_regression(facts, torch.ones(500, dtype=torch.bool))))
+
+
+def test_what_no_look_has_shown_is_negative_binomial():
+    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0, faint=0.25, promise=0.4)
+    mean, variance = certainty.unseen((5.0, 4.0), promised=25.0, discoveries=3.0)
+    shape, rate = 4 * 0.5 + 3, 4 + 10
+    law = nbinom(shape, rate / (rate + 6))
+    assert mean == pytest.approx(law.mean())
+    assert variance == pytest.approx(law.var())
+    assert certainty.unseen((0.0, 0.0), promised=10.0, discoveries=3.0) == (0.0, 0.0)
+    assert Certainty.of(certainty.numbers) == certainty
+    assert Certainty.of([*certainty.numbers[:-1], 0.7]) == replace(certainty, spread=0.7)
+    plain = replace(certainty, faint=1.0, promise=1.0)  # all cells and promises count in full
+    assert plain.unseen((2.0, 4.0), promised=10.0, discoveries=3.0) == pytest.approx((law.mean(), law.var()))
+    refused("certainty: expected 2 or 20 numbers, got 3", Certainty.of, [1.0, 2.0, 3.0])
+
+
+def test_boxes_are_right_once_and_crowds_are_neither():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 9], [0, 0, 10, 10], [41, 41, 49, 49], [80, 80, 90, 90]])
+    found = Objects(
+        boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), torch.tensor([1, 1, 2, 1, 1]), torch.zeros(5).long()
+    )
+    there = torch.tensor([[0.0, 0, 10, 10], [40, 40, 60, 60]])
+    crowd = torch.tensor([False, True])
+    annotation = Annotation(there, torch.tensor([1, 1]), crowd, (100, 100))
+    assert right_boxes(found, annotation).tolist() == [1, 0, 0, -1, 0]
+
+
+@pytest.fixture
+def path(detector, picture):
+    torch.manual_seed(0)
+    weights = (1.0, *[0.0] * (len(FACTS) - 1))
+    evidence = GlimpseEvidence(3, 8, certainty=Certainty(3.0, weights, scale=0.5, strength=2.0))
+    return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, passes=4)
+
+
+def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
+    assert path.least == 0.5
+    assert (path.objects.scores >= 0.5).all()  # the overview shows none with such a score
+    assert path.unseen[0] > 0
+    assert path.spread == SPREAD
+    chances = path.candidates.scores.double()
+    assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
+    variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
+    variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
+    assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
+    assert path.describe() == "1 object from probability or score 0.5 in 4 passes"
+    path.save(tmp_path / "a.safetensors")
+    loaded = ZoomPath.load(tmp_path / "a.safetensors")
+    assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
+    assert len(replace(path, least=0.0).objects) == len(path.candidates)
+    assert all(math.isnan(each) for each in replace(path, unseen=None).expected_error.values())
+
+
+def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
+    old = GlimpseEvidence(3, 8)
+    record = json.loads(json.dumps({**old._record(), "certainty": [-0.9, 1.1], "metadata": {}}))
+    certainty = GlimpseEvidence._restore(record, dict(old.state_dict())).certainty
+    facts = torch.randn(7, len(FACTS))
+    torch.testing.assert_close(certainty.probability(facts), (-0.9 + 1.1 * facts[:, 0]).sigmoid())
+    assert certainty.numbers == [-0.9, 1.1]
+
+
+def test_the_least_probability_can_be_chosen(detector, picture):
+    agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
+    assert agent.find_all(picture, "red", passes=2).least == 0.3  # scores, without a certainty
+    assert agent.find_all(picture, "red", passes=2, least=0.7).least == 0.7
+    assert agent.explore(picture, passes=2, least=0.6).least == 0.6
+    refused("least", agent.find_all, picture, "red", least=1.5)

@@ -92,7 +92,7 @@ def test_the_same_bits_from_two_workers(finished, tmp_path):
 
 
 SHARE = {"no store": ("eval.search",), "small batches": ()}
-"""Commands that are enough: `lab/test_zoom` has the other store, and the tests of the protocols have batches."""
+"""Commands that are enough: `lab/test_scenes` has the other store, and the tests of the protocols have batches."""
 
 
 @pytest.mark.parametrize(
