@@ -5,12 +5,10 @@ import gc
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, nullcontext
 from functools import partial, wraps
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -134,34 +132,6 @@ def pytest_runtest_protocol() -> Generator[None, object, object]:
         return (yield)
     finally:
         torch.set_num_threads(before)
-
-
-@pytest.fixture
-def kill_when() -> Iterator[Callable[..., None]]:
-    """Start a command and kill it (SIGKILL) as soon as a condition is met.
-
-    The test fails if the command ended before it could be killed, or if the condition was not met in time.
-    """
-    started: list[subprocess.Popen[bytes]] = []
-
-    def kill(call: Sequence[str], happened: Callable[[], Any], *, seconds: float = 300, **options: Any) -> None:
-        process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options)
-        started.append(process)
-        deadline = time.monotonic() + seconds
-        while not happened():
-            if process.poll() is not None:
-                pytest.fail(f"nothing to kill: the command ended with exit code {process.returncode}")
-            if time.monotonic() > deadline:
-                pytest.fail(f"nothing was killed: the condition was not met within {seconds} s")
-            time.sleep(0.01)
-        process.kill()
-        if process.wait() != -signal.SIGKILL:
-            pytest.fail(f"nothing to kill: the command had ended with exit code {process.returncode}")
-
-    yield kill
-    for process in started:
-        process.kill()
-        process.wait()
 
 
 FRESH = """

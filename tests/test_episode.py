@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, InputError, Selection, TargetEvidence
+from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, Selection, TargetEvidence
 from semfov.belief.observers import Semantic, Target
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from
 from semfov.gaze.policies import Policy
+from tests.refusals import refused
 from tests.small import Coloured, tensors
 
 GRID = Grid(3, 2, (90, 60))
@@ -236,8 +237,7 @@ def test_stored_looks_are_weighed_only_once_by_each_observer_and_target():
 def test_an_observer_of_targets_without_a_target_is_refused():
     looks = LiveLooks(*live(), GRID)
     steps = rollout(looks, Target(evidence()), Uniform(), START, Greedy(drawn_from(NOISE)), most=2)
-    with pytest.raises(InputError, match="target: expected a class to search for"):
-        list(steps)
+    refused("target: expected a class to search for", list, steps)
 
 
 def live():

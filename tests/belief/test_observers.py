@@ -333,8 +333,7 @@ def test_belief_has_a_probability_for_every_class(random_looks, toy_map):
         assert torch.equal(several[row], belief.probabilities[row, :, target])
     assert torch.equal(belief.chance(2), belief.probability(2))
     assert torch.equal(belief.presence(2), belief.probability(2).amax(-1))
-    with pytest.raises(InputError, match="target"):
-        belief.probability(5)
+    refused("target", belief.probability, 5)
 
 
 def sequence(looks):

@@ -9,12 +9,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid, InputError
+from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid
 from semfov.agents.fovea import _goal_cells
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision, conclude, decide
 from semfov.gaze.policies import Policy
+from tests.refusals import refused
 from tests.small import Coloured
 
 SIZE = (160, 120)
@@ -348,5 +349,4 @@ def test_goal_cells_are_the_cells_that_boxes_overlap():
         (torch.rand(2, 5), "shape"),
         ([[0, 0, math.inf, 5]], "finite"),
     ):
-        with pytest.raises(InputError, match=f"boxes: .*{message}"):
-            _goal_cells(wrong, grid, torch.zeros(()))
+        refused(f"boxes: .*{message}", _goal_cells, wrong, grid, torch.zeros(()))

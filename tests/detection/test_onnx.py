@@ -12,6 +12,7 @@ from semfov.detection.onnx_heads import HEADS
 from semfov.detection.preprocessing import Preprocessing
 from semfov.io.files import sha256
 from tests.colours import write_network
+from tests.detection.test_onnx_heads import cell_list, corners, distance_boxes
 from tests.refusals import refused, unusable
 
 SIDE = 64
@@ -23,12 +24,8 @@ def random(*shape, seed=0):
     return np.random.default_rng(seed).random(shape).astype(np.float32)
 
 
-def corners(x, y, w, h):
-    return [x - w / 2, y - h / 2, x + w / 2, y + h / 2]
-
-
-def cells(*strides):
-    return [(c, r, s) for s in strides for r in range(SIDE // s) for c in range(SIDE // s)]
+def cells_of(*strides):
+    return cell_list((SIDE, SIDE), strides)
 
 
 def pixels(rows):
@@ -55,7 +52,7 @@ def yolox():
         return [
             (corners((row[0] + c) * s, (row[1] + r) * s, s * math.exp(row[2]), s * math.exp(row[3])),
              residual(row[5:], row[4]))
-            for row, (c, r, s) in zip(out["output"].tolist(), cells(8, 16, 32), strict=True)
+            for row, (c, r, s) in zip(out["output"].tolist(), cells_of(8, 16, 32), strict=True)
         ]  # fmt: skip
 
     rows = random(1, 84, 8)
@@ -77,18 +74,6 @@ def yolov8():
     return {"output0": pixels(random(1, 84, 7)).transpose(0, 2, 1)}, read
 
 
-def distance_boxes(out, strides, offset):
-    rows = []
-    for (c, r, s), numbers in zip(cells(*strides), out.tolist(), strict=True):
-        sides = []
-        for side in range(4):
-            weights = [math.exp(t) for t in numbers[8 * side : 8 * side + 8]]
-            sides.append(s * sum(b * w for b, w in enumerate(weights)) / sum(weights))
-        x, y = (c + offset) * s, (r + offset) * s
-        rows.append([x - sides[0], y - sides[1], x + sides[2], y + sides[3]])
-    return rows
-
-
 def nanodet():
     """Maps in pairs, level by level."""
     outputs = {}
@@ -99,7 +84,9 @@ def nanodet():
     def read(out):
         classes = np.concatenate([out[f"cls_pred_stride_{s}"] for s in (8, 16, 32)])
         distances = np.concatenate([out[f"dis_pred_stride_{s}"] for s in (8, 16, 32)])
-        return list(zip(distance_boxes(distances, (8, 16, 32), 0.5), map(residual, classes.tolist()), strict=True))
+        return list(
+            zip(distance_boxes(distances, cells_of(8, 16, 32), 0.5), map(residual, classes.tolist()), strict=True)
+        )
 
     return outputs, read
 
@@ -112,14 +99,16 @@ def picodet():
 
     def read(out):
         classes, distances = (np.concatenate([out[f"{kind}{s}"] for s in strides]) for kind in "ab")
-        return list(zip(distance_boxes(distances, strides, 0.5), map(residual, classes.tolist()), strict=True))
+        return list(
+            zip(distance_boxes(distances, cells_of(*strides), 0.5), map(residual, classes.tolist()), strict=True)
+        )
 
     return outputs, read
 
 
 def nanodet_plus():
     def read(out):
-        boxes = distance_boxes(out["output"][:, 3:], (8, 16, 32, 64), 0.0)
+        boxes = distance_boxes(out["output"][:, 3:], cells_of(8, 16, 32, 64), 0.0)
         return list(zip(boxes, map(normalised, out["output"][:, :3].tolist()), strict=True))
 
     return {"output": random(1, 85, 35)}, read
@@ -360,7 +349,7 @@ def test_real_models_against_opencv_and_numpy(shared, name):
         canvas = np.full((416, 416, 3), 114, np.float32)
         canvas[: inner.shape[0], : inner.shape[1]] = inner
         out = session.run(None, {"images": canvas.transpose(2, 0, 1)[None]})[0][0]
-        grid = [(c, r, s) for s in (8, 16, 32) for r in range(416 // s) for c in range(416 // s)]
+        grid = cell_list((416, 416), (8, 16, 32))
         boxes = np.array([corners((o[0] + c) * s, (o[1] + r) * s, np.exp(o[2]) * s, np.exp(o[3]) * s)
                           for o, (c, r, s) in zip(out, grid, strict=True)])  # fmt: skip
         boxes /= [inner.shape[1] / width, inner.shape[0] / height] * 2
@@ -375,11 +364,7 @@ def test_real_models_against_opencv_and_numpy(shared, name):
             canvas = (small - [103.53, 116.28, 123.675]) / [57.375, 57.12, 58.395]
             out = session.run(None, {"data": canvas.transpose(2, 0, 1)[None].astype(np.float32)})[0][0]
             classes, distances, offset = out[:, :80], out[:, 80:], 0.0
-        powers = np.exp(distances.reshape(-1, 4, 8))
-        reach = (powers * np.arange(8)).sum(-1) / powers.sum(-1)
-        grid = [(c, r, s) for s in (8, 16, 32, 64) for r in range(-(-416 // s)) for c in range(-(-416 // s))]
-        boxes = np.array([[c - d[0], r - d[1], c + d[2], r + d[3]] for d, (c, r, _) in zip(reach, grid, strict=True)])
-        boxes = (boxes + offset) * np.array([[s] for _, _, s in grid])
+        boxes = np.array(distance_boxes(distances, cell_list((416, 416), (8, 16, 32, 64)), offset))
         boxes /= [416 / width, 416 / height] * 2
     detector = load_detector(path)
     fitted, placement = detector.fit(torch.tensor(bgr[..., ::-1].copy()).permute(2, 0, 1)[None] / 255)

@@ -34,6 +34,19 @@ def corners(x, y, w, h):
     return [x - w / 2, y - h / 2, x + w / 2, y + h / 2]
 
 
+def distance_boxes(numbers, cells, offset):
+    """Boxes of distributions of the distances of their four sides, `(N, 4 · bins)`, from points of cells."""
+    rows, bins = [], numbers.shape[1] // 4
+    for (column, row, stride), each in zip(cells, numbers.tolist(), strict=True):
+        sides = []
+        for side in range(4):
+            weights = [math.exp(t) for t in each[side * bins : (side + 1) * bins]]
+            sides.append(stride * sum(b * w for b, w in enumerate(weights)) / sum(weights))
+        x, y = (column + offset) * stride, (row + offset) * stride
+        rows.append([x - sides[0], y - sides[1], x + sides[2], y + sides[3]])
+    return rows
+
+
 def close(actual, expected):
     expected = torch.tensor(expected, dtype=actual.dtype)
     rtol = 1e-5 if actual.dtype == torch.float32 else 1e-12
@@ -69,15 +82,7 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     cells = cell_list(canvas, strides)
     classes, distances = noise(1, len(cells), 3, dtype=dtype), 2 * noise(1, len(cells), 4 * bins, dtype=dtype)
     found = heads._decode_distances(classes, distances, canvas, strides=strides, offset=offset)
-    expected = []
-    for (column, row, stride), numbers in zip(cells, distances[0].tolist(), strict=True):
-        sides = []
-        for side in range(4):
-            weights = [math.exp(t) for t in numbers[side * bins : (side + 1) * bins]]
-            sides.append(stride * sum(b * w for b, w in enumerate(weights)) / sum(weights))
-        x, y = (column + offset) * stride, (row + offset) * stride
-        expected.append([x - sides[0], y - sides[1], x + sides[2], y + sides[3]])
-    close(found.boxes, [expected])
+    close(found.boxes, [distance_boxes(distances[0], cells, offset)])
     assert torch.equal(found.classes, classes)
     assert found.objectness is None
 

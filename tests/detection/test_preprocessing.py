@@ -13,6 +13,12 @@ from semfov.detection.placement import resize
 from semfov.detection.preprocessing import Preprocessing
 from tests.refusals import refused
 
+
+def by_the_formula(unit, channels, scale, mean, std):
+    column = (slice(None), None, None)
+    return ((unit if channels == "rgb" else unit[:, ::-1]) * scale - np.array(mean)[column]) / np.array(std)[column]
+
+
 numbers = st.floats(0.1, 200)
 
 
@@ -27,10 +33,7 @@ def test_every_pixel_equals_the_formula(channels, scale, mean, std, dtype):
     canvas = torch.rand(2, 3, 2, 3, dtype=dtype, generator=torch.Generator().manual_seed(0))
     before = canvas.clone()
     image = Preprocessing(channels=channels, scale=scale, mean=mean, std=std)(canvas)
-    source = canvas.double().numpy()
-    expected = np.empty_like(source)
-    for out in range(3):
-        expected[:, out] = (source[:, out if channels == "rgb" else 2 - out] * scale - mean[out]) / std[out]
+    expected = by_the_formula(canvas.double().numpy(), channels, scale, mean, std)
     assert image.dtype == dtype
     np.testing.assert_allclose(image.numpy(), expected, rtol=1e-4, atol=1e-3 if dtype == torch.float32 else 1e-9)
     assert torch.equal(canvas, before)
@@ -55,10 +58,7 @@ def test_bytes_equal_the_formula(settings, layout):
         canvas = torch.nn.functional.pad(canvas, (1, 2, 3, 1))[..., 3:-1, 1:-2]
     wanted = Preprocessing(**settings)
     image = wanted.of_bytes(canvas)
-    expected = np.empty(source.shape)
-    for out in range(3):
-        unit = source[:, out if wanted.channels == "rgb" else 2 - out] / 255
-        expected[:, out] = (unit * wanted.scale - wanted.mean[out]) / wanted.std[out]
+    expected = by_the_formula(source / 255, wanted.channels, wanted.scale, wanted.mean, wanted.std)
     assert image.dtype == torch.float32
     assert image.is_contiguous()
     np.testing.assert_allclose(image.numpy(), expected, rtol=1e-5, atol=1e-5)

@@ -245,8 +245,7 @@ def test_a_closer_look_equals_the_loop(belief):
 
 
 def test_a_fovea_of_zero_width_is_refused():
-    with pytest.raises(InputError, match="fovea"):
-        CloserLook(GRID, 0.0)
+    refused("fovea", CloserLook, GRID, 0.0)
 
 
 BELIEF = DirichletBelief(0.3 + 4 * draw(3, 12, 5) ** 2)

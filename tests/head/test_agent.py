@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from semfov import ActivePerception, Detections, Flat, HeadAgent, InputError, Panorama
+from semfov import ActivePerception, Detections, Flat, HeadAgent, Panorama
 from semfov.agents.head import _decide_look
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
@@ -13,6 +13,7 @@ from semfov.gaze.policies import Policy
 from semfov.head.belief import SceneBelief
 from semfov.head.episode import HeadStep, live
 from semfov.sensor.sphere import Regions
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -104,8 +105,7 @@ def test_arguments_are_checked(agent, panorama):
         ({"target": "blue", "confirm": 2.0}, "confirm"),
         ({"target": "blue", "foresight": -1.0}, "foresight"),
     ):
-        with pytest.raises(InputError, match=message):
-            agent.search(world, **arguments)
+        refused(message, agent.search, world, **arguments)
 
 
 def test_a_search_is_found_by_the_cell_at_the_gaze_and_says_so_in_its_decision(agent, panorama):

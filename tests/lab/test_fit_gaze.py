@@ -33,6 +33,7 @@ from semfov.fit.viewing import (
 )
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
+from tests.refusals import refused
 from tests.small import Shown
 
 SIZE = (60, 80)
@@ -238,8 +239,7 @@ def test_settings_of_gaze_without_their_fixations_are_refused():
             ViewingData(**{"fixations": (Path("people.csv"),), "pictures": (Path("photographs"),), **given})
     with pytest.raises(InputError, match=r"^gaze\.pictures: expected a folder for each of 1 files of fixations, got 0"):
         GazeModelFit(fixations=(Path("people.csv"),))
-    with pytest.raises(InputError, match=r"^gaze\.folds: expected 0, or 2 or more, got 1"):
-        GazeModelFit(folds=1)
+    refused(r"^gaze\.folds: expected 0, or 2 or more, got 1", GazeModelFit, folds=1)
     with pytest.raises(InputError, match=r"--gaze\.fixations FILE"):
         FitDetectorConfig(model=Path("yolov3-tiny"), gaze=GazeModelFit(seconds=(3.0,))).named()
 

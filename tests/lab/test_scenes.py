@@ -32,7 +32,6 @@ from semfov.data.scene import Annotation, Scene
 from semfov.detection import Detections, Objects
 from semfov.head.views import Views
 from semfov.runs.config import DataConfig
-from semfov.runs.window_looking import right_boxes
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
@@ -378,16 +377,6 @@ def test_recall_and_precision_are_shares_of_all_objects_and_boxes():
         assert got[1, :2].tolist() == [0, 0]
         assert got[1, 2].isnan()
     assert recall_cells(got[1], got[0], "+") == (["+0.000 ± 0.125", "+0.000 ± 0.625"], "-")
-
-
-def test_a_right_box_shows_an_object_of_its_class_that_no_better_box_shows():
-    boxes = torch.tensor([[0.0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60], [0, 0, 10, 10], [80, 80, 90, 90]])
-    labels, looks = torch.tensor([1, 1, 1, 2, 1]), torch.zeros(5, dtype=torch.long)
-    objects = Objects(boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), labels, looks)
-    there = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60], [80, 80, 90, 90]])
-    annotation = Annotation(there, torch.tensor([1, 1, 2]), torch.zeros(3, dtype=torch.bool), (100, 100))
-    assert right_boxes(objects, annotation).tolist() == [1, 0, 1, 0, 0]
-    assert len(right_boxes(Objects.none(), annotation)) == 0
 
 
 def test_orders_look_at_every_slice_once(zooming):

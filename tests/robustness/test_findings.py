@@ -7,8 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov import FovealObservationModel, Grid, InputError, acquisition, read_image
+from semfov import FovealObservationModel, Grid, acquisition, read_image
 from semfov.io.storage import read_tensors, write_tensors
+from tests.refusals import refused
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -36,8 +37,7 @@ def test_points_and_boxes_far_outside_are_in_the_grid():
 def test_invalid_distances_are_refused(distance):
     """NaN was treated as the outermost level."""
     model = FovealObservationModel.identity(["cup"], [0.2])
-    with pytest.raises(InputError, match="distance: expected numbers from 0 up"):
-        model.calibrate(torch.tensor([0.4, 0.6]), torch.tensor(distance))
+    refused("distance: expected numbers from 0 up", model.calibrate, torch.tensor([0.4, 0.6]), torch.tensor(distance))
 
 
 def test_a_model_that_does_not_fit_on_the_disk_raises_an_error(fresh, tmp_path):

@@ -24,6 +24,7 @@ from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, Looking
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 from semfov.runs.workers import run_tasks, shared_processes
+from tests.refusals import refused
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -394,5 +395,4 @@ def test_without_a_scheduler_the_error_says_what_to_start(monkeypatch):
     monkeypatch.setattr(workers, "_REACH", 0.2)
     with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):
         results(operator.neg, [1, 2], f"tcp://127.0.0.1:{free_port()}")
-    with pytest.raises(InputError, match="expected the address of a running Dask scheduler"):
-        results(operator.neg, [1, 2], "nowhere")
+    refused("expected the address of a running Dask scheduler", results, operator.neg, [1, 2], "nowhere")

@@ -304,8 +304,7 @@ def test_settings_of_numbers_without_a_fraction():
     ],
 )
 def test_bad_settings(settings, message):
-    with pytest.raises(InputError, match=message):
-        MultiScaleFovea(**settings)
+    refused(message, MultiScaleFovea, **settings)
 
 
 def test_a_network_with_a_fixed_input_takes_no_other_crops(tmp_path):

@@ -11,11 +11,12 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov import DataError, Grid, InputError, viz
+from semfov import DataError, Grid, viz
 from semfov.data.fixations import Fixations
 from semfov.viz import plot_scanpath
 from semfov.viz.style import TIME
 from tests import small
+from tests.refusals import refused
 
 CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
 
@@ -67,8 +68,7 @@ def test_figures_are_drawn_into_given_axes(name, scanpath):
         ]
         assert a.get_title() == b.get_title()
     if isinstance(place, int):
-        with pytest.raises(InputError, match=f"axes: expected {place} axes"):
-            function(*arguments, **options, axes=given[:-1])
+        refused(f"axes: expected {place} axes", function, *arguments, **options, axes=given[:-1])
 
 
 def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):
@@ -183,5 +183,4 @@ def test_fixations_of_people_are_drawn_as_those_of_an_agent():
     np.testing.assert_allclose(axes.collections[-1].get_offsets(), points + 0.5)
     assert axes.get_title() == "a.jpg, 7: “cup”, found"
     assert [patch.get_bbox().bounds for patch in axes.patches] == [(180.0, 380.0, 50.0, 50.0)]
-    with pytest.raises(InputError, match=r"^image: expected the photograph"):
-        plot_scanpath(person)
+    refused(r"^image: expected the photograph", plot_scanpath, person)

@@ -388,14 +388,15 @@ def test_what_no_look_has_shown_is_negative_binomial():
 
 
 def test_boxes_are_right_once_and_crowds_are_neither():
-    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 9], [0, 0, 10, 10], [41, 41, 49, 49], [80, 80, 90, 90]])
-    found = Objects(
-        boxes, torch.tensor([0.9, 0.8, 0.7, 0.6, 0.5]), torch.tensor([1, 1, 2, 1, 1]), torch.zeros(5).long()
+    boxes = torch.tensor(
+        [[0.0, 0, 9, 9], [0, 0, 9, 8], [0, 0, 9, 9], [41, 41, 49, 49], [80, 80, 89, 89], [70, 0, 79, 9]]
     )
-    there = torch.tensor([[0.0, 0, 10, 10], [40, 40, 60, 60]])
-    crowd = torch.tensor([False, True])
-    annotation = Annotation(there, torch.tensor([1, 1]), crowd, (100, 100))
-    assert right_boxes(found, annotation).tolist() == [1, 0, 0, -1, 0]
+    labels = torch.tensor([1, 1, 2, 1, 1, 1])
+    found = Objects(boxes, torch.linspace(0.9, 0.4, 6), labels, torch.zeros(6).long())
+    there = torch.tensor([[0.0, 0, 9, 9], [40, 40, 60, 60], [80, 80, 89, 89], [70, 0, 79, 9]])
+    annotation = Annotation(there, torch.tensor([1, 1, 2, 1]), torch.arange(4) == 1, (100, 100))
+    assert right_boxes(found, annotation).tolist() == [1, 0, 0, -1, 0, 1]
+    assert len(right_boxes(Objects.none(), annotation)) == 0
 
 
 @pytest.fixture

@@ -254,8 +254,7 @@ def test_limits_and_several_classes(agent):
     stopped = agent.find_all(scene, on_look=lambda record: seen.append(record.passes) or len(seen) < 2)
     assert (stopped.ending, seen, stopped.passes) == ("stopped", [1, 2], 2)
     assert agent.search(picture(), "red", seconds=0).ending == "seconds"
-    with pytest.raises(InputError, match="seconds"):
-        EpisodeLimits(seconds=-1)
+    refused("seconds", EpisodeLimits, seconds=-1)
     assert torch.equal(both.candidates.boxes, agent.find_all(scene, [1, 2]).candidates.boxes)
 
 

@@ -148,19 +148,7 @@ def test_finished_parts_are_kept_and_a_damaged_one_is_computed_again(finished):
     assert damaged is None or found[damaged][-1] > broken[damaged][-1]
 
 
-ALONE = pytest.mark.parametrize("finished", [long("eval.search"), long("train.fit_fom")], indirect=True)
-
-
-@ALONE
-def test_a_killed_run_goes_on_to_the_same_bits(finished, tmp_path, kill_when):
-    name, settings, folder = finished
-    call = words(name, tmp_path, *settings)
-    kill_when([sys.executable, "-m", name, *call], lambda: list(tmp_path.glob(COMMANDS[name].parts)), cwd=ROOT)
-    assert run(name, *call) == 0
-    assert contents(name, tmp_path) == contents(name, folder)
-
-
-@ALONE
+@pytest.mark.parametrize("finished", [long("eval.search"), long("train.fit_fom")], indirect=True)
 def test_the_same_bits_from_two_ranks(finished, tmp_path):
     name, settings, folder = finished
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", name]
