@@ -80,10 +80,10 @@ def foveate(
     source = image if isinstance(image, Bands) else as_batch(image)
     like = source.base if isinstance(source, Bands) else source
     fixation, many = fixations(gaze, like)
-    if values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
-        for name, value in (("sigma", sigma), ("growth", growth)):
-            if not bool((torch.as_tensor(value) > 0).all()):
-                check(False, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
+    for name, value in (("sigma", sigma), ("growth", growth)):
+        known = not isinstance(value, Tensor) or values_known(value)
+        if known and not (value > 0 if isinstance(value, Real) else bool((torch.as_tensor(value) > 0).all())):
+            check(False, name, "a positive number", value if isinstance(value, Real) else value.tolist())
     widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
     size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
     details = source.details if isinstance(source, Bands) else ()
@@ -231,35 +231,30 @@ def _collapse(
         return views if out is None else out.copy_(views)
     dtype = bands.base.dtype
     bands = Bands(tuple(map(widened, bands.details)), widened(bands.base), bands.convention)
-    windows = _windows(bands, fixation, sigma, growth)
-    result = bands.base
-    for k in reversed(range(len(bands.details))):
-        band = bands.details[k]
-        across, down = windows[k]
-        window = (down[..., :, None] * across[..., None, :])[:, :, None]
-        expanded = expand(result, (band.shape[-2], band.shape[-1]), bands.convention)
-        if k == len(bands.details) - 1:
-            # All fixations share the coarsest level.
-            result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
-        else:
-            views = expanded.unflatten(0, (batch, many))
-            if k == 0 and out is not None and out.dtype == views.dtype:
-                return torch.addcmul(views, window, band[:, None], out=out)
-            # In place where no graph is recorded, which avoids allocating memory.
-            blend = views.addcmul_ if values_known(views, window, band) else views.addcmul
-            result = blend(window, band[:, None]).flatten(0, 1)
+    result, windows = bands.base, _windows(bands, fixation, sigma, growth)
+    in_place = values_known(result, windows[0][0])
+    for k, (band, (across, down)) in reversed([*enumerate(zip(bands.details, windows, strict=True))]):
+        window, detail = down[..., None] * across[..., None, :], band[:, None]
+        views = expand(result, (band.shape[-2], band.shape[-1]), bands.convention)
+        # All fixations share the coarsest level.
+        views = views[:, None] if result is bands.base else views.view(batch, many, *detail.shape[2:])
+        if k == 0 and out is not None and out.dtype == views.dtype:
+            return torch.addcmul(views, window, detail, out=out)
+        # In place where no graph is traced and the views exist, which avoids allocating memory.
+        fits = in_place and views.shape[1] == many
+        result = (views.addcmul_ if fits else views.addcmul)(window, detail).flatten(0, 1)
     views = result.unflatten(0, (batch, many))
     return views.to(dtype) if out is None else out.copy_(views)
 
 
 def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Gaussian windows `(B, G, w_k)` along x and `(B, G, h_k)` along y for every band, from one exponential."""
+    """Gaussian windows `(B, G, 1, w_k)` along x and `(B, G, 1, h_k)` along y for every band, from one exponential."""
     sizes = tuple((band.shape[-2], band.shape[-1]) for band in bands.details)
     place, power, axis, level = _layout(sizes, bands.convention, sigma.dtype, sigma.device)
     least = torch.finfo(sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
     widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
     offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
-    weights = offset.square().mul(-0.5).exp().to(bands.base.dtype)
+    weights = offset.square().mul(-0.5).exp().to(bands.base.dtype)[:, :, None]
     pieces = weights.split([n for size in sizes for n in reversed(size)], -1)
     return list(zip(pieces[0::2], pieces[1::2], strict=True))
 

@@ -57,19 +57,18 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
     """
     _check(image, convention)
-    return _reduce(image, convention)
+    return _reduce(widened(image), convention).to(image.dtype)
 
 
 def _reduce(image: Tensor, convention: Convention) -> Tensor:
-    """`pyrdown` without the checks."""
+    """`pyrdown` without the checks, of what is wide enough (`widened`)."""
     if _runs_in_kornia(image, convention):
         # Imported when first needed: Kornia takes a quarter of a second.
         from kornia.geometry import transform
 
         return transform.pyrdown(image.contiguous())
-    wide = widened(image)
     height, width = image.shape[-2:]
-    return separable(wide, *_reducing(height, width, convention, wide.dtype, image.device)).to(image.dtype)
+    return separable(image, *_reducing(height, width, convention, image.dtype, image.device))
 
 
 def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -97,17 +96,17 @@ def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "korni
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], shape, strict=True):
             check(0 <= 2 * count - length <= 1, "shape", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
-    return expand(image, shape, convention)
+    return expand(widened(image), shape, convention).to(image.dtype)
 
 
 def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
-    """`pyrup` without the checks."""
+    """`pyrup` without the checks, of what is wide enough (`widened`)."""
     if _runs_in_kornia(image, convention, size):
         from kornia.geometry import transform
 
         return transform.pyrup(image.contiguous())
-    before, after, wide = (image.shape[-2], image.shape[-1]), (size[0], size[1]), widened(image)
-    return separable(wide, *_expanding(before, after, convention, wide.dtype, image.device)).to(image.dtype)
+    before, after = (image.shape[-2], image.shape[-1]), (size[0], size[1])
+    return separable(image, *_expanding(before, after, convention, image.dtype, image.device))
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -155,7 +154,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
         smaller = _reduce(image, convention)
         expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
         # Allocating memory costs more than the subtraction, so it is done only where a gradient or a graph needs it.
-        fresh = expanded.requires_grad or not values_known(image, expanded)
+        fresh = expanded.requires_grad or not values_known(expanded)
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(band.to(dtype) for band in details), image.to(dtype), convention)
