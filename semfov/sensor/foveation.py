@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
-from semfov.sensor.lines import constant, empty
-from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, widened
+from semfov.sensor.lines import constant, difference, empty
+from semfov.sensor.pyramid import Bands, Convention, expand, expanding, laplacian_pyramid, reduce, widened
 from semfov.threads import one_thread_if_small
 
 # Elements of the views that are made together on a CPU; those of many views leave the processor's cache.
 _TOGETHER = 1 << 21
+_LARGE = 360  # pixels of the shorter side from which on the finest band is not computed for one fixation
 
 
 @one_thread_if_small
@@ -89,20 +90,28 @@ def foveate(
     details = source.details if isinstance(source, Bands) else ()
     tensors = [each for each in (*details, like, fixation, widths, growth) if isinstance(each, Tensor)]
     recorded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    plain = like.device.type == "cpu" and not recorded and values_known(*tensors)
+    whole = plain and number == 1 and levels > 0 and min(size) >= _LARGE
     step = max(1, _TOGETHER // max(1, like.shape[1] * size[0] * size[1]))
-    apart = batch * number > step and like.device.type == "cpu" and not recorded
-    if not (apart and values_known(*tensors)):
-        bands = source if isinstance(source, Bands) else laplacian_pyramid(source, levels, convention)
-        result = _collapse(bands, fixation, widths, growth)
-        return result if many else result[:, 0]
+
+    def pyramid(some: slice) -> tuple[Bands, Tensor | None]:
+        if isinstance(source, Bands):
+            return Bands(tuple(band[some] for band in source.details), source.base[some], source.convention), None
+        if not whole:
+            return laplacian_pyramid(source[some], levels, convention), None
+        image = widened(source[some])
+        half = reduce(image, convention)
+        rest = laplacian_pyramid(half, levels - 1, convention)
+        return Bands((image, *rest.details), rest.base, convention), half
+
+    if not plain or batch * number <= step:
+        views = _collapse(*pyramid(slice(None)), fixation, widths, growth).to(like.dtype)
+        return views if many else views[:, 0]
     views = empty(like, batch, number, like.shape[1], *size)
     for b in (slice(n, n + max(1, step // number)) for n in range(0, batch, max(1, step // number))):
-        if isinstance(source, Bands):
-            own = Bands(tuple(band[b] for band in source.details), source.base[b], source.convention)
-        else:
-            own = laplacian_pyramid(source[b], levels, convention)
+        own = pyramid(b)
         for g in (slice(n, n + step) for n in range(0, number, step)):
-            _collapse(own, fixation[b, g], widths[b], growth, views[b, g])
+            _collapse(*own, fixation[b, g], widths[b], growth, views[b, g])
     return views if many else views[:, 0]
 
 
@@ -222,29 +231,45 @@ class Foveation(Sensor):
 
 
 def _collapse(
-    bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor, out: Tensor | None = None
+    bands: Bands,
+    half: Tensor | None,
+    fixation: Tensor,
+    sigma: Tensor,
+    growth: float | Tensor,
+    out: Tensor | None = None,
 ) -> Tensor:
-    """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`, into `out` if it is given."""
+    r"""Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`, into `out` if it is given.
+
+    With G₁, `half`, the first detail is the image itself, for one fixation of each. Then
+    :math:`R_0 = w_0 G_0 + (\mathrm{expand}(R_1) - w_0 \mathrm{expand}(G_1))`, the difference in one product.
+    """
     batch, many = fixation.shape[:2]
     if not bands.details:
         views = bands.base[:, None].repeat(1, many, 1, 1, 1)
         return views if out is None else out.copy_(views)
-    dtype = bands.base.dtype
     bands = Bands(tuple(map(widened, bands.details)), widened(bands.base), bands.convention)
     result, windows = bands.base, _windows(bands, fixation, sigma, growth)
     in_place = values_known(result, windows[0][0])
     for k, (band, (across, down)) in reversed([*enumerate(zip(bands.details, windows, strict=True))]):
         window, detail = down[..., None] * across[..., None, :], band[:, None]
-        views = expand(result, (band.shape[-2], band.shape[-1]), bands.convention)
-        # All fixations share the coarsest level.
-        views = views[:, None] if result is bands.base else views.view(batch, many, *detail.shape[2:])
+        size = band.shape[-2], band.shape[-1]
+        if k == 0 and half is not None:
+            lines = expanding((half.shape[-2], half.shape[-1]), size, bands.convention, half.dtype, half.device)
+            weights = zip(down.flatten(1), across.flatten(1), strict=True)
+            views = torch.empty_like(detail, memory_format=torch.contiguous_format)
+            for one, other, weight, view in zip(result, half, weights, views, strict=True):
+                difference(one, other, *lines, weight, view[0])
+        else:
+            views = expand(result, size, bands.convention)
+            # All fixations share the coarsest level.
+            views = views[:, None] if result is bands.base else views.view(batch, many, *detail.shape[2:])
         if k == 0 and out is not None and out.dtype == views.dtype:
             return torch.addcmul(views, window, detail, out=out)
         # In place where no graph is traced and the views exist, which avoids allocating memory.
         fits = in_place and views.shape[1] == many
         result = (views.addcmul_ if fits else views.addcmul)(window, detail).flatten(0, 1)
     views = result.unflatten(0, (batch, many))
-    return views.to(dtype) if out is None else out.copy_(views)
+    return views if out is None else out.copy_(views)
 
 
 def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -6,7 +6,7 @@ channels. A product reads a transposed image equally fast, so two passes filter 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, wraps
 from typing import Any, TypeVar, TypeVarTuple
 
@@ -130,13 +130,47 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     between = planes.new_empty(min(most, number), *sides)
     for first in range(0, number, most):
         passes = _passes(down, across, min(most, number - first), planes.stride())
-        begin = planes.storage_offset() + first * planes.stride(0)
-        for matrix, (size, strides, offset), into in passes[0]:
-            torch.bmm(matrix, planes.as_strided(size, strides, begin + offset), out=between.as_strided(*into))
-        begin = first * down.length * across.length
-        for matrix, source, (size, strides, offset) in passes[1]:
-            torch.bmm(matrix, between.as_strided(*source), out=result.as_strided(size, strides, begin + offset))
+        _multiply(passes[0], planes, planes.storage_offset() + first * planes.stride(0), between, 0)
+        _multiply(passes[1], between, 0, result, first * down.length * across.length)
     return result.view(*image.shape[:-2], *result.shape[-2:])
+
+
+def difference(
+    one: Tensor, other: Tensor, down: Lines, across: Lines, weights: tuple[Tensor, Tensor], result: Tensor
+) -> None:
+    """Filter planes `(n, h, w)` of one image, minus those of another times the weights of rows and of columns.
+
+    Neither line may be dense. The lines of both images alternate between the passes, so that one product subtracts.
+    """
+    rows, width = down.count, across.length
+    between = one.new_empty(rows, 2, width)
+    both = [across, replace(across, **_weighted(across, weights[1]))]
+    pairs = {
+        name: torch.stack([getattr(down, name).expand_as(each), each], -1).flatten(-2)
+        for name, each in _weighted(down, -weights[0]).items()
+    }
+    last = Lines(2 * rows, down.length, None, rows=down.rows, start=2 * down.start, shift=2 * down.shift, **pairs)
+    first = [_products(lines, 1, rows, (0, 1, across.count), (0, 1, 2 * width)) for lines in both]
+    second = _products(last, 1, width, (0, width, 1), (0, width, 1))
+    for *planes, plane in zip(one, other, result, strict=True):
+        for at, (products, each) in enumerate(zip(first, planes, strict=True)):
+            _multiply(products, each, each.storage_offset(), between, at * width)
+        _multiply(second, between, 0, plane, plane.storage_offset())
+
+
+def _weighted(lines: Lines, weight: Tensor) -> dict[str, Tensor]:
+    """The tiles of lines with their output pixels times a weight `(length,)`."""
+    tiles, tile, _ = lines.middle.shape
+    edge, last = lines.ends.shape[1], lines.rows + tiles * tile
+    ends = torch.stack([weight[:edge], weight[len(weight) - edge :]])[..., None] * lines.ends
+    return {"ends": ends, "middle": weight[lines.rows : last].view(tiles, tile, 1) * lines.middle}
+
+
+def _multiply(products: list[_Product], source: Tensor, begin: int, result: Tensor, into: int) -> None:
+    """Compute products of planes in the memory of `source` from `begin` on, in that of the result from `into` on."""
+    for matrix, (size, strides, offset), (sides, steps, place) in products:
+        planes = source.as_strided(size, strides, begin + offset)
+        torch.bmm(matrix, planes, out=result.as_strided(sides, steps, into + place))
 
 
 @lru_cache(maxsize=256)

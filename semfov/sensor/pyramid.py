@@ -57,10 +57,10 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
     """
     _check(image, convention)
-    return _reduce(widened(image), convention).to(image.dtype)
+    return reduce(widened(image), convention).to(image.dtype)
 
 
-def _reduce(image: Tensor, convention: Convention) -> Tensor:
+def reduce(image: Tensor, convention: Convention) -> Tensor:
     """`pyrdown` without the checks, of what is wide enough (`widened`)."""
     if _runs_in_kornia(image, convention):
         # Imported when first needed: Kornia takes a quarter of a second.
@@ -106,7 +106,7 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
 
         return transform.pyrup(image.contiguous())
     before, after = (image.shape[-2], image.shape[-1]), (size[0], size[1])
-    return separable(image, *_expanding(before, after, convention, image.dtype, image.device))
+    return separable(image, *expanding(before, after, convention, image.dtype, image.device))
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -126,7 +126,7 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     _check(image, convention, levels)
     pyramid = [widened(image)]
     for _ in range(levels):
-        pyramid.append(_reduce(pyramid[-1], convention))
+        pyramid.append(reduce(pyramid[-1], convention))
     return tuple(level.to(image.dtype) for level in pyramid)
 
 
@@ -151,7 +151,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     _check(image, convention, levels)
     details, dtype, image = [], image.dtype, widened(image)
     for _ in range(levels):
-        smaller = _reduce(image, convention)
+        smaller = reduce(image, convention)
         expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
         # Allocating memory costs more than the subtraction, so it is done only where a gradient or a graph needs it.
         fresh = expanded.requires_grad or not values_known(expanded)
@@ -206,7 +206,7 @@ def _reducing(
 
 
 @constant
-def _expanding(
+def expanding(
     before: tuple[int, int], after: tuple[int, int], convention: Convention, dtype: torch.dtype, device: torch.device
 ) -> tuple[Lines, Lines]:
     """The matrices of `pyrup` for the columns and the rows of an image of one size that get another."""

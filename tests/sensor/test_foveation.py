@@ -122,11 +122,14 @@ def test_gradients(convention, size):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 27), (141, 200)])
-def test_view_is_equal_with_and_without_gradients(convention, size):
+def test_view_is_equal_with_and_without_gradients(monkeypatch, convention, size):
+    """Also for one fixation, where the finest band of a large image is not computed."""
+    monkeypatch.setattr("semfov.sensor.foveation._LARGE", 140)
     image, gaze = draw(2, 3, *size), 20 * draw(2, 3, 2)
     recorded = foveate(image.clone().requires_grad_(), gaze, sigma=8.0, convention=convention)
     assert recorded.requires_grad
     close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
+    close(recorded[:, 1].detach(), foveate(image, gaze[:, 1], sigma=8.0, convention=convention))
     with torch.inference_mode():
         close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
 
