@@ -130,7 +130,7 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     between = planes.new_empty(min(most, number), *sides)
     for first in range(0, number, most):
         passes = _passes(down, across, min(most, number - first), planes.stride())
-        _multiply(passes[0], planes, planes.storage_offset() + first * planes.stride(0), between, 0)
+        _multiply(passes[0], planes, int(planes.storage_offset()) + first * planes.stride(0), between, 0)
         _multiply(passes[1], between, 0, result, first * down.length * across.length)
     return result.view(*image.shape[:-2], *result.shape[-2:])
 
@@ -144,13 +144,12 @@ def difference(
     """
     rows, width = down.count, across.length
     between = one.new_empty(rows, 2, width)
-    both = [across, replace(across, **_weighted(across, weights[1]))]
-    pairs = {
-        name: torch.stack([getattr(down, name).expand_as(each), each], -1).flatten(-2)
-        for name, each in _weighted(down, -weights[0]).items()
-    }
-    last = Lines(2 * rows, down.length, None, rows=down.rows, start=2 * down.start, shift=2 * down.shift, **pairs)
+    ends, middle = _weighted(across, weights[1])
+    both = across, replace(across, ends=ends, middle=middle)
     first = [_products(lines, 1, rows, (0, 1, across.count), (0, 1, 2 * width)) for lines in both]
+    pairs = zip((down.ends, down.middle), _weighted(down, -weights[0]), strict=True)
+    ends, middle = (torch.stack([each.expand_as(minus), minus], -1).flatten(-2) for each, minus in pairs)
+    last = Lines(2 * rows, down.length, None, ends, middle, down.rows, 2 * down.start, 2 * down.shift)
     second = _products(last, 1, width, (0, width, 1), (0, width, 1))
     for *planes, plane in zip(one, other, result, strict=True):
         for at, (products, each) in enumerate(zip(first, planes, strict=True)):
@@ -158,12 +157,12 @@ def difference(
         _multiply(second, between, 0, plane, plane.storage_offset())
 
 
-def _weighted(lines: Lines, weight: Tensor) -> dict[str, Tensor]:
-    """The tiles of lines with their output pixels times a weight `(length,)`."""
+def _weighted(lines: Lines, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Ends and middle of lines with their output pixels times a weight `(length,)`."""
     tiles, tile, _ = lines.middle.shape
     edge, last = lines.ends.shape[1], lines.rows + tiles * tile
     ends = torch.stack([weight[:edge], weight[len(weight) - edge :]])[..., None] * lines.ends
-    return {"ends": ends, "middle": weight[lines.rows : last].view(tiles, tile, 1) * lines.middle}
+    return ends, weight[lines.rows : last].view(tiles, tile, 1) * lines.middle
 
 
 def _multiply(products: list[_Product], source: Tensor, begin: int, result: Tensor, into: int) -> None:
