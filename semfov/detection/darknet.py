@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from semfov.detection.darknet_config import Section
 from semfov.detection.feature_maps import NetworkStep, landmarks
 from semfov.detection.onnx_file import check_canvas
-from semfov.errors import DataError, check, check_shape
+from semfov.errors import DataError, check, check_data, check_shape
 from semfov.io.files import reading
 from semfov.io.schema import excerpt
 
@@ -159,51 +159,43 @@ class _Builder:
 
     def add(self, section: Section) -> nn.Module:
         """Make the layer of the next section."""
-        if len(self.shapes) >= _MOST_LAYERS:
-            raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers, got more; check the cfg")
+        count, limit = len(self.shapes), f"at most {_MOST_LAYERS} layers"
+        check_data(count < _MOST_LAYERS, section.where, limit, "more; check the cfg")
         if section.kind not in self._makers:
             kinds = ", ".join(self._makers)
             raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {kinds}")
         for key, value in _NEUTRAL.get(section.kind, {}).items():
-            if section.text(key, value) != value:
-                raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")
+            got = section.text(key, value)
+            section.check(got == value, f"{key}={value}", f"{key}={got}, which is not supported")
         return self._makers[section.kind](section)
 
     def _note(self, channels: int, step: Fraction, *further: int, sources: tuple[int, ...] | None = None) -> None:
         """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
         shape = _Shape(channels, step)
-        if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
-            raise DataError(
-                f"cfg: layer {len(self.shapes)} has a map of more than {_MOST_ELEMENTS:,} numbers; check the cfg"
-            )
+        fits = shape.channels * self._pixels <= _MOST_ELEMENTS * shape.step**2
+        check_data(fits, f"cfg: layer {len(self.shapes)}", f"a map of at most {_MOST_ELEMENTS:,} numbers", "more")
         self.sources.append((len(self.shapes) - 1, *further) if sources is None else sources)
         self.shapes.append(shape)
         self._here = shape
 
     def _convolution(self, section: Section) -> nn.Module:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
-        if here.channels % groups or filters % groups:
-            raise DataError(
-                f"{section.where}: expected groups that divide {excerpt(here.channels)} input channels and "
-                f"{excerpt(filters)} filters, got {excerpt(groups)}"
-            )
+        counts = f"{excerpt(here.channels)} input channels and {excerpt(filters)} filters"
+        section.check(here.channels % groups == filters % groups == 0, f"groups that divide {counts}", excerpt(groups))
         size, stride = section.integer("size", 1), section.integer("stride", 1)
         # Parameters are counted before the layer is made, because making it allocates them.
         self._parameters += here.channels // groups * filters * size**2 + 4 * filters
-        if self._parameters > _MOST_PARAMETERS:
-            raise DataError(
-                f"{section.where}: expected at most {_MOST_PARAMETERS:,} parameters up to this layer, got more; "
-                f"check the cfg"
-            )
-        _check_kernel(section, size, stride, section.integer("padding", 0, minimum=0))
-        same = section.integer("pad", 0, minimum=0)
+        most = f"at most {_MOST_PARAMETERS:,} parameters up to this layer"
+        section.check(self._parameters <= _MOST_PARAMETERS, most, "more; check the cfg")
+        padding = section.integer("padding", 0, minimum=0)
+        _check_kernel(section, size, stride, padding)
         self._note(filters, here.step * stride)
         return Convolution(
             here.channels,
             filters,
             size,
             stride=stride,
-            padding=size // 2 if same else section.integer("padding", 0, minimum=0),
+            padding=size // 2 if section.integer("pad", 0, minimum=0) else padding,
             groups=groups,
             activation=_activation(section, "logistic"),
             normalised=bool(section.integer("batch_normalize", 0, minimum=0)),
@@ -226,21 +218,18 @@ class _Builder:
         sources = tuple(self._layer(section, "layers", layer) for layer in section.integers("layers"))
         groups, group = section.integer("groups", 1), section.integer("group_id", 0, minimum=0)
         shapes = [self.shapes[source] for source in sources]
-        if len({shape.step for shape in shapes}) != 1:
-            raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
-        if group >= groups or any(shape.channels % groups for shape in shapes):
-            counts = excerpt([shape.channels for shape in shapes])
-            raise DataError(
-                f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
-                f"{counts}, got group_id={excerpt(group)} and groups={excerpt(groups)}"
-            )
-        self._note(sum(shape.channels for shape in shapes) // groups, shapes[0].step, sources=sources)
+        section.check(len({shape.step for shape in shapes}) == 1, "layers of one size", section.text("layers"))
+        counts = [shape.channels for shape in shapes]
+        parts = f"a group_id below groups, and groups that divide the channels {excerpt(counts)}"
+        fits = group < groups and not any(count % groups for count in counts)
+        section.check(fits, parts, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
+        self._note(sum(counts) // groups, shapes[0].step, sources=sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:
         sources = [self._layer(section, "from", layer) for layer in section.integers("from")]
-        if len(sources) != 1 or self.shapes[sources[0]] != self._here:
-            raise DataError(f"{section.where}: [shortcut] expected one layer of the same shape, got layers {sources}")
+        fits = len(sources) == 1 and self.shapes[sources[0]] == self._here
+        section.check(fits, "one layer of the same shape", f"layers {sources}")
         self._note(self._here.channels, self._here.step, *sources)
         return Shortcut(_activation(section, "linear"))
 
@@ -248,15 +237,13 @@ class _Builder:
         numbers = section.numbers("anchors")
         pairs = list(zip(numbers[::2], numbers[1::2], strict=False))
         mask = section.integers("mask", ",".join(map(str, range(len(pairs)))))
-        if len(numbers) % 2 or not mask or any(not 0 <= index < len(pairs) for index in mask):
-            raise DataError(
-                f"{section.where}: [yolo] expected pairs of anchors and a mask of their indices, got {len(numbers)} "
-                f"numbers and the mask {mask}"
-            )
+        fits = len(numbers) % 2 == 0 and bool(mask) and all(0 <= index < len(pairs) for index in mask)
+        section.check(
+            fits, "pairs of anchors and a mask of their indices", f"{len(numbers)} numbers and the mask {mask}"
+        )
         scale = section.numbers("scale_x_y", "1")
         head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
-        if head.channels != self._here.channels:
-            raise DataError(f"{section.where}: [yolo] expected {head.channels} channels, got {self._here.channels}")
+        section.check(head.channels == self._here.channels, f"{head.channels} channels", self._here.channels)
         self._note(self._here.channels, self._here.step)
         return head
 
@@ -266,25 +253,19 @@ class _Builder:
 
     def _layer(self, section: Section, key: str, number: int) -> int:
         index = number if number >= 0 else len(self.shapes) + number
-        if not 0 <= index < len(self.shapes):
-            raise DataError(
-                f"{section.where}: [{section.kind}] expected {key} to name an earlier layer, got {key}={number}"
-            )
+        section.check(0 <= index < len(self.shapes), f"{key} to name an earlier layer", f"{key}={number}")
         return index
 
 
 def _check_kernel(section: Section, size: int, stride: int, padding: int) -> None:
-    if size > _LARGEST_KERNEL or stride > _LARGEST_KERNEL or padding > size:
-        raise DataError(
-            f"{section.where}: [{section.kind}] expected size and stride up to {_LARGEST_KERNEL} and no more padding "
-            f"than size, got {size}, {stride} and {padding}"
-        )
+    fits = max(size, stride) <= _LARGEST_KERNEL and padding <= size
+    limits = f"size and stride up to {_LARGEST_KERNEL} and no more padding than size"
+    section.check(fits, limits, f"{size}, {stride} and {padding}")
 
 
 def _activation(section: Section, default: str) -> str:
     name = section.text("activation", default)
-    if name not in _ACTIVATIONS:
-        raise DataError(f"{section.where}: activation {name!r} is not supported; known: {', '.join(_ACTIVATIONS)}")
+    section.check(name in _ACTIVATIONS, f"one of the activations {', '.join(_ACTIVATIONS)}", repr(name))
     return name
 
 
@@ -298,17 +279,15 @@ class Darknet(nn.Module):
     def __init__(self, sections: Sequence[Section]) -> None:
         super().__init__()
         self.sections = tuple(sections)
-        if not sections or sections[0].kind not in ("net", "network"):
-            got = f"[{sections[0].kind}]" if sections else "no sections"
-            raise DataError(f"cfg: expected [net] as its first section, got {got}")
+        first = f"[{sections[0].kind}]" if sections else "no sections"
+        check_data(first in ("[net]", "[network]"), "cfg", "[net] as its first section", first)
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
         self.channels = sections[0].integer("channels", 3)
         check_canvas(sections[0].where, self.input_size)
         builder = _Builder(self.channels, self.input_size)
         self.layers = nn.ModuleList([builder.add(section) for section in sections[1:]])
         self.heads = [layer for layer in self.layers if isinstance(layer, Head)]
-        if not self.heads:
-            raise DataError(f"{sections[0].where}: expected at least one [yolo] section, got none")
+        sections[0].check(bool(self.heads), "at least one [yolo] section", "none")
         self.stride = max(-(-shape.step.numerator // shape.step.denominator) for shape in builder.shapes)
         self.sources = builder.sources
         self.steps = [shape.step for shape in builder.shapes]
@@ -393,16 +372,11 @@ class Darknet(nn.Module):
             major, minor, _ = struct.unpack_from("<3i", data)
             start = 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
         needed = start + 4 * sum(_count(layer) for layer in layers)
-        if length != needed or len(data) != needed:
-            fault = "truncated" if length < needed else "too long"
-            sizes = f"expected {needed} bytes for this network, got {length}"
-            raise DataError(f"weights {str(path)!r}: {sizes}; the file is {fault}, or belongs to another network")
+        got = f"{length}; the file is {'truncated' if length < needed else 'too long'}, or belongs to another network"
+        check_data(length == len(data) == needed, f"weights {str(path)!r}", f"{needed} bytes for this network", got)
         numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
-        if not bool(torch.isfinite(numbers).all()):
-            raise DataError(
-                f"weights {str(path)!r}: expected finite numbers, got NaN or infinite ones; the file is damaged or not "
-                f"a weights file"
-            )
+        got = "NaN or infinite ones; the file is damaged or not a weights file"
+        check_data(bool(numbers.isfinite().all()), f"weights {str(path)!r}", "finite numbers", got)
         for layer in layers:
             numbers = _fill(layer, numbers, str(path))
         return hashlib.sha256(data).hexdigest()
@@ -420,10 +394,8 @@ def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
     bias = vectors[0]
     if layer.normalised:
         _, scale, mean, variance = vectors
-        if bool((variance < 0).any()):
-            raise DataError(
-                f"weights {path!r}: expected variances of at least 0, got negative ones; the file does not fit the cfg"
-            )
+        got = "negative ones; the file does not fit the cfg"
+        check_data(not bool((variance < 0).any()), f"weights {path!r}", "variances of at least 0", got)
         factor = scale / (variance + _EPSILON).sqrt()
         weight, bias = weight * factor[:, None, None, None], bias - mean * factor
     layer.weight.copy_(weight)

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from semfov.errors import DataError
+from semfov.errors import DataError, check_data
 from semfov.io.files import read_text
 from semfov.io.schema import excerpt
 
@@ -20,41 +21,39 @@ class Section(NamedTuple):
     options: Mapping[str, str]
     where: str = "cfg"
 
+    def check(self, condition: bool, expected: str, got: object, key: str = "") -> None:
+        """Raise `DataError` with the place of the section, and of a key in it, unless a condition holds."""
+        check_data(condition, f"{self.where}: [{self.kind}] {key}".rstrip(), expected, got)
+
     def text(self, key: str, default: str | None = None) -> str:
         """The value of `key` as text; a key without a default is required."""
         value = self.options.get(key, default)
-        if value is None:
-            raise DataError(f"{self.where}: [{self.kind}] expected the key {key!r}, which is missing")
-        return value
+        self.check(value is not None, f"the key {key!r}", "none")
+        return str(value)
 
     def integers(self, key: str, default: str | None = None) -> tuple[int, ...]:
         """The value of `key` as a list of whole numbers."""
         return self._values(int, key, default, "whole numbers")
 
     def numbers(self, key: str, default: str | None = None) -> tuple[float, ...]:
-        """The value of `key` as a list of numbers."""
-        numbers = self._values(float, key, default, "numbers")
-        if not all(map(math.isfinite, numbers)):
-            raise self._refuse(key, "finite numbers")
-        return numbers
+        """The value of `key` as a list of finite numbers."""
+        return self._values(float, key, default, "finite numbers")
 
     def integer(self, key: str, default: int | None = None, *, minimum: int = 1) -> int:
         """The value of `key` as one whole number, at least `minimum`."""
-        values = self.integers(key, None if default is None else str(default))
-        if len(values) != 1 or values[0] < minimum:
-            raise self._refuse(key, f"one whole number of at least {minimum}")
+        expected = f"one whole number of at least {minimum}"
+        values = self._values(int, key, None if default is None else str(default), expected)
+        self.check(len(values) == 1 and values[0] >= minimum, expected, excerpt(self.options.get(key)), key)
         return values[0]
 
     def _values(self, kind: Callable[[str], _T], key: str, default: str | None, expected: str) -> tuple[_T, ...]:
-        try:
-            return tuple(kind(part) for part in self.text(key, default).split(",") if part.strip())
-        except ValueError as error:
-            raise self._refuse(key, expected) from error
-
-    def _refuse(self, key: str, expected: str) -> DataError:
-        return DataError(
-            f"{self.where}: [{self.kind}] {key}: expected {expected}, got {excerpt(self.options.get(key))}"
-        )
+        text = self.text(key, default)
+        values: tuple[Any, ...] = (math.nan,)
+        with suppress(ValueError):
+            values = tuple(kind(part) for part in text.split(",") if part.strip())
+        finite = all(0 * value == 0 for value in values)  # also of whole numbers that no float can hold
+        self.check(finite, expected, excerpt(text), key)
+        return values
 
 
 def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:

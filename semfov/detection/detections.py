@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from semfov.detection.exchange import category_ids, coco_results, named_detections
-from semfov.errors import InputError, check, check_shape, check_whole
+from semfov.errors import check, check_shape, check_whole
 
 if TYPE_CHECKING:
     import supervision
@@ -139,13 +139,9 @@ class Detections:
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Boxes, score vectors, classes from 1, and scores of the single image."""
-        mask = self.mask
-        if mask.shape[:-1].numel() != 1:
-            raise InputError(
-                f"detections: expected the detections of one image, such as detections[0], got a batch of shape "
-                f"{tuple(mask.shape[:-1])}"
-            )
-        real = mask.reshape(-1)
+        lead, real = self.mask.shape[:-1], self.mask.reshape(-1)
+        one = "the detections of one image, such as detections[0]"
+        check(lead.numel() == 1, "detections", one, f"a batch of shape {tuple(lead)}")
         boxes, vectors = self.boxes.reshape(-1, 4)[real], self.scores.reshape(-1, self.scores.shape[-1])[real]
         best = vectors[:, 1:].max(-1) if vectors.shape[-1] > 1 else vectors.max(-1)
         return boxes, vectors, best.indices + 1, best.values
@@ -199,13 +195,11 @@ class Detections:
             shape = (len(boxes), classes + 1)
             check(tuple(vectors.shape) == shape, "data['scores']", f"shape {shape}", tuple(vectors.shape))
             return cls._one_image(boxes, vectors)
-        if detections.class_id is None and len(boxes):
-            raise InputError("detections: expected a class_id for every box, got none")
-        labels = torch.as_tensor([] if detections.class_id is None else detections.class_id).long() + 1
-        confidence = detections.confidence
-        return cls._one_image(
-            boxes, _vectors_of(labels, None if confidence is None else torch.as_tensor(confidence), classes)
-        )
+        numbers, confidence = detections.class_id, detections.confidence
+        check(numbers is not None or not len(boxes), "detections", "a class_id for every box", "none")
+        labels = torch.as_tensor([] if numbers is None else numbers).long() + 1
+        scores = None if confidence is None else torch.as_tensor(confidence)
+        return cls._one_image(boxes, _vectors_of(labels, scores, classes))
 
     def to_torchvision(self) -> dict[str, Tensor]:
         """Convert the detections of one image to the form of torchvision's detectors, which `torchmetrics` also takes.

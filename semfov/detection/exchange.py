@@ -51,13 +51,12 @@ def category_ids(
     categories: Sequence[int] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
 ) -> list[int]:
     """Find the category id of each class."""
-    ids = [category for category in categories if not isinstance(category, Mapping)]
-    if len(ids) == len(categories):
-        check(all(map(_is_whole, ids)), "categories", "whole numbers, or categories of an annotation file", ids[:3])
-        return [index(each) for each in ids]
+    named = [category for category in categories if isinstance(category, Mapping)]
+    if not named:
+        check(all(map(_is_whole, categories)), "categories", "whole numbers, or categories of a file", categories[:3])
+        return [index(each) for each in categories if not isinstance(each, Mapping)]
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
-    named = [category for category in categories if isinstance(category, Mapping)]
     by_name = {canonical_name(str(category["name"])): int(category["id"]) for category in named}
     names = class_indices(classes)
     missing = [name for name in names if name not in by_name]

@@ -52,29 +52,20 @@ def _decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     scores, numbers = rows[..., 4], rows[..., 5]
     if values_known(rows):
         used = numbers[scores > 0]
-        check(
-            bool((used == used.round()).all()),
-            "rows",
-            "a whole number of a class in the last column",
-            used[:3].tolist(),
-        )
+        whole = bool((used == used.round()).all())
+        check(whole, "rows", "a whole number of a class in the last column", used[:3].tolist())
         known = not len(used) or (float(used.min()) >= 0 and float(used.max()) < classes)
-        check(
-            known,
-            "classes",
-            "a name for each class of the rows",
-            f"{classes}, and class {used.max() if len(used) else 0:g}",
-        )
+        got = f"{classes}, and class {used.max() if len(used) else 0:g}"
+        check(known, "classes", "a name for each class of the rows", got)
     index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
-    return Candidates(
-        rows[..., :4], scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
-    )
+    vectors = scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
+    return Candidates(rows[..., :4], vectors)
 
 
 def _decode_distances(
     classes: Tensor,
     distances: Tensor,
-    canvas: tuple[int, int],
+    canvas: _Canvas,
     *,
     strides: tuple[int, ...] = (8, 16, 32, 64),
     offset: float = 0.5,
@@ -91,7 +82,7 @@ def _decode_distances(
     bins = distances.shape[-1] // 4
     whole = bins > 0 and distances.shape[-1] == 4 * bins
     check(whole, "distances", "4 · bins channels, the same number of bins for each side", tuple(distances.shape))
-    grid = _grid(distances.shape[1], (canvas[0], canvas[1]), strides, offset, distances.dtype, distances.device)
+    grid = _grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
     expected = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     point, reach = grid[:, :2] * grid[:, 2:], expected * grid[:, 2:]
     return Candidates(torch.cat([point - reach[..., :2], point + reach[..., 2:]], -1), classes)
@@ -255,7 +246,7 @@ def _distances(signature: Signature) -> Iterator[str]:
     """Heads with a class map and a distance map for each level."""
     shapes = [shape for _, shape in signature.outputs]
     count = len(shapes) // 2
-    rows = [columns * rows for columns, rows in (cells(signature.canvas, s) for s in STRIDES[:count])]
+    rows = [_cell_count(signature.canvas, [stride]) for stride in STRIDES[:count]]
     if any(len(shape) != 3 for shape in shapes) or sorted(shape[1] for shape in shapes) != sorted(rows * 2):
         return
     if "paddle" in signature.producer.lower():
@@ -344,7 +335,7 @@ def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
         low, high = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         check(not 0 <= low < high <= 1, "output of the head", form, "numbers from 0 to 1, as fractions of the canvas")
-    grid = _grid(raw.shape[1], (canvas[0], canvas[1]), STRIDES[:3], 0.0, raw.dtype, raw.device)
+    grid = _grid(raw.shape[1], canvas, STRIDES[:3], 0.0, raw.dtype, raw.device)
     centre = (raw[..., 0:2] + grid[:, :2]) * grid[:, 2:]
     size = raw[..., 2:4].exp() * grid[:, 2:]
     return Candidates(_corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
@@ -353,14 +344,10 @@ def _yolox(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
 def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
-    maps = list(outputs.values())
-    levels = []
-    for stride in strides:
-        columns, rows = cells(canvas, stride)
-        levels.append([each for each in maps if each.shape[1] == columns * rows])
-    if any(len(level) != 2 for level in levels):
-        got = [tuple(each.shape) for each in maps]
-        raise InputError(f"outputs: expected a class and a distance map at each of strides {strides}, got {got}")
+    counts = [_cell_count(canvas, [stride]) for stride in strides]
+    levels = [[each for each in outputs.values() if each.shape[1] == count] for count in counts]
+    pairs, shapes = all(len(level) == 2 for level in levels), [tuple(each.shape) for each in outputs.values()]
+    check(pairs, "outputs", f"a class and a distance map at each of strides {strides}", shapes)
     classes, distances = (torch.cat([level[index] for level in levels], 1) for index in (0, 1))
     return _decode_distances(classes, distances, canvas, strides=strides)
 

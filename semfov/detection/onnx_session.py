@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
-from semfov.errors import DataError, InputError, check
-from semfov.io.files import check_regular, inside
+from semfov.errors import DataError, InputError, check, check_data
+from semfov.io.files import check_regular, inside, reading
 from semfov.io.schema import excerpt
 
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -69,7 +69,6 @@ class OnnxSession:
         threads: int | None = None,
         device: torch.device | str = "cpu",
         providers: Sequence[_Provider] | None = None,
-        spinning: bool = False,
         open_ended: bool | None = None,
         further: Sequence[str] = (),
     ) -> None:
@@ -84,15 +83,15 @@ class OnnxSession:
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
-        options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self.open_ended = check_file(self.path) if open_ended is None else open_ended
         self._settings: dict[str, Any] = {
             "threads": self.threads,
             "device": device,
             "providers": self.providers,
-            "spinning": spinning,
+            "open_ended": self.open_ended,
+            "further": tuple(further),
         }
-        self._settings |= {"open_ended": self.open_ended, "further": tuple(further)}
         if self.open_ended:
             _limit_memory()
             options.add_session_config_entry("session.use_env_allocators", "1")
@@ -114,9 +113,8 @@ class OnnxSession:
             self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
             self.producer: str = meta.producer_name
             for output in self._session.get_outputs():
-                if output.type not in _FLOATS:
-                    what = f"{self.path.name}: output {output.name!r}"
-                    raise InputError(f"{what}: expected floating-point numbers, got {output.type}")
+                name = f"{self.path.name}: output {output.name!r}"
+                check(output.type in _FLOATS, name, "floating-point numbers", output.type)
             self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
             self.image, self.shape, self._dtype, self._extra = self._inputs()
         except UnicodeDecodeError as error:
@@ -128,13 +126,11 @@ class OnnxSession:
         inputs = self._session.get_inputs()
         images = [i for i in inputs if len(i.shape) == 4 and i.type in _FLOATS]
         description = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
-        if len(images) != 1 or _sizes(images[0].shape)[1] not in (3, None):
-            raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {description}")
+        fits = len(images) == 1 and _sizes(images[0].shape)[1] in (3, None)
+        check(fits, self.path.name, "one floating-point input (B, 3, H, W)", description)
         extra = [i.name for i in inputs if i is not images[0]]
-        if not set(extra) <= set(_EXTRA_INPUTS):
-            raise InputError(
-                f"{self.path.name}: expected no inputs but an image and {', '.join(_EXTRA_INPUTS)}, got {description}"
-            )
+        known = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
+        check(set(extra) <= set(_EXTRA_INPUTS), self.path.name, known, description)
         return images[0].name, _sizes(images[0].shape), _FLOATS[images[0].type], extra
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
@@ -164,11 +160,8 @@ class OnnxSession:
                 reason = f"its tensors need more than {_MOST_MEMORY >> 20} MiB, as with too many boxes; {reason}"
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         for name, array in zip(names, arrays, strict=True):
-            if array.ndim < 1 or array.shape[0] != len(image):
-                raise InputError(
-                    f"{self.path.name}: output {name!r}: expected a row for each of {len(image)} images, got shape "
-                    f"{tuple(array.shape)}"
-                )
+            expected, got = f"a row for each of {len(image)} images", f"shape {array.shape}"
+            check(array.shape[:1] == (len(image),), f"{self.path.name}: output {name!r}", expected, got)
         return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
     def _limited(self, names: list[str], feed: dict[str, Any]) -> Any:
@@ -227,9 +220,8 @@ def check_file(path: Path) -> bool:
     import onnx
 
     name = f"ONNX model {str(path)!r}"
-    check_regular(path, name)
-    if not path.is_file():
-        raise DataError(f"{name}: no such file; check the path")
+    with reading(path, name):
+        path.stat()
     try:
         model = onnx.load(path, load_external_data=False)
         stored = [*model.graph.initializer]
@@ -239,8 +231,8 @@ def check_file(path: Path) -> bool:
                     check_regular(inside(path.parent, entry.value))
         for tensor in stored:
             _check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
-        if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > _MOST_METADATA:
-            raise DataError(f"{name}: expected at most {_MOST_METADATA:,} characters of metadata")
+        length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
+        check_data(length <= _MOST_METADATA, name, f"at most {_MOST_METADATA:,} characters of metadata", f"{length:,}")
         slim = _without_weights(model)
         for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
             for place, side in enumerate(value.type.tensor_type.shape.dim):
@@ -266,8 +258,8 @@ def check_file(path: Path) -> bool:
 def _check_elements(name: str, sizes: Iterable[int]) -> None:
     """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
     sizes = list(sizes)
-    if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
-        raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
+    fits = min(sizes, default=0) >= 0 and math.prod(sizes) <= _MOST_ELEMENTS
+    check_data(fits, name, f"at most {_MOST_ELEMENTS:,} numbers", f"sizes {excerpt(sizes)}")
 
 
 def _dims(value: Any) -> list[int]:
@@ -281,14 +273,14 @@ def _without_weights(model: Any) -> Any:
 
     slim = onnx.ModelProto()
     slim.CopyFrom(model)
-    for tensor in slim.graph.initializer:
-        if math.prod(tensor.dims) > 1024:
-            slim.graph.input.append(
-                onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims))
-            )
-    small = [tensor for tensor in slim.graph.initializer if math.prod(tensor.dims) <= 1024]
+    stored = [*slim.graph.initializer]
     del slim.graph.initializer[:]
-    slim.graph.initializer.extend(small)
+    for tensor in stored:
+        if math.prod(tensor.dims) <= 1024:
+            slim.graph.initializer.append(tensor)
+        else:
+            shape = onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims))
+            slim.graph.input.append(shape)
     return slim
 
 
@@ -322,9 +314,8 @@ def _providers(device: torch.device, providers: Sequence[_Provider] | None) -> l
     if device.type == "cpu":
         return ["CPUExecutionProvider"]
     provider = f"{device.type.upper()}ExecutionProvider"
-    if provider not in have:
-        expected = "expected a device that onnxruntime can use"
-        raise InputError(f"device: {expected}, got {device} (its providers: {', '.join(have)})")
+    got = f"{device} (its providers: {', '.join(have)})"
+    check(provider in have, "device", "a device that onnxruntime can use", got)
     return [(provider, {"device_id": device.index or 0}), "CPUExecutionProvider"]
 
 

@@ -58,46 +58,29 @@ def select(
     return chosen if chosen.boxes.device == device else chosen.to(device)
 
 
-def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:
-    """Raise `InputError` where a detector returns NaN or infinite values."""
-    if not values_known(confidence, boxes):
-        return
-    named = {"confidence": confidence.detach(), "boxes": boxes.detach()}
-    # The range of the numbers takes one pass over them. It is finite only if all of them are.
-    ranges = [numbers.aminmax() for numbers in named.values() if numbers.numel()]
-    if ranges and not math.isfinite(sum(high - low for low, high in ranges)):
-        for name, numbers in named.items():
-            check_finite(numbers, f"detector: {name} in image {image}")
-
-
-def check_scores(image: int, candidates: Candidates) -> None:
-    """Raise `InputError` where a selected box has a score outside [0, 1]."""
-    if not values_known(candidates.classes):
-        return
-    named = {"class scores": candidates.classes, "objectness": candidates.objectness}
-    ranges = {name: each.detach().aminmax() for name, each in named.items() if each is not None and each.numel()}
-    inside = {name: (low >= 0) & (high <= 1) for name, (low, high) in ranges.items()}
-    if inside and not bool(torch.stack([*inside.values()]).all()):
-        name = next(name for name, fits in inside.items() if not bool(fits))
-        check(False, f"detector: {name} in image {image}", "numbers in [0, 1]", "numbers outside")
+def check_numbers(image: int, low: float, high: float, **named: Tensor | None) -> None:
+    """Raise `InputError` where a detector returns NaN, infinite numbers, or numbers outside a range."""
+    for name, each in named.items():
+        if each is not None and each.numel() and values_known(each):
+            least, most = map(float, each.detach().aminmax())  # one pass; NaN and infinite numbers are among them
+            if not (low <= least and most <= high and math.isfinite(most - least)):
+                where = f"detector: {name.replace('_', ' ')} in image {image}"
+                check_finite(each, where)
+                check(False, where, f"numbers in [{low:g}, {high:g}]", "numbers outside")
 
 
 def _select_one(
-    candidates: Candidates,
-    image: int,
-    placement: Placement | None,
-    selection: Selection,
-    policy: BackgroundPolicy,
+    candidates: Candidates, image: int, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
     confidence = candidates.confidence[image]
     index = (confidence >= selection.threshold).nonzero()[:, 0]
     boxes = candidates.boxes[image].index_select(0, index)
-    check_candidates(image, confidence, boxes)
+    check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
     boxes = boxes if placement is None else placement.boxes_to_image(boxes)
     labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
     chosen = suppress(boxes, confidence.index_select(0, index), labels, selection)
     rows = candidates.take(image, index[chosen])
-    check_scores(image, rows)
+    check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     scores = score_vectors(rows, policy)
     # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
     order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)

@@ -10,13 +10,13 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
 from semfov.detection.scores import Candidates
-from semfov.errors import DataError, InputError, check, lookup
+from semfov.errors import DataError, InputError, check, check_data, lookup
 from semfov.io.files import sha256
 
 _Raw = list[tuple[Tensor, Tensor]]
@@ -48,10 +48,7 @@ class TorchvisionDetector(ModuleDetector):
             count = _output_count(model)
             check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
             classes = names[first:]
-        head = _head_of(model)
-        if head is None:
-            raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
-        outputs, softmax = head
+        outputs, softmax = _head_of(model)
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
         transform: Any = model.transform
         fixed = transform.fixed_size
@@ -88,16 +85,13 @@ class TorchvisionDetector(ModuleDetector):
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1], padded with empty boxes to one number."""
         raw = self.outputs(canvas)
-        longest = max((len(scores) for _, scores in raw), default=0)
         images = [self._candidates(boxes, scores) for boxes, scores in raw]
-        boxes, classes = (
-            torch.stack([F.pad(x, (0, 0, 0, longest - len(x))) for x in column]).to(canvas.dtype)
-            for column in ([c.boxes for c in images], [c.classes for c in images])
-        )
-        background = None
-        if self._softmax:
-            rows = [scores[:, 0] for _, scores in raw]
-            background = torch.stack([F.pad(x, (0, longest - len(x)), value=1.0) for x in rows]).to(canvas.dtype)
+
+        def padded(rows: list[Tensor], value: float = 0.0) -> Tensor:
+            return pad_sequence(rows, True, value).to(canvas.dtype)
+
+        background = padded([scores[:, 0] for _, scores in raw], 1.0) if self._softmax else None
+        boxes, classes = padded([each.boxes for each in images]), padded([each.classes for each in images])
         return Candidates(boxes, classes, background=background)
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
@@ -141,30 +135,23 @@ class TorchvisionDetector(ModuleDetector):
             named = isinstance(weights, str) and not Path(text).suffix
             enum = members[lookup(text, [*members.__members__], f"{members.__name__} member")] if named else None
         if enum is not None:
-            if classes is not None:
-                raise InputError(
-                    "classes: expected None, because torchvision's weights have their own classes, got names"
-                )
+            check(classes is None, "classes", "None, because torchvision's weights have their own classes", "names")
             classes = enum.meta["categories"][1:]
             digest = _download(enum)
         elif classes is None:
             raise InputError("classes: expected the names of the model's classes without background, got None")
         else:
             model |= {"num_classes": len(classes) + first, "weights_backbone": None}
-            if weights is not None and not Path(weights).is_file():
-                raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
-            digest = "" if weights is None else sha256(weights)
+            digest = "" if weights is None else sha256(weights, f"weights {fspath(weights)!r}")
         try:
             network = models.get_model(name, weights=enum, **model)
         except (TypeError, ValueError) as error:
             raise InputError(f"options of {name}: {error}") from error
         # The builder and the constructors of its model would silently accept any other option.
-        builders = (
-            models.get_model_builder(name),
-            *(each for each in type(network).__mro__ if issubclass(each, nn.Module)),
-        )
+        modules = (each for each in type(network).__mro__ if issubclass(each, nn.Module))
+        builders = models.get_model_builder(name), *modules
+        known = sorted({each for call in builders for each in inspect.signature(call).parameters})
         for option in model:
-            known = sorted({each for call in builders for each in inspect.signature(call).parameters})
             lookup(option, known, f"option of {name}")
         if enum is None and weights is not None:
             _load_state(network, Path(weights))
@@ -184,11 +171,9 @@ def _download(enum: Any) -> str:
     path = Path(torch.hub.get_dir()) / "checkpoints" / Path(enum.url).name
     digest = sha256(path)
     start = re.search(r"-([0-9a-f]{8,})\.", path.name)
-    if start is not None and not digest.startswith(start[1]):
-        raise DataError(
-            f"weights {path}: damaged, expected a sha256 that begins with {start[1]}, got {digest}; delete the file to "
-            f"fetch it again"
-        )
+    fits, begins = start is None or digest.startswith(start[1]), start and start[1]
+    got = f"{digest}; delete the file to fetch it again"
+    check_data(fits, f"weights {path}: damaged", f"a sha256 that begins with {begins}", got)
     return digest
 
 
@@ -271,8 +256,8 @@ def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
     return clip_boxes_to_image(boxes, size)
 
 
-def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool] | None:
-    """The function that decodes a kind of model, and whether its scores are a softmax; None for an unknown kind."""
+def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool]:
+    """The function that decodes a kind of model, and whether its scores are a softmax."""
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.ssd import SSD
 
@@ -284,7 +269,7 @@ def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool] |
     ):
         if isinstance(model, kind):
             return function, softmax
-    return None
+    raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
 
 
 def _output_count(model: nn.Module) -> int | None:

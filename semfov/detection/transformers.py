@@ -39,11 +39,8 @@ class TransformersDetector(ModuleDetector):
         config: Any = model.config
         detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
         takes_text = "input_ids" in inspect.signature(model.forward).parameters
-        if not detects or takes_text:
-            raise InputError(
-                f"detector: expected a model for object detection with classes of its own, such as "
-                f"RTDetrForObjectDetection, got {type(model).__name__}"
-            )
+        expected = "a model for object detection with classes of its own, such as RTDetrForObjectDetection"
+        check(detects and not takes_text, "detector", expected, type(model).__name__)
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
         normal, usual = config.model_type in _IMAGENET, HEADS["detr"].preprocessing
@@ -142,9 +139,8 @@ def _size(settings: Mapping[str, Any], usual: Mapping[str, int]) -> dict[str, in
         given = {"shortest_edge": given, "longest_edge": settings.get("max_size")}
     elif isinstance(given, list | tuple) and len(given) == 2:
         given = {"height": given[0], "width": given[1]}
-    size = {
-        name: value for name, value in dict(given if isinstance(given, Mapping) else {}).items() if value is not None
-    }
+    sides = given if isinstance(given, Mapping) else {}
+    size = {name: value for name, value in sides.items() if value is not None}
     kinds = [{"height", "width"}, {*_MOST}, {*_EDGES}, *({name} for name in _EDGES)]
     whole = all(type(value) is int and 0 < value <= _LARGEST for value in size.values())
     wanted = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from semfov.detection.modules import ModuleDetector, module_digest
 from semfov.detection.onnx_heads import decode_yolov8
 from semfov.detection.scores import Candidates
-from semfov.errors import InputError
+from semfov.errors import InputError, check
 
 
 class UltralyticsDetector(ModuleDetector):
@@ -49,10 +49,8 @@ class UltralyticsDetector(ModuleDetector):
     def propose(self, canvas: Tensor) -> Candidates:
         outputs = self.model(self._pixels(canvas))
         columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
-        if not isinstance(columns, Tensor) or columns.ndim != 3 or columns.shape[1] != 4 + self._count:
-            got = tuple(columns.shape) if isinstance(columns, Tensor) else type(columns).__name__
-            raise InputError(
-                f"detector: expected a network that returns all class scores of each box, (B, {4 + self._count}, N), "
-                f"got {got}; use a detection model whose head selects no boxes (end2end off)"
-            )
+        shape = tuple(columns.shape) if isinstance(columns, Tensor) else (type(columns).__name__,)
+        expected = f"a network that returns all class scores of each box, (B, {4 + self._count}, N)"
+        way = "use a detection model whose head selects no boxes (end2end off)"
+        check(len(shape) == 3 and shape[1] == 4 + self._count, "detector", expected, f"{shape}; {way}")
         return self._named(decode_yolov8(columns.to(canvas.dtype)))

@@ -14,7 +14,7 @@ from semfov.data.windowed import LargePicture, resized
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.scores import BackgroundPolicy, Candidates, shares
-from semfov.detection.selection import check_candidates, check_scores, select
+from semfov.detection.selection import check_numbers, select
 from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import edges_at
 from semfov.threads import beside
@@ -276,8 +276,8 @@ def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, fain
     index = (confidence >= faint).nonzero()[:, 0]
     selected = candidates.take(image, index)
     boxes = selected.boxes.detach()
-    check_candidates(image, confidence, boxes)
-    check_scores(image, selected)
+    check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
+    check_numbers(image, 0, 1, class_scores=selected.classes, objectness=selected.objectness)
     return Hints(boxes, shares(selected, policy)[1].detach())
 
 

@@ -146,8 +146,8 @@ MAPS = "[convolutional]\nfilters=6\nactivation=linear\n"
         (MAPS + YOLO, "expected [net]"),
         (NET + MAPS, "at least one [yolo]"),
         (NET + "[lstm]\n", "cfg:5: layer [lstm] is not supported"),
-        (NET + "[convolutional]\nactivation=hardtan\n", "activation 'hardtan' is not supported"),
-        (NET + "[convolutional]\nactivation=linear\ndilation=2\n", "dilation=2 is not supported"),
+        (NET + "[convolutional]\nactivation=hardtan\n", "got 'hardtan'"),
+        (NET + "[convolutional]\nactivation=linear\ndilation=2\n", "got dilation=2, which is not supported"),
         (
             NET + "[convolutional]\nfilters=4\ngroups=2\nactivation=linear\n",
             "groups that divide 3 input channels and 4 filters, got 2",
@@ -256,11 +256,11 @@ def test_values_are_converted_and_checked():
     assert section.numbers("anchors") == (1.5, 2.0, 3.0, 4.0)
     assert section.integer("size") == 3
     assert section.integer("stride", 2) == 2
-    unusable(r"a.cfg:7: \[yolo\] expected the key 'classes', which is missing", section.integer, "classes")
+    unusable(r"a.cfg:7: \[yolo\]: expected the key 'classes', got none", section.integer, "classes")
     for key in ("mask", "word"):
         unusable(rf"a.cfg:7: \[yolo\] {key}: expected", section.integer, key)
     unusable("of at least 4, got '3'", section.integer, "size", minimum=4)
-    unusable("expected numbers, got 'x'", section.numbers, "word")
+    unusable("expected finite numbers, got 'x'", section.numbers, "word")
 
 
 @pytest.mark.parametrize(
