@@ -69,6 +69,7 @@ class OnnxSession:
         threads: int | None = None,
         device: torch.device | str = "cpu",
         providers: Sequence[_Provider] | None = None,
+        spinning: bool = False,
         open_ended: bool | None = None,
         further: Sequence[str] = (),
     ) -> None:
@@ -83,12 +84,13 @@ class OnnxSession:
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
         self.open_ended = check_file(self.path) if open_ended is None else open_ended
         self._settings: dict[str, Any] = {
             "threads": self.threads,
             "device": device,
             "providers": self.providers,
+            "spinning": spinning,
             "open_ended": self.open_ended,
             "further": tuple(further),
         }
