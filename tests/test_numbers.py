@@ -191,6 +191,7 @@ KNOWN = {
         f"rate, {_FOVEA_RATE}": "code",
         "40 of the fitting": "videos of the table",
         "20 frames": "videos of the table",
+        "of 16 bits": "a type",
     },
     "docs/guides/records.md": {
         f"which is {LEAST} unless": "code",
@@ -238,7 +239,6 @@ SHARES = {
         "less than half of themselves": "visibility in the annotations of the street",
         "less than a tenth of an object": "the border of low-yield cells in the code",
         "count for a tenth of it": "in the file of the model and its card",
-        "about a tenth of the products": "50 of 540 million",
     },
 }
 """What shares and ratios in words are made of: the two numbers, in quotation marks if tables have them, or a reason."""
