@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import time
+from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -138,29 +139,26 @@ def _class_counts(run: Looking, scenes: Any) -> dict[str, int]:
 
 def _thin_classes(counts: dict[str, int], thin: int) -> list[str]:
     """Write warnings, as lines of Markdown, about classes with fewer than `thin` objects to learn from."""
-    none = [name for name, count in counts.items() if count == 0]
-    few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
-    lines = []
-    if none:
-        lines += [f"**No object to learn from** ({len(none)} classes): {', '.join(none)}.", ""]
-    if few:
-        lines += [f"**Fewer than {thin} objects to learn from** ({len(few)} classes): {', '.join(few)}.", ""]
+    rare = {
+        "No object": [name for name, count in counts.items() if count == 0],
+        f"Fewer than {thin} objects": [f"{name} {count}" for name, count in counts.items() if 0 < count < thin],
+    }
+    lines = [
+        f"**{what} to learn from** ({len(some)} classes): {', '.join(some)}." for what, some in rare.items() if some
+    ]
     if lines:
-        lines += [
+        lines.append(
             "The target evidence and the map process the scores of all classes with one network; only one number per "
             "class, its frequency, is separate. The observation model changes the scores of a class without examples "
-            "very little.",
-            "",
-        ]
-    return lines
+            "very little."
+        )
+    return [text for line in lines for text in (line, "")]
 
 
-def _detector_report(config: FitDetectorConfig, run: Looking, results: dict[str, PartResult], seconds: float) -> str:
+def _detector_report(inputs: PartInputs, seconds: float) -> str:
     """Write the report as Markdown."""
-    photographs = len(run.scenes)
-    holdout = config.holdout or 5
-    held_out = [index for index in range(photographs) if index % holdout == 0]
-    counts = _class_counts(run, (index for index in range(photographs) if index % holdout))
+    config, run, results, held_out = inputs.config, inputs.run, inputs.results, inputs.held_out
+    counts = _class_counts(run, {*range(len(run.scenes))} - {*held_out})
     rows = [["part", "used", "result on held-out photographs"]]
     rows += [
         [_TITLES[name], "yes" if each.part.used else _UNUSED.get(name, "no, raw"), each.part.why]
@@ -169,7 +167,7 @@ def _detector_report(config: FitDetectorConfig, run: Looking, results: dict[str,
     lines = [
         f"# Models of {run.eye.detector.name}",
         "",
-        f"{photographs} photographs, {len(held_out)} of them held out (one in {holdout}); "
+        f"{len(run.scenes)} photographs, {len(held_out)} of them held out (one in {config.holdout}); "
         f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
         f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
         "",
@@ -236,7 +234,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
             with whole.stage(part):
                 folder.fit(part)
     path = _manifest_of(folder).write(config.out)
-    text = _detector_report(config, run, results, time.monotonic() - started)
+    text = _detector_report(folder.inputs, time.monotonic() - started)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
@@ -255,10 +253,8 @@ def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
         check_sources(config.data, config.detector)
         make_detector(config.detector)
     except UnnamedClasses as error:
-        names: tuple[str, ...] = ()
-        if config.data.annotations is not None:
-            coco, _ = read_annotations(config.data.annotations)
-            names = tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
+        coco = None if config.data.annotations is None else read_annotations(config.data.annotations)[0]
+        names = () if coco is None else tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
         if len(names) != error.count:
             known = f"; the annotations have {len(names)} categories" if names else ""
             raise InputError(f"{error}{known}") from None
@@ -374,13 +370,12 @@ class _FolderFit:
         return result
 
     def _read_result(self, file: Path, key: str) -> PartResult | None:
+        """What an earlier run wrote of a part, if it is whole and has this key."""
         out = self.inputs.config.out
-        try:
+        with suppress(Exception):  # a damaged record is no problem, as the part can be fitted again
             record = json.loads(file.read_text(encoding="utf-8"))
-            part = Part(**record["part"])
-            whole = record["key"] == key
-            whole = whole and (part.file is None or sha256(out / part.file) == part.sha256)
-            whole = whole and all((out / figure).is_file() for figure in record["figures"])
-        except Exception:  # a damaged record is no problem, as the part can be fitted again
-            return None
-        return PartResult(part, record["report"], tuple(record["figures"])) if whole else None
+            part, figures = Part(**record["part"]), tuple(record["figures"])
+            kept = part.file is None or sha256(out / part.file) == part.sha256
+            if record["key"] == key and kept and all((out / figure).is_file() for figure in figures):
+                return PartResult(part, record["report"], figures)
+        return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -121,18 +121,18 @@ class FoldStore:
 
     def scores(self, name: str, folds: Iterable[Fold]) -> Scores:
         """The scores of folds as one, read or computed."""
-        parts: dict[tuple[str, int], list[Tensor]] = {}
+
+        def computed(fold: Fold) -> dict[str, Tensor]:
+            scores = fold.scores(self.model(name, fold))
+            return {f"{row}/{source}": each for (row, source), each in scores.items()}
+
+        parts: dict[str, list[Tensor]] = {}
         for fold in folds:
-
-            def computed(fold: Fold = fold) -> dict[str, Tensor]:
-                scores = fold.scores(self.model(name, fold))
-                return {f"{row}/{source}": each for (row, source), each in scores.items()}
-
-            kept = self.kept(f"{name} {fold.title}", {"name": name, **fold.what}, computed)
+            kept = self.kept(f"{name} {fold.title}", {"name": name, **fold.what}, partial(computed, fold))
             for key, each in kept.items():
-                row, _, source = key.rpartition("/")
-                parts.setdefault((row, int(source)), []).append(each)
-        return {key: torch.cat(each) for key, each in parts.items()}
+                parts.setdefault(key, []).append(each)
+        named = ((*key.rpartition("/")[::2], torch.cat(each)) for key, each in parts.items())
+        return {(row, int(source)): each for row, source, each in named}
 
     def kept(
         self, name: str, what: Mapping[str, object], compute: Callable[[], dict[str, Tensor]]

@@ -17,11 +17,7 @@ _LEAST_SIGNAL = 1e-4
 
 
 class _SignalSearch(AcquisitionFunction):
-    """Base of the ideal searchers of Najemnik and Geisler: there is one target, and it is seen through Gaussian noise.
-
-    The prior of the target's place is its probability in every cell by the belief, scaled to sum to 1 over the cells
-    not yet fixated: in a search that continues, no fixated cell held the target.
-    """
+    """Base of the ideal searchers of Najemnik and Geisler: one target is seen through Gaussian noise."""
 
     target: Tensor
     signal: Tensor
@@ -34,7 +30,7 @@ class _SignalSearch(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)`."""
-        place = belief.chance(self.target).masked_fill(visited, 0)
+        place = belief.chance(self.target).masked_fill(visited, 0)  # as the search went on, the target was not there
         place = place / place.sum(-1, keepdim=True).clamp(min=torch.finfo(place.dtype).tiny)
         return one_by_one(self.values, place, self.signal.to(place).expand(len(place), -1, -1))
 

@@ -21,18 +21,13 @@ _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, ho
 
 
 class Outlook(NamedTuple):
-    """The present belief, and the belief after one more look from each of N levels of distance.
-
-    The look is the one with the expected scores. By samples (`look_ahead_by_samples`) there are M looks for each level,
-    and N M in place of N. Likelihoods of the look are `(..., X·Y, N, K+1)`, and their means under the present belief
-    `(..., X·Y, N, 1)`.
-    """
+    """The present belief, and that after a look from each of N levels of distance; by M samples N M in place of N."""
 
     beta: Tensor
     total: Tensor
     mean: Tensor
-    likelihood: Tensor
-    scale: Tensor
+    likelihood: Tensor  # (..., X·Y, N, K+1)
+    scale: Tensor  # their means under the present belief, (..., X·Y, N, 1)
 
     @property
     def growth(self) -> Tensor:
@@ -65,9 +60,7 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
               r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
 
     The expected scores enter Kaplan's rule without calibration (Luzio, Bernardino and Moreno, 2024, the equation of
-    :math:`\bar S^x`, "which can then be applied with Kaplan's rule"). A measure F of the result is the plug-in
-    :math:`F(\beta'(E[S]))`, which the paper calls expected. It is not the expectation :math:`E[F(\beta'(S))]`, because
-    neither the update nor F is linear in the scores; `look_ahead_by_samples` computes that.
+    :math:`\bar S^x`, "which can then be applied with Kaplan's rule").
     """
     total, mean = _total_and_mean(beta)
     return _outlook(beta, total, mean, _expected_looks(mean, expected))
@@ -142,11 +135,7 @@ def sampled_likelihoods(
 
 
 class Lookahead(AcquisitionFunction):
-    """Base of the acquisition functions of exploration that look one step ahead.
-
-    The update of a cell depends on the fixation only through the level of the distance between them. Every cell is
-    therefore updated N times instead of X·Y times, and `forward` looks up the level that applies to each fixation.
-    """
+    """Base of the acquisition functions of exploration that look one step ahead, once from each level of distance."""
 
     levels: Tensor
     likelihoods: Tensor | None

@@ -11,15 +11,7 @@ _TILE = 24
 
 
 def _gaussian_kernel(sigma: float) -> Tensor:
-    r"""Weights of a Gaussian kernel; → `(2r+1,)`.
-
-    .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
-
-    The number of taps is made odd by rounding up. This is OpenCV's kernel for floats where no size is given. The
-    weights are computed by Kornia. The blur is not, because Kornia's takes more than twice as long on a CPU
-    (`benchmarks.pyramid`).
-    """
-    check(sigma > 0, "sigma", "a positive number of pixels", sigma)
+    """Weights of a Gaussian, as many as OpenCV takes for floats; Kornia's blur would take twice as long on a CPU."""
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.filters import get_gaussian_kernel1d
 
@@ -27,10 +19,7 @@ def _gaussian_kernel(sigma: float) -> Tensor:
 
 
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
-    """Blur with a Gaussian, where the border pixels are repeated: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
-
-    Shapes: image `(B, C, H, W)` → `(B, C, H, W)`.
-    """
+    """Blur an image `(B, C, H, W)` with a Gaussian: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`."""
     check_shape(image, "image", None, None, None, None)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     check(sigma > 0, "sigma", "a positive number of pixels", sigma)
@@ -39,10 +28,7 @@ def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor
 
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Enlarge an image by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
-
-    Shapes: image `(..., h, w)`, size `(height, width)` → `(..., height, width)`.
-    """
+    """Enlarge an image `(..., h, w)` to `(height, width)` by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`."""
     check_shape(image, "image", None, None)
     if tuple(image.shape[-2:]) == tuple(size):
         return image

@@ -38,13 +38,10 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 @constant
 def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
-    r"""Even and odd Gabor filters without response to a uniform image, as weights of a convolution `(2n, 1, 9, 9)`.
+    r"""Even and odd Gabor filters, as weights of a convolution `(2n, 1, 9, 9)`: of mean 0 and absolute sum 1.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
-
-    The mean is subtracted, and the absolute values are scaled to sum to 1. At 0° the wave runs along x, and vertical
-    bars give the largest response.
     """
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
     y, x = place[:, None], place[None, :]
@@ -57,15 +54,9 @@ def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _promote(maps: Tensor) -> Tensor:
-    r"""Map normalisation of Itti, Koch and Niebur (1998): promote maps with one strong peak, suppress those with many.
+    """Map normalisation of Itti, Koch and Niebur (1998), `N(M) = M (1 - m)²`; maps `(..., h, w)`.
 
-    .. math:: N(M) = M \, (1 - \bar m)^2
-
-    M is the map scaled to [0, 1], and :math:`\bar m` the mean of its local maxima other than the largest. A local
-    maximum exceeds 0.1 and is no less than its eight neighbours; of equal neighbours the first counts. A map whose
-    range is no more than the rounding errors of values up to 1 becomes 0.
-
-    Shapes: maps `(..., h, w)`.
+    m is the mean of the local maxima above 0.1 other than the largest; a map of rounding errors alone becomes 0.
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
     # Peaks are above their earlier neighbours and no less than their later ones, in row-major order.
@@ -91,11 +82,8 @@ def _conspicuity(image: Tensor) -> Tensor:
 
     over centres c = 2, 3, 4 and surrounds s = c + 3, c + 4 of the Gaussian pyramid.
 
-    The contrast of an opponency is the difference of R - G at the centre and R - G in the surround. Equation 2 of Itti,
-    Koch and Niebur has G - R in the surround. Taken literally, it responds most to a uniform colour, while their text
-    means the contrast. The same holds for B - Y and their equation 3.
-
-    Shapes: image `(B, 3, H, W)` → `(B, 3, h, w)`.
+    Opponencies of the surround are subtracted as they are: with G - R in it (their equation 2, and 3 for B - Y) a
+    uniform colour would respond most. Image `(B, 3, H, W)` → `(B, 3, h, w)`.
     """
     levels = max(_CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)

@@ -112,9 +112,6 @@ def _norm(vectors: Tensor) -> Tensor:
 
 
 def _passed(knots: tuple[float, ...], distance: Tensor) -> Tensor:
-    """The share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`.
-
-    A table over the knots, interpolated linearly, is its first value and the sum of its differences times these shares.
-    """
+    """The share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`."""
     knot = distance.new_tensor(knots)
     return ((distance[..., None, :] - knot[:-1, None]) / knot.diff()[:, None]).clamp(0, 1)

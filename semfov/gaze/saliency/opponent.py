@@ -18,27 +18,14 @@ def _check_image(image: Tensor) -> None:
 
 
 def opponent_colours(image: Tensor) -> Tensor:
-    r"""Intensity, red-green and blue-yellow of VOCUS2 (Frintrop, Werner and Martin García, CVPR 2015, section 3.1).
-
-    .. math:: I = (R + G + B) / 3, \quad RG = R - G, \quad BY = B - (R + G) / 2
-
-    Shapes: image `(B, 3, H, W)` → `(B, 3, H, W)`.
-    """
+    """Intensity, red-green and blue-yellow `(B, 3, H, W)` of VOCUS2 (Frintrop, Werner and Martin García, 2015, 3.1)."""
     _check_image(image)
     red, green, blue = image.unbind(1)
     return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
 
 
 def lab_colours(image: Tensor) -> Tensor:
-    r"""CIELAB of sRGB (`kornia.color.rgb_to_lab`: illuminant D65, observer of 2°), scaled.
-
-    .. math:: (L^* / 100, \; a^* / 255, \; b^* / 255)
-
-    The scale is that of OpenCV's bytes divided by 255, as in the program of VOCUS2's authors. Two of its steps are left
-    out: the rounding to bytes, and the offset of the opponencies, on which contrasts do not depend.
-
-    Shapes: image `(B, 3, H, W)` → `(B, 3, H, W)`.
-    """
+    """CIELAB `(L* / 100, a* / 255, b* / 255)` of sRGB: OpenCV's bytes by 255, but for their offset and rounding."""
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.color import rgb_to_lab
 
@@ -54,7 +41,7 @@ def double_opponency(image: Tensor) -> Tensor:
     .. math:: R = [r - (g + b)/2]_+, \; G = [g - (r + b)/2]_+, \; B = [b - (r + g)/2]_+,
         \; Y = [(r + g)/2 - |r - g|/2 - b]_+
 
-    Shapes: image `(B, 3, H, W)` → `(B, 3, H, W)`.
+    Image `(B, 3, H, W)` → `(B, 3, H, W)`.
     """
     _check_image(image)
     intensity = image.mean(1)

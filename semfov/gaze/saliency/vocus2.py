@@ -1,6 +1,6 @@
 """VOCUS2: saliency as the contrast of two Gaussian pyramids, of centres and of surrounds."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -28,17 +28,12 @@ class _Twin(NamedTuple):
 def _twin_pyramids(
     channels: Tensor, centre_sigma: float = 2.0, surround_sigma: float = 6.0, layers: int = 5, scales: int = 2
 ) -> list[list[_Twin]]:
-    r"""Centre and surround pyramids (Frintrop, Werner and Martin García, CVPR 2015, section 3.2).
+    r"""Centre and surround pyramids (Frintrop, Werner and Martin García, 2015, section 3.2); channels `(B, C, H, W)`.
 
-    Each layer has half the size of the one before. A layer has S scales, each computed by further blur of the one
-    before (Lowe, 2004):
+    Each layer has half the size of the one before, and S scales, each by further blur of the one before (Lowe, 2004):
 
     .. math:: \sigma_c(s) = 2^{s/S} \sigma_c, \quad
         \mathrm{surround} = G(2^{s/S} \sqrt{\sigma_s^2 - \sigma_c^2}) * \mathrm{centre}
-
-    Scale S of a layer has twice the blur of scale 0, and every second pixel of it is scale 0 of the next layer.
-
-    Shapes: channels `(B, C, H, W)`.
     """
     _check_settings(centre_sigma, surround_sigma, layers, scales)
     wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
@@ -159,12 +154,8 @@ class VOCUS2(nn.Module):
         _check_settings(centre_sigma, surround_sigma, layers, scales)
         lookup(fusion, get_args(_Fusion), "fusion")
         lookup(color_space, get_args(_ColorSpace), "color space")
-        self.centre_sigma = centre_sigma
-        self.surround_sigma = surround_sigma
-        self.layers = layers
-        self.scales = scales
-        self.fusion: _Fusion = fusion
-        self.color_space: _ColorSpace = color_space
+        self.settings: dict[str, Any] = {"centre_sigma": centre_sigma, "surround_sigma": surround_sigma}
+        self.settings |= {"layers": layers, "scales": scales, "fusion": fusion, "color_space": color_space}
         self.normalise = normalise
 
     def forward(self, image: ImageLike) -> Tensor:
@@ -176,22 +167,11 @@ class VOCUS2(nn.Module):
         Returns:
             `(B, H, W)`.
         """
-        return vocus2_saliency(
-            as_batch(image),
-            centre_sigma=self.centre_sigma,
-            surround_sigma=self.surround_sigma,
-            layers=self.layers,
-            scales=self.scales,
-            fusion=self.fusion,
-            color_space=self.color_space,
-            normalise=self.normalise,
-        )
+        return vocus2_saliency(as_batch(image), **self.settings, normalise=self.normalise)
 
     def extra_repr(self) -> str:
         """All settings by name."""
-        sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
-        settings = f"layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
-        return f"{sigmas}, {settings}, color_space={self.color_space!r}"
+        return ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
 
 
 def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:
