@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
-from semfov.errors import InputError, check
+from semfov.errors import check
 from semfov.eye import Eye
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Uniform
@@ -23,8 +23,6 @@ from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.setup import make_learned, make_observation
 from semfov.strategy import Strategy
 
-_T = TypeVar("_T")
-
 
 class PolicyLooking(Looking):
     """Looks at scenes, and policies that choose where to look in them."""
@@ -33,20 +31,27 @@ class PolicyLooking(Looking):
     config: RunConfig
 
     def __init__(self, config: RunConfig) -> None:
+        check(len(config.policies) > 0, "policies", "at least one policy", "none")
         labels = [label(choice, self.task) for choice in config.policies]
         for name in labels:
             check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
         super().__init__(config)
-        self.models = _load_models(config, self.task, self.eye)
         components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
+        loaded: dict[str, Any] = {}
+
+        def model(name: str) -> Any:
+            loaded[name] = loaded[name] if name in loaded else _load(name, config.belief, self.eye)
+            return loaded[name]
+
         self.strategies: dict[str, Strategy] = {}
         observers: dict[PolicyConfig, Observer] = {}
         for name, policy in self.policies.items():
-            made = _make_strategy(policy, self.task, config.belief, components, self.models, fovea)
+            made = _make_strategy(policy, self.task, config.belief, components, model, fovea)
             # Policies with the same belief share an observer, which then weighs each look only once.
             observer = observers.setdefault(_belief_settings(policy, self.task), made.observer)
             self.strategies[name] = Strategy(observer, made.policy)
+        self.models = _Models(**loaded)
 
     @cached_property
     def code(self) -> str:
@@ -79,20 +84,13 @@ class _Models(NamedTuple):
     map: MapEvidence | None = None
 
 
-def _load_models(config: RunConfig, task: Task, eye: Eye) -> _Models:
-    """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
-    check(len(config.policies) > 0, "policies", "at least one policy", "none")
-    policies = [resolve(choice, task) for choice in config.policies]
-    belief = config.belief
-    return _Models(
-        make_observation(belief.model, eye) if _needs_observation(policies, belief) else None,
-        make_learned(TargetEvidence, belief.target_model, eye)
-        if any(_by_evidence(policy, task) for policy in policies)
-        else None,
-        make_learned(MapEvidence, belief.map_model, eye)
-        if any(policy.scores == "learned" and not _by_evidence(policy, task) for policy in policies)
-        else None,
-    )
+def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
+    """Load a model that a policy needs, and check that it was fitted for the detector and the sensor."""
+    if name == "observation":
+        return make_observation(belief.model, eye)
+    if name == "evidence":
+        return make_learned(TargetEvidence, belief.target_model, eye)
+    return make_learned(MapEvidence, belief.map_model, eye)
 
 
 def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
@@ -107,44 +105,24 @@ def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
     return replace(policy, policy=Uniform.name, saliency=None, samples=None)
 
 
-def _needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
-    """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
-    return any(
-        policy.scores == "calibrated"
-        or (belief.misses if policy.misses is None else policy.misses)
-        or (policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model)
-        for policy in policies
-    )
-
-
 def _make_strategy(
-    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: _Models, fovea: float
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, model: Callable[[str], Any], fovea: float
 ) -> Strategy:
-    """Build the observer and the policy that settings describe."""
+    """Build the observer and the policy that settings describe; `model` gives what they need by its name."""
     if policy.policy == TARGET_EVIDENCE:
-        return Strategy(
-            Target(_required(models.evidence, "policy", "learned target evidence")), Policy("non-predictive")
-        )
-    calibrated = policy.scores == "calibrated"
-    function = FUNCTIONS[policy.policy]
-    model = models.map if function.needs_map else models.observation
+        return Strategy(Target(model("evidence")), Policy("non-predictive"))
+    calibrated, function = policy.scores == "calibrated", FUNCTIONS[policy.policy]
+    needed = model("map" if function.needs_map else "observation") if "model" in function.takes else None
     common = {"fovea": fovea, "prior": belief.prior}
     own = {name: common[name] for name in common.keys() & function.takes}
-    chosen = Policy(function, model, samples=policy.samples, calibrated=calibrated, **own)
+    chosen = Policy(function, needed, samples=policy.samples, calibrated=calibrated, **own)
     if _by_evidence(policy, task):
-        return Strategy(Target(_required(models.evidence, "scores", "learned target evidence")), chosen)
+        return Strategy(Target(model("evidence")), chosen)
     if policy.scores == "learned":
-        return Strategy(LearnedMap(_required(models.map, "scores", "a learned map")), chosen)
+        return Strategy(LearnedMap(model("map")), chosen)
     names = ("footprint", "tempering", "memory", "misses")
     common_or_own = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in names}
-    if common_or_own.pop("misses"):
-        common_or_own["misses"] = _required(models.observation, "misses", "an observation model")
-    observation = _required(models.observation, "scores", "an observation model") if calibrated else None
+    common_or_own["misses"] = model("observation") if common_or_own["misses"] else None
+    observation = model("observation") if calibrated else None
     observer = Semantic(components, observation, prior=belief.prior, fusion=belief.fusion, **common_or_own)
     return Strategy(observer, chosen)
-
-
-def _required(model: _T | None, argument: str, expected: str) -> _T:
-    if model is None:
-        raise InputError(f"{argument}: expected {expected}, got none")
-    return model

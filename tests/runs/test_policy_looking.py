@@ -8,8 +8,18 @@ import torch
 
 from eval.comparison.looking import Candidate
 from eval.explore.run import ExploreConfig
-from eval.search.run import SearchConfig
-from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence, observers, policies
+from eval.search.run import SearchConfig, SearchRun
+from semfov import (
+    DirichletBelief,
+    Eye,
+    FovealObservationModel,
+    Foveation,
+    Grid,
+    InputError,
+    TargetEvidence,
+    observers,
+    policies,
+)
 from semfov.belief import MapEvidence
 from semfov.gaze.acquisition import (
     FUNCTIONS,
@@ -20,17 +30,15 @@ from semfov.gaze.acquisition import (
     TargetPosterior,
 )
 from semfov.runs import policy_looking
-from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig
 from semfov.runs.policy_looking import (
     _belief_settings,
-    _load_models,
+    _load,
     _make_strategy,
-    _Models,
-    _needs_observation,
 )
 from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
-from tests.refusals import refused
+from tests.small import Blobs
 
 GRID = Grid(4, 3, (40, 30))
 FOVEA = 100 / 640
@@ -43,7 +51,7 @@ def model():
 
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
     """The strategy of a policy for two classes, made with the given models."""
-    return _make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, _Models(**models), fovea)
+    return _make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, models.__getitem__, fovea)
 
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
@@ -73,11 +81,16 @@ def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(nam
     assert torch.equal(first, second)
 
 
-def needs_model(belief=None, *choices, task="search"):
-    return _needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
+def test_prediction_calibration_and_misses_need_an_observation_model(model):
+    every = {"evidence": TargetEvidence(components=3), "map": MapEvidence(components=3), "observation": model}
 
+    def needs_model(belief, *choices, task="search"):
+        asked = set()
+        for choice in choices:
+            given = resolve(choice, task), task, belief or BeliefConfig(), 3
+            _make_strategy(*given, lambda name: asked.add(name) or every[name], FOVEA)
+        return "observation" in asked
 
-def test_prediction_calibration_and_misses_need_an_observation_model():
     soft = PolicyConfig("non-predictive", footprint="soft")
     assert not needs_model(None, "random", "target-evidence", "vocus2", "non-predictive-raw", soft)
     assert not needs_model(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
@@ -95,51 +108,29 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
         assert needs_model(None, given, task="exploration") == (name not in without)
 
 
-@pytest.fixture
-def loaded(monkeypatch):
-    """The models that a run loads, as pairs of kind and name."""
-    loaded = []
-
-    def make(kind, name):
-        loaded.append((kind, name))
-        return kind
-
-    monkeypatch.setattr(policy_looking, "make_observation", lambda name, eye: make("observation", name))
-    monkeypatch.setattr(policy_looking, "make_learned", lambda kind, name, eye: make(kind, name))
-    return loaded
+def test_models_are_loaded_by_the_names_in_the_settings(monkeypatch):
+    monkeypatch.setattr(policy_looking, "make_observation", lambda name, eye: ("observation", name))
+    monkeypatch.setattr(policy_looking, "make_learned", lambda kind, name, eye: (kind, name))
+    belief = BeliefConfig(model="mine", target_model="sought", map_model="everything")
+    assert [_load(name, belief, SimpleNamespace()) for name in ("observation", "evidence", "map")] == [
+        ("observation", "mine"),
+        (TargetEvidence, "sought"),
+        (MapEvidence, "everything"),
+    ]
 
 
-def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
-    eye = SimpleNamespace()
-    assert _load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == _Models()
-    assert _load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == _Models()
-    assert loaded == []
-    learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
-    assert _load_models(learned, "exploration", eye) == _Models(map=MapEvidence)
-    assert loaded == [(MapEvidence, "everything")]
-    loaded.clear()
-    guided = PolicyConfig("target-evidence", saliency="vocus2")
-    every = SearchConfig(
-        policies=("random", guided, "predictive-raw"), belief=BeliefConfig(model="mine", target_model="sought")
-    )
-    models = _load_models(every, "search", eye)
-    assert models == _Models("observation", TargetEvidence)
-    assert set(loaded) == {("observation", "mine"), (TargetEvidence, "sought")}
-
-
-def test_presets_need_their_observation_model_and_runs_a_policy(model):
-    # `needs_observation` agrees with what making the strategy requires.
-    others = {"evidence": TargetEvidence(4, 4), "map": MapEvidence(4, 4)}
-    for task in ("search", "exploration"):
-        for preset in presets(task).values():
-            assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
-            if _needs_observation([preset], BeliefConfig()):
-                refused("observation model", strategy, preset, task, **others)
-            else:
-                strategy(preset, task, **others)
-    for config in [SearchConfig, ExploreConfig]:
+def test_a_run_has_the_models_that_its_policies_need(monkeypatch, tmp_path):
+    looked = SearchConfig(policies=("random",), data=DataConfig(limit=1, min_instances=0), cache=tmp_path)
+    monkeypatch.setattr("semfov.runs.looking.make_eye", lambda detector, sensor: Eye(Foveation(9.0), Blobs()))
+    monkeypatch.setattr(policy_looking, "_load", lambda name, belief, eye: TargetEvidence(components=4))
+    assert SearchRun(looked).models == (None, None, None)
+    guided = (PolicyConfig("target-evidence", saliency="vocus2"), "random")
+    models = SearchRun(replace(looked, policies=guided)).models
+    assert models.observation is models.map is None
+    assert isinstance(models.evidence, TargetEvidence)
+    for config in (SearchConfig, ExploreConfig):
         with pytest.raises(InputError, match="policies: expected at least one"):
-            _load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
+            SearchRun(config(policies=()))
 
 
 def test_strategies_follow_their_settings(model):
@@ -152,8 +143,6 @@ def test_strategies_follow_their_settings(model):
     assert explorer.observer.observation is model
     assert explorer.observer.misses is model
     assert isinstance(explorer.policy(None, GRID), ExpectedAccuracy)
-    refused("misses", strategy, "random", belief=BeliefConfig(misses=True))
-    refused("scores", strategy, "non-predictive-calibrated")
 
 
 def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
@@ -179,7 +168,6 @@ def test_target_evidence_brings_its_own_belief():
     assert isinstance(sought.observer, observers.Target)
     assert sought.observer.model is evidence
     assert sought.policy.name == "non-predictive"
-    refused("learned", strategy, "target-evidence")
 
 
 def test_saliency_alone_keeps_the_belief_of_the_run(model):
@@ -220,4 +208,3 @@ def test_policies_that_need_a_target_position_work_with_learned_evidence(model, 
     belief = made.observer.start(2, GRID, torch.zeros(()))
     visited = torch.zeros(2, 12, dtype=torch.bool)
     assert made.policy(torch.tensor([1, 2]), GRID)(belief, visited).shape == (2, 12)
-    refused("learned target evidence", strategy, PolicyConfig(name, "learned"), observation=model)
