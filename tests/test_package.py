@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,14 @@ def test_public_names_are_found_when_they_are_asked_for():
         assert getattr(semfov, name) is not None
     with pytest.raises(AttributeError):
         semfov.nosuch  # noqa: B018
+
+
+def test_rooms_are_imported_by_the_names_that_the_package_gives_them():
+    """As `from semfov.acquisition import …` does; a name that is not there is no attribute of them."""
+    for room in ("acquisition", "dirichlet", "observers", "policies", "saliency"):
+        module, own = import_module(f"semfov.{room}"), getattr(semfov, room)
+        assert [name for name in own.__all__ if getattr(module, name) is not getattr(own, name)] == []
+        assert not hasattr(module, "nosuch")
 
 
 @pytest.mark.parametrize("words", [["--version"], ["search", "--help"], ["searhc"]])
