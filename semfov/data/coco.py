@@ -27,11 +27,7 @@ _BEYOND = 0.2
 
 
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
-    """Read and check a COCO instances file.
-
-    Ids are integers or strings. Images need `id`, `file_name`, `width` and `height`, categories `id` and `name`,
-    annotations `id`, `image_id`, `category_id` and `bbox` = `[x, y, width, height]`; these may have `iscrowd`.
-    """
+    """Read and check a COCO instances file; ids are integers or strings; its index and the sha256 of the file."""
     name = f"annotations {Path(path)}"
     data = read_json(path, name=name)
     expected = "an object with images, annotations and categories"

@@ -106,11 +106,10 @@ def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
 
 
 class _Quiet:
-    """Silence of decoders, which begins with the first thread in it and ends with the last one.
+    """Silence of decoders, which begins with the first thread in it and ends with the last one."""
 
-    Filters and levels are those of all threads: if each put back what it had found, one that began in another's silence
-    would leave it behind for ever.
-    """
+    # Filters and levels are those of all threads: if each put back what it had found, one that began in another's
+    # silence would leave it behind for ever.
 
     def __init__(self) -> None:
         self._lock, self._inside, self._before = Lock(), 0, ExitStack()

@@ -192,10 +192,8 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
 
 
 def as_positions(values: Tensor, like: Tensor | torch.dtype | None = None) -> Tensor:
-    """Positions with the device and precision of a tensor, or a precision (None: their own), but float32 at least.
-
-    Half precision is off by pixels from 2,048 pixels on, and whole numbers cut the fractions of what is added to them.
-    """
+    """Positions with the device and precision of a tensor, or a precision (None: their own), but float32 at least."""
+    # Half precision is off by pixels from 2,048 on, and whole numbers cut the fractions of what is added to them.
     dtype = like if isinstance(like, torch.dtype) else (values if like is None else like).dtype
     device = like.device if isinstance(like, Tensor) else values.device
     return values.to(device, torch.promote_types(dtype, torch.float32))

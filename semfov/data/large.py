@@ -227,11 +227,7 @@ def _is_converted(path: str | PathLike[str]) -> bool:
 
 
 class _RasterPicture(LargePicture):
-    """A raster, whose coarse windows are read from the overviews of the file, if it has some.
-
-    Bands that the file calls red, green and blue are the channels, else the first three, or a single one as grey. One
-    of neither 8 nor 16 bits needs `white`. Transparent and masked pixels are blended with white.
-    """
+    """A raster, whose coarse windows are read from the overviews of the file, if it has some."""
 
     path: Path
 
@@ -320,12 +316,8 @@ class _ArrayPicture(LargePicture):
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
-    """Open a picture of any common type (`semfov.as_image`) for reading by windows; `white` scales numbers to bytes.
-
-    Files `.tif` and `.tiff` are read tile by tile if `tifffile` is installed, and by rasterio if that is installed and
-    they have overviews or are of a kind that `tifffile` leaves; else as other photographs. Rasters `.vrt` and `.jp2`
-    need rasterio. Arrays of bytes `(H, W, 3)` and `(H, W)`, such as a `numpy.memmap`, are not copied.
-    """
+    """Open a picture of any common type (`semfov.as_image`) for reading by windows; `white` scales numbers to bytes."""
+    # TIFFs are read by tifffile, by rasterio if they have overviews or tifffile leaves them, else as other photographs.
     check_white(white)
     if bands is not None:
         numbers = [*bands] if isinstance(bands, tuple | list) else [bands]

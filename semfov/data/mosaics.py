@@ -24,11 +24,7 @@ class _Tile(NamedTuple):
 
 
 class Mosaics(ComposedScenes):
-    """Mosaics of `columns` × `rows` photographs; tile `(width, height)`.
-
-    Each photograph is resized to fit its slot, whose rest is grey. Mosaic `i` depends only on the seed, on `i` and on
-    the photographs, of which none is in it twice unless there are fewer than slots.
-    """
+    """Mosaics of photographs by a seed, none twice in one unless they are fewer; tile `(width, height)`."""
 
     def __init__(
         self,

@@ -193,11 +193,7 @@ def _layout(generator: np.random.Generator) -> list[_Item]:
 
 
 def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Random clouds and a faint texture, in a random tint; → `(H, W, 3)`.
-
-    The clouds are a sum of random grids, one for each octave, whose amplitude halves with the scale. All arithmetic is
-    in integers, so every machine composes the same bits.
-    """
+    """Random clouds and a faint texture, in a random tint, in integers, the same everywhere; → `(H, W, 3)`."""
     from PIL import Image
 
     clouds = np.zeros(_SIZE[::-1], dtype=np.int64)

@@ -121,10 +121,7 @@ class Stream(NamedTuple):
 
 
 def open_stream(source: str | Path | int, most: int | None = None, white: White | None = None) -> Stream:
-    """Open a video by its file, a folder of frames, a camera by its number, or a stream by its address.
-
-    The frames of a folder are in the order of their names; `white` as for `read_image`.
-    """
+    """Open a video by its file, a folder of frames by name, a camera by its number, or a stream by its address."""
     check_white(white)
     address = isinstance(source, str) and "://" in source
     if not address and not isinstance(source, int):

@@ -95,11 +95,7 @@ class LargePicture(ABC):
         return reduction if reduction >= self._first else 1
 
     def read(self, box: _Box, reduction: int = 1) -> Tensor:
-        """Read a window, `(3, h, w)`; coarse ones of pictures of more than 16 million pixels from reduced copies.
-
-        The copies are made when one is first needed, of strips of 8 million pixels (25 MB). They are kept, and take a
-        twelfth of the memory of the picture, and at most 134 MB.
-        """
+        """Read a window, `(3, h, w)`; coarse ones of pictures of more than 16 million pixels from reduced copies."""
         self._inside(box)
         coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
         return self._reduced(box, reduction) if coarse and reduction >= self._first else _bytes_of(self._given(box))

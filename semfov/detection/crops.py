@@ -13,11 +13,9 @@ _BORDER = 2.0
 def merge_crops(
     detections: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
 ) -> Detections:
-    """Merge the detections in the crops of each fixation; windows `(F·L, 4)`, size `(width, height)`.
-
-    A box that lies in a finer crop, without being cut by its border, is left out of the wider ones, which are less
-    sharp there. Of the others, two boxes of one object are merged as in windows (`semfov.detection.objects`).
-    """
+    """Merge the detections in the crops of each fixation; windows `(F·L, 4)`, size `(width, height)`."""
+    # A box that a finer crop shows whole is left out of the wider ones, which are less sharp there. Others are merged
+    # as in windows (`semfov.detection.objects`).
     merged = []
     for first in range(0, len(detections.mask), crops):
         rows = slice(first, first + crops)

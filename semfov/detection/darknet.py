@@ -54,11 +54,7 @@ class Convolution(nn.Conv2d):
 
 
 class MaxPool(nn.Module):
-    """Darknet's max pool.
-
-    The padding (by default `size - 1`) is split between both sides; if it is odd, the larger half is on the right and
-    at the bottom. The output is `(W + padding - size) // stride + 1` wide, so `size=2, stride=1` keeps the size.
-    """
+    """Darknet's max pool; of an odd padding (by default `size - 1`) the larger half is right and below."""
 
     def __init__(self, size: int, stride: int, padding: int) -> None:
         super().__init__()
@@ -121,6 +117,8 @@ _MOST_ELEMENTS = 2**28
 _MOST_LAYERS = 2000
 _LARGEST_KERNEL = 255
 
+_KINDS = ("convolutional", "maxpool", "upsample", "route", "shortcut", "yolo", "dropout")
+
 # Keys that change what a layer computes, with the only value that is implemented.
 _NEUTRAL = {
     "convolutional": {"binary": "0", "xnor": "0", "dilation": "1", "antialiasing": "0"},
@@ -147,27 +145,38 @@ class _Builder:
         self.shapes: list[_Shape] = []
         self.sources: list[tuple[int, ...]] = []
         self._here = _Shape(channels, Fraction(1))
-        self._makers: dict[str, Callable[[Section], nn.Module]] = {
-            "convolutional": self._convolution,
-            "maxpool": self._maxpool,
-            "upsample": self._upsample,
-            "route": self._route,
-            "shortcut": self._shortcut,
-            "yolo": self._yolo,
-            "dropout": self._dropout,
-        }
 
     def add(self, section: Section) -> nn.Module:
         """Make the layer of the next section."""
-        count, limit = len(self.shapes), f"at most {_MOST_LAYERS} layers"
-        check_data(count < _MOST_LAYERS, section.where, limit, "more; check the cfg")
-        if section.kind not in self._makers:
-            kinds = ", ".join(self._makers)
-            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {kinds}")
-        for key, value in _NEUTRAL.get(section.kind, {}).items():
+        count, kind, here = len(self.shapes), section.kind, self._here
+        check_data(count < _MOST_LAYERS, section.where, f"at most {_MOST_LAYERS} layers", "more; check the cfg")
+        for key, value in _NEUTRAL.get(kind, {}).items():
             got = section.text(key, value)
             section.check(got == value, f"{key}={value}", f"{key}={got}, which is not supported")
-        return self._makers[section.kind](section)
+        makers = {"convolutional": self._convolution, "route": self._route, "yolo": self._yolo}
+        if kind in makers:
+            return makers[kind](section)
+        if kind == "maxpool":
+            stride = section.integer("stride", 1)
+            size = section.integer("size", stride)
+            padding = section.integer("padding", size - 1, minimum=0)
+            _check_kernel(section, size, stride, padding)
+            self._note(here.channels, here.step * stride)
+            return MaxPool(size, stride, padding)
+        if kind == "upsample":
+            stride = section.integer("stride", 2)
+            self._note(here.channels, here.step / stride)
+            return nn.Upsample(scale_factor=float(stride), mode="nearest")
+        if kind == "shortcut":
+            sources = self._layers(section, "from")
+            fits = len(sources) == 1 and self.shapes[sources[0]] == here
+            section.check(fits, "one layer of the same shape", f"layers {sources}")
+            self._note(here.channels, here.step, *sources)
+            return Shortcut(_activation(section, "linear"))
+        if kind != "dropout":
+            raise DataError(f"{section.where}: layer [{kind}] is not supported; supported: {', '.join(_KINDS)}")
+        self._note(here.channels, here.step)
+        return nn.Identity()
 
     def _note(self, channels: int, step: Fraction, *further: int, sources: tuple[int, ...] | None = None) -> None:
         """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
@@ -201,21 +210,8 @@ class _Builder:
             normalised=bool(section.integer("batch_normalize", 0, minimum=0)),
         )
 
-    def _maxpool(self, section: Section) -> nn.Module:
-        stride = section.integer("stride", 1)
-        size = section.integer("size", stride)
-        padding = section.integer("padding", size - 1, minimum=0)
-        _check_kernel(section, size, stride, padding)
-        self._note(self._here.channels, self._here.step * stride)
-        return MaxPool(size, stride, padding)
-
-    def _upsample(self, section: Section) -> nn.Module:
-        stride = section.integer("stride", 2)
-        self._note(self._here.channels, self._here.step / stride)
-        return nn.Upsample(scale_factor=float(stride), mode="nearest")
-
     def _route(self, section: Section) -> nn.Module:
-        sources = tuple(self._layer(section, "layers", layer) for layer in section.integers("layers"))
+        sources = self._layers(section, "layers")
         groups, group = section.integer("groups", 1), section.integer("group_id", 0, minimum=0)
         shapes = [self.shapes[source] for source in sources]
         section.check(len({shape.step for shape in shapes}) == 1, "layers of one size", section.text("layers"))
@@ -225,13 +221,6 @@ class _Builder:
         section.check(fits, parts, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
         self._note(sum(counts) // groups, shapes[0].step, sources=sources)
         return Route(groups, group)
-
-    def _shortcut(self, section: Section) -> nn.Module:
-        sources = [self._layer(section, "from", layer) for layer in section.integers("from")]
-        fits = len(sources) == 1 and self.shapes[sources[0]] == self._here
-        section.check(fits, "one layer of the same shape", f"layers {sources}")
-        self._note(self._here.channels, self._here.step, *sources)
-        return Shortcut(_activation(section, "linear"))
 
     def _yolo(self, section: Section) -> nn.Module:
         numbers = section.numbers("anchors")
@@ -247,14 +236,13 @@ class _Builder:
         self._note(self._here.channels, self._here.step)
         return head
 
-    def _dropout(self, section: Section) -> nn.Module:
-        self._note(self._here.channels, self._here.step)
-        return nn.Identity()
-
-    def _layer(self, section: Section, key: str, number: int) -> int:
-        index = number if number >= 0 else len(self.shapes) + number
-        section.check(0 <= index < len(self.shapes), f"{key} to name an earlier layer", f"{key}={number}")
-        return index
+    def _layers(self, section: Section, key: str) -> tuple[int, ...]:
+        """Numbers of the earlier layers that a key names, below 0 from this one on."""
+        count = len(self.shapes)
+        numbers = tuple(number if number >= 0 else count + number for number in section.integers(key))
+        earlier = all(0 <= number < count for number in numbers)
+        section.check(earlier, f"{key} to name an earlier layer", f"{key}={section.text(key)}")
+        return numbers
 
 
 def _check_kernel(section: Section, size: int, stride: int, padding: int) -> None:

@@ -18,11 +18,7 @@ from semfov.io.files import write_bytes
 
 
 def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:
-    """Write a Darknet detector as an ONNX model, with class names, input size and padding in its metadata.
-
-    From `images` `(B, 3, H, W)`, RGB in [0, 1], it computes all boxes of all heads before any selection: `boxes`
-    `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`.
-    """
+    """Write a Darknet detector as an ONNX model of all its boxes, with what `load_onnx` needs in its metadata."""
     if not isinstance(detector, YoloV3):
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
     model = network_model(detector.network, detector.name, detector.input_size if static else None)

@@ -85,8 +85,21 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
         return model
     if isinstance(model, str | PathLike):
         name = _detector_name(model)
-        return _load(_loader(name), name, name, options)
-    return _load(_wrapper(model), model, f"a {type(model).__name__}", options)
+        load: Callable[..., Detector] = load_yolo
+        if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
+            load = load_onnx
+        elif name.startswith("torchvision:"):
+            load = TorchvisionDetector.load
+        elif name.startswith("hf:"):
+            load = TransformersDetector.load
+        return _load(load, name, name, options)
+    for package, wrapper in _WRAPPERS.items():
+        if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
+            return _load(wrapper, model, f"a {type(model).__name__}", options)
+    raise InputError(
+        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
+        f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
+    )
 
 
 def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:
@@ -107,26 +120,6 @@ def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, opti
     if options.get("background") is not None:
         detector.background = options["background"]
     return detector if "device" in own else detector.to(options.get("device"))
-
-
-def _loader(name: str) -> Callable[..., Detector]:
-    """The function that loads a detector by its name or file."""
-    if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
-        return load_onnx
-    if name.startswith("torchvision:"):
-        return TorchvisionDetector.load
-    return TransformersDetector.load if name.startswith("hf:") else load_yolo
-
-
-def _wrapper(model: nn.Module) -> Callable[..., Detector]:
-    """The class of detectors that holds a module, which is known by its own class."""
-    for package, wrapper in _WRAPPERS.items():
-        if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
-            return wrapper
-    raise InputError(
-        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
-        f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
-    )
 
 
 def _options_of(load: Callable[..., Detector]) -> list[str]:

@@ -79,11 +79,9 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
-    """Find a model with another input size in the cache, and make it if it is missing; canvas `(width, height)`.
-
-    A fully convolutional network knows its input size in two places: the shape of its input, and the shapes that its
-    `Reshape` nodes ask for, which end with the rows and columns of the feature maps. Both are replaced.
-    """
+    """Find a model with another input size in the cache, and make it if it is missing; canvas `(width, height)`."""
+    # A fully convolutional network knows its size in the shape of its input, and in those that its `Reshape` nodes ask
+    # for.
     import onnx
 
     check_canvas("input_size", canvas)

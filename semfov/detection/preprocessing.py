@@ -45,7 +45,8 @@ class Preprocessing:
         """Convert a canvas `(B, 3, H, W)` to the input of the network, a new tensor of the same shape."""
         check_shape(canvas, "canvas", None, 3, None, None)
         # Plane by plane, as each stays in the cache between the operations.
-        planes = [canvas[:, source] * (self.scale / std) for source, std in zip(self._order, self.std, strict=True)]
+        sources = canvas.unbind(1)[:: -1 if self.channels == "bgr" else 1]
+        planes = [source * (self.scale / std) for source, std in zip(sources, self.std, strict=True)]
         shifts = [mean / std for mean, std in zip(self.mean, self.std, strict=True)]
         return torch.stack([plane - shift if shift else plane for plane, shift in zip(planes, shifts, strict=True)], 1)
 
@@ -53,18 +54,14 @@ class Preprocessing:
         """Convert a canvas of bytes `(B, 3, H, W)` to the input: `self(canvas / 255)`, in one pass over memory."""
         check_bytes(canvas)
         image = torch.empty(canvas.shape, device=canvas.device)
-        for plane, source, mean, std in zip(image.unbind(1), self._order, self.mean, self.std, strict=True):
-            plane.copy_(canvas[:, source])
+        sources = canvas.unbind(1)[:: -1 if self.channels == "bgr" else 1]
+        for plane, source, mean, std in zip(image.unbind(1), sources, self.mean, self.std, strict=True):
+            plane.copy_(source)
             if (factor := self.scale / 255 / std) != 1:
                 plane.mul_(factor)
             if mean:
                 plane.sub_(mean / std)
         return image
-
-    @property
-    def _order(self) -> tuple[int, int, int]:
-        """For each channel of the input, the one of an RGB canvas."""
-        return (2, 1, 0) if self.channels == "bgr" else (0, 1, 2)
 
     def merged(self, settings: Mapping[str, Any]) -> Self:
         """Return a copy with some settings replaced; unknown names are refused."""

@@ -45,11 +45,8 @@ class Selection:
 def select(
     candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
-    """Select the best boxes of each image, map them to the image, and compute their score vectors.
-
-    Boxes on a GPU are selected on the CPU: every step needs the number of boxes that the step before has left, and on
-    a GPU each of them would wait.
-    """
+    """Select the best boxes of each image, map them to the image, and compute their score vectors."""
+    # On a GPU each step would wait for the number of boxes that the step before has left.
     device, count = candidates.boxes.device, candidates.boxes.shape[0]
     if values_known(candidates.boxes):
         candidates = candidates.to(torch.device("cpu"))

@@ -26,11 +26,7 @@ _PREFIX = "torchvision:"
 
 
 class TorchvisionDetector(ModuleDetector):
-    """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
-
-    The canvas is the image, resized by the model's own transform. The model's thresholds and its final suppression are
-    left out. Faster R-CNN predicts a box for every class of a proposal; that of the best class is used.
-    """
+    """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable."""
 
     def __init__(
         self,

@@ -185,11 +185,7 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
 
 
 class _OnnxTwin:
-    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
-
-    A session has as many threads as torch has when it is opened. Every process opens its own, because the threads of a
-    pool do not survive a fork.
-    """
+    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU, in a session for each process."""
 
     def __init__(self, digest: str, versions: tuple[object, ...] | None = None) -> None:
         self.digest = digest
@@ -325,13 +321,10 @@ _RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
 class YoloV3(Detector):
-    """A Darknet network with YOLOv3 heads as a `Detector`; input_size `(width, height)`; it is differentiable.
+    """A Darknet network with YOLOv3 heads as a `Detector`; input_size `(width, height)`; it is differentiable."""
 
-    With runtime `"auto"`, onnxruntime computes the network on a CPU where no gradients are needed, which is faster and
-    equal up to rounding; no forward hooks are called then. Torch computes it in all other cases: with gradients, on
-    accelerators, in other precisions, with weights that were changed after loading, and in compiled, exported or
-    transformed functions.
-    """
+    # With runtime `auto`, onnxruntime computes it on a CPU where that is equal up to rounding, and torch in all other
+    # cases.
 
     def __init__(
         self,

@@ -35,11 +35,7 @@ def modules_digest(*modules: str) -> str:
 
 
 def class_digest(kind: type) -> str:
-    """Compute a digest of the code of a user's class: its file, its bases' files, and the user's modules they import.
-
-    Installed libraries do not count, and this package does not either: it has `package_digest`. A class that was typed
-    into an interpreter has no file, so its digest is valid in this process only. Nothing is imported.
-    """
+    """Digest of a user's class: its file, its bases' files, and the user's modules they import; imports none."""
     modules = [str(base.__module__) for base in kind.__mro__ if not _of_others(base.__module__) or base is kind]
     if any(_file(module) is None for module in modules):
         return f"{kind.__qualname__}, process {_THIS_PROCESS}"

@@ -91,11 +91,9 @@ def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str
 
 
 def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
-    """Check that a grid `(columns, rows)` has half to twice as many cells along each side as that of the training.
-
-    Learned evidence takes sizes as fractions of the image, but has learned how often a cell of one size holds an object
-    and how far the influence of its neighbours reaches.
-    """
+    """Check that a grid `(columns, rows)` has half to twice as many cells along each side as that of the training."""
+    # Evidence has learned how often a cell of one size holds an object and how far the influence of its neighbours
+    # reaches.
     cells = fitted.get("columns"), fitted.get("rows")
     if None not in cells and not all(n / 2 <= side <= 2 * n for n, side in zip(cells, grid, strict=True)):  # type: ignore[operator]
         raise InputError(

@@ -50,36 +50,17 @@ class Pretrained(StatedModule):
         """Make the module from a record and tensors; raise any error where something is missing or does not fit."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the model atomically to a safetensors file, with its metadata as JSON in the header.
-
-        Args:
-            path: the file.
-        """
+        """Write the model atomically to a safetensors file, with its metadata as JSON in the header."""
         record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
         write_file(path, self._tensors(), record)
 
     def digest(self) -> str:
-        """Checksum of everything that results depend on: tensors, and the values that are needed to make the model.
-
-        Returns:
-            The sha256 in hexadecimal.
-        """
+        """sha256 of everything that results depend on: tensors, and the values that are needed to make the model."""
         return checksum(self._tensors(), {"kind": self.kind, **self._record()})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """Load a model that is shipped with the package or one that `save` wrote.
-
-        Args:
-            name_or_path: name of a shipped model, or path of a file.
-
-        Returns:
-            The model, in `eval` mode.
-
-        Raises:
-            InputError: no model of that name is shipped.
-            DataError: the file is missing, damaged or of another kind.
-        """
+        """Load a model that is shipped with the package, by its name, or one that `save` wrote, by its path."""
         path = Path(name_or_path)
         if path.suffix != ".safetensors" and len(path.parts) < 2:
             names = sorted(file.stem for file in cls.shipped.glob("*.safetensors"))
@@ -99,14 +80,7 @@ class Pretrained(StatedModule):
 
     @classmethod
     def if_shipped(cls, name: str) -> Self | None:
-        """Load a model that is shipped with the package, if there is one.
-
-        Args:
-            name: its name.
-
-        Returns:
-            The model, in `eval` mode; None if none of this name is shipped.
-        """
+        """Load a model that is shipped with the package; None if none of this name is."""
         return cls.from_pretrained(name) if (cls.shipped / f"{name}.safetensors").is_file() else None
 
 
@@ -114,15 +88,7 @@ class PretrainedForEye(Pretrained):
     """Base of models that were fitted for one eye; `metadata` holds the settings of its `detector` and `sensor`."""
 
     def check_compatible(self, settings: Mapping[str, Any], grid: tuple[int, int] | None = None) -> None:
-        """Check that the model may be used with an eye and a grid.
-
-        It raises `InputError` for another detector and for a grid of a very different size, and warns where other
-        settings differ.
-
-        Args:
-            settings: settings of the eye, `Eye.settings()`.
-            grid: `(columns, rows)` of the belief; None leaves it unchecked.
-        """
+        """Raise `InputError` for another detector or a very different grid; warn where other settings differ."""
         if grid is not None:
             check_grid(self.metadata.get("training", {}), grid, self.title)
         check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)

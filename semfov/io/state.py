@@ -13,10 +13,7 @@ _KEY = "_extra_state"
 
 
 class StatedModule(nn.Module):
-    """Base of modules whose shapes do not tell their settings; their `state_dict` holds the settings as bytes of JSON.
-
-    A state without settings, such as that of an earlier version, is loaded as it is.
-    """
+    """Base of modules whose settings, as bytes of JSON, are in their state; one without them is loaded, too."""
 
     _told: ClassVar[tuple[str, ...]] = ()
     """Names of the settings that are no parameters."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations, by_picture
 from semfov.data.fixations.suspicions import warn_of_frames
-from semfov.errors import DataError, InputError, check
+from semfov.errors import InputError, check, check_data
 from semfov.io.files import read_json, write_text
 from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_content
 
@@ -97,10 +97,9 @@ def read_cocosearch(
             box=None if box is None else tuple(map(float, (box[0], box[1], box[0] + box[2], box[1] + box[3]))),
             found=flag if isinstance(flag, bool) else None,
         )
-        if sizes is None:
-            scanpaths.append(record)
-        elif record.picture in sizes:
-            scanpaths.append(record.in_picture(sizes[record.picture]))
+        scanpaths.append(record)
+    if sizes is not None:
+        scanpaths = [each.in_picture(sizes[each.picture]) for each in scanpaths if each.picture in sizes]
     return warn_of_frames(path, scanpaths)
 
 
@@ -121,18 +120,19 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
     """
     trials = []
     for each in fixations:
-        trial: dict[str, Any] = {"name": each.picture, "subject": each.subject}
-        if each.target is not None:
-            trial["task"] = each.target
-        if each.box is not None:
-            x1, y1, x2, y2 = each.box
-            trial["bbox"] = [x1, y1, x2 - x1, y2 - y1]
-        trial |= {"X": each.points[:, 0].tolist(), "Y": each.points[:, 1].tolist(), "length": len(each)}
-        if each.durations is not None:
-            trial["T"] = each.durations.tolist()
-        if each.found is not None:
-            trial["fixOnTarget"] = each.found
-        trials.append(trial)
+        x1, y1, x2, y2 = each.box or (0.0, 0.0, 0.0, 0.0)
+        trial = {
+            "name": each.picture,
+            "subject": each.subject,
+            "task": each.target,
+            "bbox": None if each.box is None else [x1, y1, x2 - x1, y2 - y1],
+            "X": each.points[:, 0].tolist(),
+            "Y": each.points[:, 1].tolist(),
+            "length": len(each),
+            "T": None if each.durations is None else each.durations.tolist(),
+            "fixOnTarget": each.found,
+        }
+        trials.append({key: value for key, value in trial.items() if value is not None})
     write_text(path, json.dumps(trials) + "\n")
 
 
@@ -191,12 +191,10 @@ def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> Non
     check(len({each.size for each in fixations}) <= 1, "fixations", "pictures of one size", "several sizes")
     pictures: dict[str, list[dict[str, Any]]] = {}
     for picture, people in by_picture(fixations).items():
-        pictures[picture] = []
         for each in people:
-            person: dict[str, Any] = {"x": each.points[:, 0].tolist(), "y": each.points[:, 1].tolist()}
-            if each.durations is not None:
-                person["duration_ms"] = each.durations.tolist()
-            pictures[picture].append(person)
+            times = {} if each.durations is None else {"duration_ms": each.durations.tolist()}
+            person = {"x": each.points[:, 0].tolist(), "y": each.points[:, 1].tolist(), **times}
+            pictures.setdefault(picture, []).append(person)
     write_text(path, json.dumps(pictures) + "\n")
 
 
@@ -242,8 +240,8 @@ def read_ruarte(
         # In cells, the last row and column are inside the box, which ends where the next cell begins.
         cells = trial.get("receptive_width") == trial.get("receptive_height") == 1
         flag, box = trial.get("target_found"), trial.get("target_bbox")
-        if flag is not None and not isinstance(flag, bool):
-            raise DataError(f"{path}: {name}.target_found: expected true or false, got {flag!r}")
+        told = flag is None or isinstance(flag, bool)
+        check_data(told, f"{path}: {name}.target_found", "true or false", repr(flag))
         record = _record(
             path,
             name,
@@ -255,12 +253,9 @@ def read_ruarte(
             box=None if box is None else tuple(map(float, (box[1], box[0], box[3] + cells, box[2] + cells))),
             found=flag,
         )
-        if screen is not None:
-            record = record.resized(screen)
-        if sizes is None:
-            scanpaths.append(record)
-        elif name in sizes:
-            scanpaths.append(record.in_picture(sizes[name]))
+        scanpaths.append(record if screen is None else record.resized(screen))
+    if sizes is not None:
+        scanpaths = [each.in_picture(sizes[each.picture]) for each in scanpaths if each.picture in sizes]
     return warn_of_frames(path, scanpaths)
 
 
@@ -286,6 +281,7 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
         expected = "one scanpath for each picture"
         check(each.picture not in trials, "fixations", expected, f"several for {each.picture}")
         width, height = each.size
+        x1, y1, x2, y2 = each.box or (0.0, 0.0, 0.0, 0.0)
         trial = {
             "subject": each.subject,
             "image_height": height,
@@ -294,17 +290,12 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
             "screen_width": width,
             "X": each.points[:, 0].tolist(),
             "Y": each.points[:, 1].tolist(),
+            "T": None if each.durations is None else each.durations.tolist(),
+            "target_object": each.target,
+            "target_bbox": None if each.box is None else [y1, x1, y2, x2],
+            "target_found": each.found,
         }
-        if each.durations is not None:
-            trial["T"] = each.durations.tolist()
-        if each.target is not None:
-            trial["target_object"] = each.target
-        if each.box is not None:
-            x1, y1, x2, y2 = each.box
-            trial["target_bbox"] = [y1, x1, y2, x2]
-        if each.found is not None:
-            trial["target_found"] = each.found
-        trials[each.picture] = trial
+        trials[each.picture] = {key: value for key, value in trial.items() if value is not None}
     write_text(path, json.dumps(trials) + "\n")
 
 
@@ -342,10 +333,8 @@ def _record(
 ) -> Fixations:
     """The record of a trial with lists of x, y and durations; a scanpath that was cut may have more durations."""
     x, y, times = trial[keys[0]], trial[keys[1]], trial.get(keys[2])
-    count = len(x)
-    if count != len(y):
-        raise DataError(f"{path}: {name}: expected as many Y as X, got {count} X and {len(y)} Y")
-    if times is not None and len(times) < count:
-        raise DataError(f"{path}: {name}.{keys[2]}: expected durations of {count} fixations, got {len(times)}")
+    count, most = len(x), len(x) if times is None else len(times)
+    check_data(count == len(y), f"{path}: {name}", "as many Y as X", f"{count} X and {len(y)} Y")
+    check_data(most >= count, f"{path}: {name}.{keys[2]}", f"durations of {count} fixations", most)
     durations = None if times is None else np.asarray(times[:count], dtype=np.float64)
     return Fixations(points=np.array([*zip(x, y, strict=True)], dtype=np.float64), durations=durations, **fields)

@@ -280,28 +280,20 @@ def _maybe(where: str, at: str, line: Mapping[str, str], name: str) -> float | N
 
 
 class _Export(NamedTuple):
-    """The columns of a program's table, each by its possible names without case, spaces and signs.
-
-    Attributes:
-        program: its name.
-        point: columns of x and y.
-        duration: column of the duration, and milliseconds for one of its unit.
-        keep: a column, and the beginning of its values in the lines that count; none: all do.
-        needs: further columns that tell the table from others, and columns that it does not have.
-    """
+    """The columns of a program's table, each by its possible names without case, spaces and signs."""
 
     program: str
     point: tuple[str, str]
-    duration: tuple[tuple[str, ...], float] = (("durationms", "duration"), 1.0)
+    duration: tuple[tuple[str, ...], float] = (("durationms", "duration"), 1.0)  # and milliseconds of its unit
     picture: tuple[str, ...] = ()
     subject: tuple[str, ...] = ()
     trial: tuple[str, ...] = ()
     number: tuple[str, ...] = ()
     size: tuple[str, str] | None = None
-    keep: tuple[str, tuple[str, ...]] | None = None
+    keep: tuple[str, tuple[str, ...]] | None = None  # a column, and how it begins in the lines that count
     units: _Units = "pixels"
     origin: _Origin = "top left"
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # further columns that tell the table from others
     lacks: tuple[str, ...] = ()
 
 
