@@ -71,8 +71,7 @@ class Evidence(PretrainedForEye):
 
     def evidence(self, features: Tensor) -> Tensor:
         """Evidence of looks, log odds `(...)`, from their features `(..., 10)` (`look_features`)."""
-        value: Tensor = self.look(features)
-        return value[..., 0]
+        return self.look(features)[..., 0]
 
     def unseen(self, like: Tensor) -> Tensor:
         """Evidence of a look from one longer side away without detections, log odds `()`."""
@@ -107,8 +106,7 @@ def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Siz
     # Each input is copied in one piece, and the matrix product reads the table transposed. To interleave the inputs
     # takes longer than the product.
     table = torch.stack([each.expand(shape) for each in inputs]).flatten(1)
-    value: Tensor = network(table.mT)
-    return value.view(shape)
+    return network(table.mT).view(shape)
 
 
 def network(inputs: int, width: int, outputs: int = 1) -> nn.Sequential:

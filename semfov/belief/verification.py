@@ -71,8 +71,7 @@ class Verification(PretrainedForEye):
         Returns:
             `(..., 2)`, log odds that the target is at the place, and that the image holds it.
         """
-        value: Tensor = self.linear(features)
-        return value
+        return self.linear(features)
 
     def _record(self) -> dict[str, Any]:
         return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}

@@ -131,8 +131,7 @@ class CellGazes(Gazes):
         else:
             maps = belief.class_probabilities().mT
         more = torch.stack([visited, here], 1).float()
-        planes: NDArray[np.float32] = torch.cat([maps.float().clamp(0, 1), more], 1).numpy()
-        return planes.reshape(len(rows), -1, *self.scenery.shape)
+        return torch.cat([maps.float().clamp(0, 1), more], 1).numpy().reshape(len(rows), -1, *self.scenery.shape)
 
     def places(self, rows: Tensor) -> Tensor:
         lines, columns = self.scenery.shape
@@ -144,8 +143,7 @@ class CellGazes(Gazes):
         return self.places(rows) * self.size[rows] - 0.5
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
-        free: NDArray[np.bool_] = (~self.memory.visited[rows]).numpy()
-        return free
+        return (~self.memory.visited[rows]).numpy()
 
     def detections(self, rows: Tensor) -> Detections:
         return self.looks.see(self.observer, rows, self.cell[rows], self.points(rows)).detections()

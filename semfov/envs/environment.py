@@ -170,8 +170,7 @@ class GazeEnv(EpisodeEnv):
         Returns:
             `(X·Y,)`, boolean.
         """
-        free: NDArray[np.bool_] = self.gazes.mask(_ROW)[0]
-        return free
+        return self.gazes.mask(_ROW)[0]
 
 
 class GazeSearch(GazeEnv):

@@ -85,8 +85,7 @@ class WindowGaze(Gazes):
             x1, y1, x2, y2 = window.cells
             closeness[0, y1:y2, x1:x2] = closeness[0, y1:y2, x1:x2].clamp(min=(window.level + 1) / lattice.levels)
         near = adaptive_max_pool2d(closeness, self.shape)
-        planes: NDArray[np.float32] = torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()
-        return planes[None]
+        return torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()[None]
 
     def places(self, rows: Tensor) -> Tensor:
         return torch.from_numpy(_action_of(self.glances.lattice, self.window))[None]

@@ -187,7 +187,7 @@ def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     target, maps = scanpath.target, []
     if target is not None:
         order = [index for index in order if index != target]
-        maps.append({"label": scanpath.classes[target], **_quantised(class_posterior(scanpath))})
+        maps.append({"label": scanpath.classes[target], **_quantised(class_posterior(scanpath)[0])})
     labels = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
     maps += [{"label": scanpath.classes[index], **_quantised(probabilities[..., index])} for index in labels]
     # Some detectors give several classes the same name. A number tells their entries apart.

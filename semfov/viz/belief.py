@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
-    """Probability of a class in every cell after each look, `(n, X·Y)`."""
+def class_posterior(scanpath: Scanpath, target: int | None = None) -> tuple[Tensor, str]:
+    """Probability of a class in every cell after each look, `(n, X·Y)`, and the name of the class."""
     index = scanpath.target if target is None else target
     if index is None:
         raise InputError("target: expected a class index, as nothing was searched for, got None")
     last = len(scanpath.classes) - 1
     check(0 <= index <= last, "target", f"a class index from 0 to {last}", index)
-    if scanpath.posterior is not None and index == scanpath.target:
-        return scanpath.posterior.detach().cpu()
-    return scanpath.probabilities[..., index].detach().cpu()
+    own = scanpath.posterior if index == scanpath.target else None
+    posterior = scanpath.probabilities[..., index] if own is None else own
+    return posterior.detach().cpu(), scanpath.classes[index]
 
 
 @styled
@@ -89,7 +89,7 @@ def plot_belief(
         drawn = draw_belief(panel, scanpath, number, target, grey)
         if fixation is None:
             panel.set_title(f"fixation {number}: {panel.get_title()}", parse_math=False)
-    draw_scale(used, drawn, f"probability of {_name(scanpath, target)}")
+    draw_scale(used, drawn, f"probability of {class_posterior(scanpath, target)[1]}")
     for panel in panels[len(fixations) :]:
         panel.remove()
     return figure
@@ -124,9 +124,9 @@ def plot_belief_bars(
     from matplotlib.figure import Figure
 
     check_foveal(scanpath)
-    posterior, name = class_posterior(scanpath, target).numpy(), _name(scanpath, target)
+    chances, name = class_posterior(scanpath, target)
     fixations, grid = choose_fixations(scanpath, most), scanpath.grid
-    highest = max(float(posterior.max()), 1e-9)
+    highest = max(float(chances.max()), 1e-9)
     if axes is None:
         figure = Figure(figsize=(3.3 * len(fixations) + 0.4, 3.0), layout="constrained")
         panels: list[Any] = [
@@ -139,7 +139,7 @@ def plot_belief_bars(
         figure, panels = root(axes[0]), list(axes)
     column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
     for panel, fixation in zip(panels, fixations, strict=True):
-        bars = posterior[fixation]
+        bars = chances[fixation].numpy()
         # Rows grow downwards in the picture and backwards in the plot.
         depth = grid.rows - 1 - row
         colours = colormaps[PROBABILITY](bars / highest)
@@ -159,15 +159,11 @@ def plot_belief_bars(
 
 def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | None, image: Tensor | None) -> AxesImage:
     """Draw the probability of a class in every cell, from 0 to 1, over a photograph."""
-    posterior = class_posterior(scanpath, target)[fixation]
+    posterior, name = class_posterior(scanpath, target)
+    chances = posterior[fixation]
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
-    drawn = draw_cells(axes, scanpath.grid, posterior)
+    drawn = draw_cells(axes, scanpath.grid, chances)
     draw_cross(axes, scanpath.fixations[fixation])
-    axes.set_title(f"p({_name(scanpath, target)}) up to {float(posterior.max()):.2f}", parse_math=False)
+    axes.set_title(f"p({name}) up to {float(chances.max()):.2f}", parse_math=False)
     return drawn
-
-
-def _name(scanpath: Scanpath, target: int | None) -> str:
-    index = scanpath.target if target is None else target
-    return "the target" if index is None else scanpath.classes[index]

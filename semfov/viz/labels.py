@@ -48,8 +48,10 @@ def place_within(
     placed: list[LabelBox] = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x, y, width, height, frame) for x, y in points]
-        free = next((label for label in inside if not _covers_any(label, placed)), None)
-        placed.append(free or _further(inside[0], placed))
+        x1, y1, x2, y2 = next((label for label in inside if not _covers_any(label, placed)), inside[0])
+        while covered := [other for other in placed if boxes_meet((x1, y1, x2, y2), other)]:
+            y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1
+        placed.append((x1, y1, x2, y2))
     return placed[len(obstacles) :]
 
 
@@ -67,14 +69,6 @@ def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
 def _into(x: float, y: float, width: float, height: float, frame: _Size) -> LabelBox:
     x, y = max(0.0, min(x, frame[0] - width)), max(0.0, min(y, frame[1] - height))
     return x, y, x + width, y + height
-
-
-def _further(label: LabelBox, placed: list[LabelBox]) -> LabelBox:
-    """The label moved down until it is free, out of the frame if necessary."""
-    x1, y1, x2, y2 = label
-    while covered := [other for other in placed if boxes_meet((x1, y1, x2, y2), other)]:
-        y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1
-    return x1, y1, x2, y2
 
 
 def _covers_any(label: LabelBox, placed: list[LabelBox]) -> bool:

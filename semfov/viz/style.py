@@ -141,8 +141,7 @@ def root(axes: Axes) -> Figure:
     """The figure that contains axes, also where they are in a subfigure."""
     part: Any = axes.figure
     # For a subfigure this is the whole figure, and for a figure it is the figure itself.
-    whole: Figure = part.figure
-    return whole
+    return part.figure
 
 
 def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:

@@ -359,8 +359,7 @@ class ZoomBelief:
     def expected(self, level: int, at: _Place = _EVERYWHERE) -> Cells:
         """Number of objects that looks of a level are expected to find in each cell, in some rows and columns."""
         self._predict()
-        expected: Cells = self._rate[level, *at] * self.left.numpy()[at]
-        return expected
+        return self._rate[level, *at] * self.left.numpy()[at]
 
     def value(self, level: int, foresight: float) -> Cells:
         """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`); → `(down, across)`."""
@@ -393,8 +392,7 @@ class ZoomBelief:
 
     def chances(self, level: int) -> Cells:
         """Probability that a look at each window shows the class, times the share that no closer look has shown."""
-        probability: Cells = torch.from_numpy(self._level_odds(level)).sigmoid().numpy()
-        return probability * self.unseen(level)
+        return torch.from_numpy(self._level_odds(level)).sigmoid().numpy() * self.unseen(level)
 
     def _level_odds(self, level: int) -> Cells:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""

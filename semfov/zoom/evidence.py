@@ -175,8 +175,7 @@ class PhotographEvidence(nn.Module):
     def presence(self, best: Tensor, target: Tensor) -> Tensor:
         """Log odds that the photograph holds classes 1..K, by their highest scores; shapes `(...)`."""
         facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
-        odds: Tensor = self.whole(facts)[..., 0]
-        return odds
+        return self.whole(facts)[..., 0]
 
 
 _SUMMARY = 3
@@ -384,8 +383,7 @@ class GlimpseEvidence(Pretrained):
         own = facts[..., :1]
         earlier = torch.zeros_like(own) if before is None else before.view_as(own) / 3
         inputs = torch.cat([facts[..., :5], earlier, torch.full_like(own, float(before is not None))], -1)
-        value: Tensor = facts[..., 5] + _through(self.shape, inputs)[..., 0]
-        return value
+        return facts[..., 5] + _through(self.shape, inputs)[..., 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """Predict how many objects centred in each cell closer looks find that this look did not.
@@ -413,8 +411,7 @@ class GlimpseEvidence(Pretrained):
         usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
         crowd = _neighbourhood_mean(best[None], _CROWD)[0]
         maps = [*_hint_maps(own, best, detections, look.size, crowd), usual.expand_as(own), *_memory_maps(own, before)]
-        value: Tensor = _through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
-        return value.clamp(max=3).movedim(-1, 1)
+        return (_through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)).clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
         """Predict whether the picture holds a class, after the looks of a search.
@@ -426,8 +423,7 @@ class GlimpseEvidence(Pretrained):
         Returns:
             Log odds, `(...)`.
         """
-        value: Tensor = torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
-        return value
+        return torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
 
     def taper(self, span: int) -> Tensor:
         """Weights r of the cells along a side of a window; objects at its border are cut.

@@ -53,12 +53,11 @@ class WindowView:
 
 
 class WindowLooks(NamedTuple):
-    """The result of several looks; cut `(F, L)`, windows `(F, 4)`."""
+    """The result of several looks; cut `(F, L)`."""
 
     detections: Detections
     cut: Tensor
     hints: tuple[Hints, ...] | None
-    windows: Tensor
 
 
 class WindowEye(nn.Module):
@@ -159,15 +158,14 @@ class WindowEye(nn.Module):
             boxes = boxes * selected.mask[..., None]
         detections = Detections(boxes, selected.scores, selected.mask).to(here)
         detections, cut = self._treat(detections, place.cut(selected).to(here))
-        windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
         if not hints:
-            return WindowLooks(detections, cut, None, windows)
+            return WindowLooks(detections, cut, None)
         faint = [_hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
         placed = [
             Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
             for number, each in enumerate(faint)
         ]
-        return WindowLooks(detections, cut, tuple(placed), windows)
+        return WindowLooks(detections, cut, tuple(placed))
 
     def glimpse(
         self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None

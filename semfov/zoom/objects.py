@@ -257,8 +257,7 @@ def _object_facts(
 
 def _logit(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     inside = np.clip(scores, _LEAST, _MOST)
-    odds: NDArray[np.float32] = np.log(inside / (1 - inside))
-    return odds
+    return np.log(inside / (1 - inside))
 
 
 def _overlapping(
