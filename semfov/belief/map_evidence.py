@@ -76,12 +76,9 @@ class MapEvidence(Evidence):
         components: int = 81,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
-        for name, value, least in (
-            ("look_width", look_width, 1),
-            ("readout_width", readout_width, 1),
-            ("components", components, 3),
-        ):
-            check_whole(value, name, least, 10_000)
+        check_whole(look_width, "look_width", 1, 10_000)
+        check_whole(readout_width, "readout_width", 1, 10_000)
+        check_whole(components, "components", 3, 10_000)
         super().__init__(look_width, readout_width, components=components, more=1, metadata=metadata)
         self.void = network(_EMPTINESS, readout_width)
         self.worth = network(_GAIN, readout_width)

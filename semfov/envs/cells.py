@@ -205,9 +205,8 @@ class CellGazes(Gazes):
         if self.searching:
             self.result[rows] = right[torch.arange(len(rows)), self.cell[rows]].float()
         else:
-            self.result[rows] = right_cells(self._all_or(rows).class_probabilities(), right).sum(-1) / right.any(
-                -1
-            ).sum(-1)
+            hits = right_cells(self._all_or(rows).class_probabilities(), right).sum(-1)
+            self.result[rows] = hits / right.any(-1).sum(-1)
         if not self.pictures:
             return
         detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)

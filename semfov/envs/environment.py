@@ -457,12 +457,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         for number, row in enumerate(rows.tolist()):
             each[row] = {name: value[number] for name, value in observations.items()}
         infos = self.gazes.infos(self._rows, detections=self._detections)
-        return {
-            "final_obs": each,
-            "_final_obs": ended,
-            "final_info": _marked(infos, ended),
-            "_final_info": ended.copy(),
-        }
+        return _marked({"final_obs": each, "final_info": infos}, ended)
 
     def _observed(self) -> tuple[Arrays, Arrays]:
         infos = self.gazes.infos(self._rows, detections=self._detections)

@@ -349,15 +349,10 @@ def open_zoom_scenery(
     """
     arguments = {**locals()}
     check_whole(passes, "passes", 2, 100_000)
-    folder = Path(scenes) if isinstance(scenes, str | Path) else None
-    data = DataConfig(
-        None if annotations is None else folder,
-        None if annotations is None else Path(annotations),
-        count,
-        min_instances=0,
-        max_target_area=0.2 if annotations is not None else None,
-        scene_seed=seed,
-    )
+    data = DataConfig(limit=count, min_instances=0, max_target_area=None, scene_seed=seed)
+    if annotations is not None:
+        folder = Path(scenes) if isinstance(scenes, str | Path) else None
+        data = replace(data, root=folder, annotations=Path(annotations), max_target_area=0.2)
     config = WindowLookingConfig(
         data=data,
         detector=DetectorConfig(detector, None if weights is None else Path(weights)),

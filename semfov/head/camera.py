@@ -88,7 +88,7 @@ class _CameraScene(Sphere):
 
     still = False
 
-    def __init__(self, camera: PanTiltCamera, color: Color = "rgb", *, cell: float = 6.0) -> None:
+    def __init__(self, camera: PanTiltCamera, color: Color = "rgb") -> None:
         if isinstance(camera, type):
             raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
         names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
@@ -105,15 +105,8 @@ class _CameraScene(Sphere):
             got = f"{camera.pan} with tilt {camera.tilt}, which look like {unit}"
             raise InputError(f"pan: expected limits in degrees, got {got}")
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
-        super().__init__(
-            (width, width // 2),
-            camera.size,
-            pan=camera.pan,
-            tilt=camera.tilt,
-            fields=fields,
-            speeds=camera.speeds,
-            cell=cell,
-        )
+        picture, pan, tilt = (width, width // 2), camera.pan, camera.tilt
+        super().__init__(picture, camera.size, pan=pan, tilt=tilt, fields=fields, speeds=camera.speeds)
         self.camera, self.color = camera, color
         self._frames: dict[tuple[float, ...], tuple[Tensor, Tensor]] = {}
 

@@ -62,9 +62,8 @@ def _probabilities(values: Tensor, argument: str) -> Tensor:
     p = as_numbers(values, argument).double()
     least, most = (float(p.detach().min()), float(p.detach().max())) if p.numel() else (0.0, 0.0)
     inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
-    check(
-        inside, argument, "probabilities from 0 to 1", f"{least:g} to {most:g}; give logits.sigmoid() or .softmax(-1)"
-    )
+    got = f"{least:g} to {most:g}; give logits.sigmoid() or .softmax(-1)"
+    check(inside, argument, "probabilities from 0 to 1", got)
     return p
 
 

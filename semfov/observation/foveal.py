@@ -199,9 +199,8 @@ class FovealObservationModel(Pretrained):
         check_tensor(distance, "distance")
         check(scores.is_floating_point(), "scores", "a floating-point tensor", scores.dtype)
         check_shape(scores, "scores", components)
-        check(
-            scores.shape[:-1] == distance.shape, "distance", f"shape {tuple(scores.shape[:-1])}", tuple(distance.shape)
-        )
+        shape = tuple(scores.shape[:-1])
+        check(shape == distance.shape, "distance", f"shape {shape}", tuple(distance.shape))
         weight, constant = self._linear()
         log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
         # One product for all levels and a selection cost less than gathering a matrix for each detection.

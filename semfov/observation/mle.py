@@ -72,13 +72,8 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
     rows = mean_log.detach().to(torch.float64).reshape(-1, components)
     total = rows.exp().sum(-1)
     largest = float(total.max()) if len(rows) else 0.0
-    check(
-        largest <= 1 + _FEASIBLE,
-        "mean_log",
-        "mean logarithms of scores that sum to 1, so Σ exp(mean_log) up to 1",
-        f"Σ exp(mean_log) = {largest}",
-    )
-
+    expected = "mean logarithms of scores that sum to 1, so Σ exp(mean_log) up to 1"
+    check(largest <= 1 + _FEASIBLE, "mean_log", expected, f"Σ exp(mean_log) = {largest}")
     # The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
     # exceeds A Σ exp(g) + K/2: so most rows are known to stay below the largest precision.
     capped = 1 - total <= components / (2 * max_precision)

@@ -366,9 +366,8 @@ class Moment(Record):
         from semfov.viz.live import draw_moment
 
         image = as_image(frame, argument="frame", color=color)
-        check(
-            tuple(image.shape[:0:-1]) == self.size, "frame", "{} × {} px".format(*self.size), tuple(image.shape[:0:-1])
-        )
+        size = tuple(image.shape[:0:-1])
+        check(size == self.size, "frame", "{} × {} px".format(*self.size), size)
         drawn = draw_moment(image, self, self.describe(), longest)
         return np.ascontiguousarray(drawn[..., ::-1]) if color == "bgr" else drawn
 

@@ -230,17 +230,11 @@ class GazePrediction:
         ends = (times + model.pause.cpu().float()).cumsum(1)
         lengths = ((ends < seconds * 1000).sum(1) + 1).clamp(max=most)
         paths = model.sample(self.terms, (height, width), start, int(lengths.max()), generator)
-        name = self.name
-        return [
-            Fixations(
-                name,
-                f"viewer {number + 1}",
-                path[:length].double().numpy(),
-                self.size,
-                time[:length].double().round().numpy(),
-            )
-            for number, (path, length, time) in enumerate(zip(paths, lengths.tolist(), times, strict=True))
-        ]
+        viewers = []
+        for number, (path, length, time) in enumerate(zip(paths, lengths.tolist(), times, strict=True), 1):
+            points, spent = path[:length].double().numpy(), time[:length].double().round().numpy()
+            viewers.append(Fixations(self.name, f"viewer {number}", points, self.size, spent))
+        return viewers
 
     @property
     def name(self) -> str:

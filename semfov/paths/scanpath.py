@@ -229,23 +229,16 @@ class Scanpath(_CellRecord):
         belief = self.posterior
         if belief is None and self.target is not None:
             belief = self.probabilities[..., self.target]
-        width, height = self.size
+        region = (0.0, 0.0, float(self.size[0]), float(self.size[1]))
         times = [sum(each.values()) for each in self.seconds]
         clock: list[float | None] = [*accumulate(times)] if times else [None] * len(self)
         columns = zip(self.cells.tolist(), self.fixations.tolist(), self.detections, clock, strict=True)
         for number, (cell, (x, y), detections, seconds) in enumerate(columns):
             value = float(self.values[number - 1, cell]) if number else math.inf
+            chosen = value if math.isfinite(value) else None
             more = cell_columns(self.grid, cell, None if belief is None else belief[number])
             more["presence"] = None if self.presence is None else float(self.presence[number])
-            yield RecordedLook(
-                number,
-                (x, y),
-                (0.0, 0.0, float(width), float(height)),
-                detections,
-                seconds,
-                value if math.isfinite(value) else None,
-                more,
-            )
+            yield RecordedLook(number, (x, y), region, detections, seconds, chosen, more)
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Probability in each cell after a look: of the target by the belief of the search, or of any object."""

@@ -343,12 +343,9 @@ class WindowMoment(ZoomPath, Moment):
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        fields = super()._fields(tensors, record, shared)
-        return {
-            **fields,
-            "number": record["number"],
-            "next_window": _window_from(record["next_window"], fields["lattice"]),
-        }
+        made = super()._fields(tensors, record, shared)
+        window = _window_from(record["next_window"], made["lattice"])
+        return {**made, "number": record["number"], "next_window": window}
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:

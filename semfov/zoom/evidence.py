@@ -185,6 +185,10 @@ CASE, _JUDGE_WIDTH = 10, 16
 """Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.decision`)."""
 
 
+_VERIFIED = {"verification.linear.weight": (2, CLOSER_FEATURES), "verification.linear.bias": (2,)}
+_OWN = {"usual": ("K",), "whole.weight": (1, 2), "whole.bias": (1,), **_VERIFIED}  # of photographs
+
+
 class GlimpseEvidence(Pretrained):
     r"""Predicts from a look at a window what looks at its parts show that are one to three octaves closer.
 
@@ -251,18 +255,8 @@ class GlimpseEvidence(Pretrained):
             "survey.mix.weight": Field((_CHANNELS, "K"), low=-_LARGEST, high=_LARGEST),
             **perceptron("survey.rate", _INPUTS, _WIDTH, STEPS),
             "survey.border": Field((4,), low=-1e3, high=1e3),
-            "verification.linear.weight": Field((2, CLOSER_FEATURES), low=-1e3, high=1e3, optional=True),
-            "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
-            **{
-                f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True)
-                for name, shape in {
-                    "usual": ("K",),
-                    "whole.weight": (1, 2),
-                    "whole.bias": (1,),
-                    "verification.linear.weight": (2, CLOSER_FEATURES),
-                    "verification.linear.bias": (2,),
-                }.items()
-            },
+            **{name: Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in _VERIFIED.items()},
+            **{f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in _OWN.items()},
         },
         {
             "classes": Number(size="K"),
@@ -459,10 +453,7 @@ class GlimpseEvidence(Pretrained):
         verified, own = self.verification, self.photograph
         at = own and own.verification.thresholds
         return {
-            "classes": self.classes,
-            "width": self.width,
-            "patience": self.patience,
-            "foresight": self.foresight,
+            **{name: getattr(self, name) for name in ("classes", "width", "patience", "foresight")},
             "thresholds": self.thresholds and asdict(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
             "verification": verified and {"thresholds": verified.thresholds and asdict(verified.thresholds)},
@@ -477,30 +468,23 @@ class GlimpseEvidence(Pretrained):
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        verified, certainty, photograph = (record.get(name) for name in ("verification", "certainty", "photograph"))
-        chosen, sure = record["thresholds"], verified and verified["thresholds"]
-        at, certain = (photograph and photograph[name] for name in ("thresholds", "certainty"))
-        least, context = (photograph or {}).get("window", USUAL_WINDOW)
+        verified, own = record.get("verification"), record.get("photograph")
+        least, context = (own or {}).get("window", USUAL_WINDOW)
         model = cls(
-            record["classes"],
-            record["width"],
-            patience=record["patience"],
-            foresight=record["foresight"],
-            thresholds=chosen and Thresholds(**chosen),
-            verification=verified and Verification(thresholds=sure and Thresholds(**sure)),
-            certainty=None if certainty is None else Certainty.of(certainty),
-            photograph=photograph
-            and PhotographEvidence(
-                record["classes"],
-                thresholds=at and Thresholds(**at),
-                certainty=None if certain is None else Certainty.of(certain),
-                window=(least, context),
-            ),
-            metadata=record["metadata"],
+            **{name: record[name] for name in ("classes", "width", "patience", "foresight", "metadata")},
+            **_chosen(record),
+            verification=verified and Verification(thresholds=_chosen(verified)["thresholds"]),
+            photograph=own and PhotographEvidence(record["classes"], **_chosen(own), window=(least, context)),
         )
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
         return model
+
+
+def _chosen(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The thresholds and the certainty in a record."""
+    at, certainty = record["thresholds"], record.get("certainty")
+    return {"thresholds": at and Thresholds(**at), "certainty": None if certainty is None else Certainty.of(certainty)}
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:

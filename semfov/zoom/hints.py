@@ -66,15 +66,10 @@ class Gist:
         size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
         found = np.zeros((cells, kinds), np.bool_)
         found[there, class_scores[sure].argmax(1)] = True
-        shape = rows, columns
-        return Gist(
-            level,
-            (column, row),
-            scale,
-            strongest.view(*shape, -1),
-            torch.from_numpy(size).view(shape),
-            torch.from_numpy(found).view(*shape, -1),
+        maps = (
+            each.unflatten(0, (rows, columns)) for each in (strongest, torch.from_numpy(size), torch.from_numpy(found))
         )
+        return Gist(level, (column, row), scale, *maps)
 
     @cached_property
     def best(self) -> Tensor:

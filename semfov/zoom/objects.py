@@ -161,11 +161,8 @@ def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
 def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> tuple[Tensor, ...]:
     """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications."""
     looks = [glance.detections for glance in glances]
-    detections = Detections(
-        torch.cat([look.boxes for look in looks], 1),
-        torch.cat([look.scores for look in looks], 1),
-        torch.cat([look.mask for look in looks], 1),
-    )
+    columns = zip(*((look.boxes, look.scores, look.mask) for look in looks), strict=True)
+    detections = Detections(*(torch.cat(column, 1) for column in columns))
     value, label = detections.confidence[0], detections.labels[0]
     classes = [target] if isinstance(target, int) else list(target or ())
     if classes:

@@ -61,10 +61,7 @@ class LearnedMap(Gatherer[MapEvidence]):
         targets = torch.arange(1, len(self.model.prior), device=fixation.device)
         by_class = self.each(
             lambda boxes, scores, mask, point: self.model(Detections(boxes, scores, mask), point, grid, targets),
-            detections.boxes,
-            detections.scores,
-            detections.mask,
-            fixation,
+            *(detections.boxes, detections.scores, detections.mask, fixation),
         )
         every = targets.expand(len(fixation), -1)
         where = grid.distance(fixation), highest_score(detections, targets), grid.cell_of(fixation)
