@@ -32,7 +32,8 @@ from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
 from semfov.viz.animation import render
 from semfov.viz.belief import plot_belief
-from semfov.viz.style import FOUND, GAZE, TARGET
+from semfov.viz.scanpath import plot_foveated_strip
+from semfov.viz.style import GAZE, TARGET
 
 _TASKS = ("search", "find all", "explore", "gaze")
 _EVERY = "all classes"
@@ -148,13 +149,9 @@ class _Calls:
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
             cells = [*cells, int(grid.cell_of(point)[0])]
             looked = _look_at_cells(self.agent, image, target, cells)
-            return (
-                cells,
-                _clicked(image, looked),
-                _seen(looked),
-                render([plot_belief(looked.record, -1)], dpi=110)[0],
-                looked.describe(),
-            )
+            seen = render([plot_foveated_strip(looked.record, most=1)], dpi=250)[0]
+            believed = render([plot_belief(looked.record, -1)], dpi=110)[0]
+            return cells, _clicked(image, looked), seen, believed, looked.describe()
 
     def fresh(self, picture: Any) -> tuple[Any, ...]:
         """No cells, and the picture to click on."""
@@ -267,21 +264,4 @@ def _clicked(image: Tensor, looked: _OwnLooks) -> Image.Image:
     x, y = (side * scale for side in looked.point)
     draw.circle((x, y), radius, outline="white", width=6)
     draw.circle((x, y), radius, outline=TARGET, width=4)
-    return picture
-
-
-def _seen(looked: _OwnLooks) -> Image.Image:
-    """The foveated picture of the last look, with its detections of at least 0.1."""
-    record = looked.record
-    view = record.views()[-1]
-    picture = pillow(view)
-    draw, scale = ImageDraw.Draw(picture), view.shape[-1] / record.size[0]
-    detections = record.looks[-1].detections
-    columns = detections.boxes[0].tolist(), detections.labels[0].tolist(), detections.confidence[0].tolist()
-    for box, label, score in zip(*columns, strict=True):
-        if score >= 0.1:
-            colour = FOUND if label == record.target else GAZE
-            draw.rectangle([side * scale for side in box], outline=colour, width=3)
-            draw.text((box[0] * scale + 4, box[1] * scale + 2), f"{record.classes[label]} {score:.2f}", fill="white",
-                      stroke_width=2, stroke_fill=colour, font_size=max(12, picture.width / 40))  # fmt: skip
     return picture

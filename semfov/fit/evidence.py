@@ -300,15 +300,6 @@ class EvidenceFit(PartFit):
             "deciding": judged,
         }
 
-    def _wide_thresholds(self, model: TargetEvidence) -> Thresholds:
-        """Choose the thresholds on the held-out photographs, with many absent classes for a precise share of alarms."""
-        config, scenes = self.settings, self.inputs.held_out
-        absent = max(config.classes, min(20, _ABSENT // len(scenes)))
-        wide = _make_examples(self.run, replace(config, absent=absent), scenes)
-        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
-        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
-        return _judge_evidence(bounds, model, wide, Grid(*config.cells, config.cells))[1]
-
     def _curves(self, ways: Mapping[str, Strategy]) -> dict[str, FloatArray]:
         """Cumulative performance of strategies on every photograph with a target, `(P, shifts+1)`."""
         run, protocol = self.run, self.inputs.protocol
@@ -359,8 +350,14 @@ class EvidenceFit(PartFit):
 
     def fit(self) -> PartResult:
         """Train, and compare searches and their decisions with those of raw scores."""
-        inputs, fit = self.inputs, fit_evidence(self.settings, self.run)
-        fit.model.thresholds = thresholds = self._wide_thresholds(fit.model)
+        config, inputs, fit = self.settings, self.inputs, fit_evidence(self.settings, self.run)
+        # Thresholds are chosen with many absent classes, for a precise share of alarms.
+        absent = max(config.classes, min(20, _ABSENT // len(inputs.held_out)))
+        wide = _make_examples(self.run, replace(config, absent=absent), inputs.held_out)
+        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
+        bounds = replace(config, surest=SUREST_OF_FEW if expected < 10 else SUREST)
+        thresholds = _judge_evidence(bounds, fit.model, wide, Grid(*config.cells, config.cells))[1]
+        fit.model.thresholds = thresholds
         learned = Strategy(Target(fit.model), Policy("non-predictive"))
         ways = {
             "fitted": learned,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.protocols import explorations_of, run_explorations
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.settings import Count, Range, Share
+from semfov.runs.settings import Count, Range
 from semfov.runs.tables import table
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
@@ -55,10 +55,11 @@ class FitMapConfig(FitOnLooksConfig):
         gain_steps: number of training steps for predicting the gain of a look.
     """
 
+    astray: ClassVar[float] = 0.5
+
     classes: Annotated[int, Range(2, 10_000)] = 12
     others: Count = 3
     looks: Annotated[int, Range(2, 10_000)] = 12
-    astray: Share = 0.5
     steps: Count = 1000
     gain_steps: Count = 200
     batch: Count = 12

@@ -57,15 +57,9 @@ class _WholeSearch(TargetSearch[WindowLook]):
         *,
         spare: bool = False,
     ) -> None:
-        places = partial(PhotographPlaces, target, glances.lattice, window=model.window)
-        super().__init__(
-            number,
-            target,
-            places,
-            lambda box: look_closely(glances, box, model.window).candidates,
-            present=len(objects) > 0,
-            spare=spare,
-        )
+        self.picture, self.target, self.present, self.spare = number, target, len(objects) > 0, spare
+        self.candidates = partial(PhotographPlaces, target, glances.lattice, window=model.window)
+        self.close_up = lambda box: look_closely(glances, box, model.window).candidates
         self.steps, self.objects, self.model = (whole,), objects, model
         self.best = float(whole.show[target - 1])
         """Highest score of the target."""

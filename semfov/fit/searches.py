@@ -35,21 +35,14 @@ class TargetSearch(ABC, Generic[LookType]):
 
     after: ClassVar[tuple[int, ...]]
     most: ClassVar[int] = MOST_CLOSER
+    picture: int
+    target: int
+    present: bool
+    spare: bool = False
+    passes: float = math.inf
     steps: Any
-
-    def __init__(
-        self,
-        picture: int,
-        target: int,
-        candidates: Callable[[], CandidatePlaces[LookType]],
-        close_up: LookAt,
-        *,
-        present: bool,
-        spare: bool = False,
-        passes: float = math.inf,
-    ) -> None:
-        self.picture, self.target, self.candidates, self.close_up = picture, target, candidates, close_up
-        self.present, self.spare, self.passes = present, spare, passes
+    candidates: Callable[[], CandidatePlaces[LookType]]
+    close_up: LookAt
 
     def look(self, index: int, number: int) -> LookType:
         """Return the look of this index; `number` looks of both kinds were made up to it."""
@@ -120,14 +113,10 @@ class _PhotographSearch(TargetSearch[Step]):
     def __init__(
         self, photograph: SearchedPhotograph, target: DrawnSearch, evidence: TargetEvidence, looks: int
     ) -> None:
-        super().__init__(
-            photograph.number,
-            target.target,
-            partial(CandidateCells, photograph.grid, target.target),
-            lambda box: photograph.looks(tuple(box.tolist())),
-            present=target.present,
-            spare=target.spare,
-        )
+        self.picture, self.target = photograph.number, target.target
+        self.present, self.spare = target.present, target.spare
+        self.candidates = partial(CandidateCells, photograph.grid, target.target)
+        self.close_up = lambda box: photograph.looks(tuple(box.tolist()))
         self.photograph, self.sought, self.evidence, self.most_looks = photograph, target, evidence, looks
 
     @cached_property

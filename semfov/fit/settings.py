@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from semfov.errors import InputError
 from semfov.fit.gaze_model import GazeModelFit
 from semfov.runs.config import DataConfig, DetectorConfig, EyeConfig
-from semfov.runs.settings import Count, Positive, Range, Seed, Share, Side, SingleName, Whole
+from semfov.runs.settings import Count, Positive, Range, Seed, Side, SingleName, Whole
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,6 @@ class FitOnLooksConfig(FitOnCellsConfig):
         data: photographs to learn from.
         holdout: one in every n photographs is held out for the evaluation.
         looks: number of looks in a training episode.
-        astray: share of the fixations in training that are drawn at random, so that the model learns from all cells.
         steps: number of training steps.
         batch: number of examples in a step.
         rate: highest learning rate.
@@ -61,10 +60,13 @@ class FitOnLooksConfig(FitOnCellsConfig):
         cache: folder for the detections from every cell, shared with the evaluations (None: the user's cache).
     """
 
+    astray: ClassVar[float] = (
+        0.3  # share of the fixations in training that are drawn at random, to learn from all cells
+    )
+
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     holdout: Annotated[int, Range(2, 10**9)] = 5
     looks: Annotated[int, Range(2, 10_000)] = 16
-    astray: Share = 0.3
     steps: Count = 500
     batch: Count = 48
     rate: Positive = 5e-3

@@ -153,15 +153,9 @@ class _MosaicSearch(TargetSearch[WindowLook]):
         likely: float,
         turns: Iterable[tuple[WindowStep[ZoomBelief], SearchFacts]],
     ) -> None:
-        places = partial(CandidateBoxes, target, likely)
-        super().__init__(
-            mosaic,
-            target,
-            places,
-            lambda box: look_closely(looks, box).detections,
-            present=len(objects) > 0,
-            passes=passes,
-        )
+        self.picture, self.target, self.present, self.passes = mosaic, target, len(objects) > 0, passes
+        self.candidates = partial(CandidateBoxes, target, likely)
+        self.close_up = lambda box: look_closely(looks, box).detections
         self.looks, self.objects, self.steps = looks, objects, list[WindowLook]()
         self.glances, self.boxes = list[Glance](), list[Tensor | None]()
         for number, (turn, facts) in enumerate(turns, 1):

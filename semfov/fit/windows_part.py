@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
@@ -45,13 +44,6 @@ _LOOK = 0.04
 """Estimate of the seconds of a pass of the detector."""
 
 
-@dataclass(frozen=True)
-class _LeftOut:
-    """Settings of evidence that is not fitted."""
-
-    why: str
-
-
 class WindowsFit(PartFit):
     """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
 
@@ -66,9 +58,9 @@ class WindowsFit(PartFit):
                 f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
-        self.settings: FitMosaicsConfig | _LeftOut
+        self.settings: FitMosaicsConfig | dict[str, str]
         if why is not None:
-            self.settings, self.tasks = _LeftOut(why), {}
+            self.settings, self.tasks = {"left out": why}, {}
             return
         self.settings = config = self.mosaics(photographs)
         sets = {"searched": config.searched, "judged": config.judged}
@@ -114,8 +106,9 @@ class WindowsFit(PartFit):
     def fit(self) -> PartResult:
         """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
         config = self.settings
-        if isinstance(config, _LeftOut):
-            return PartResult(Part(None, None, False, config.why), f"{config.why.capitalize()}.")
+        if isinstance(config, dict):
+            why = config["left out"]
+            return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
         with one_thread():
             fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
             model, figures = _fit_mosaics(fit)
