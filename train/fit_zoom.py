@@ -20,6 +20,7 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
+from semfov.fit.training import training_of
 from semfov.fit.windows_certainty import explorations_of_kinds, spread_again
 from semfov.fit.windows_evidence import (
     SurveyExample,
@@ -39,9 +40,6 @@ from semfov.zoom.evidence import GlimpseEvidence, Survey
 from train.outputs import write_outputs
 from train.zoom_choice import choose_foresight, choose_patience
 from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, PicturesFit, RefitPart
-
-_PREDICTING = ("mosaics", "far", "kinds", "each", "steps", "tile", "seed")
-"""Settings that the prediction whether a closer look shows a class depends on, where it was fitted further."""
 
 _FURTHER = 1e-3
 """Highest learning rate of a prediction that is fitted further."""
@@ -73,7 +71,6 @@ def fit_zoom(config: FitZoomConfig) -> None:
             lines += _fit_further(config, model, examples)
     if "survey" in refit:
         fit.survey(model, examples)
-        model.metadata["survey"]["judged_far"] = config.judged_far
         held = {"": examples["judged"], ", crowded": examples["judged crowded"]}
         measured = {
             name: value for each in held for name, value in judge_survey(model.survey, held[each], each).items()
@@ -97,10 +94,11 @@ def fit_zoom(config: FitZoomConfig) -> None:
         check(model.certainty is not None, "evidence", "a model whose certainty was fitted", config.evidence)
         prepare_worker()
         lines += spread_again(model, explorations_of_kinds(model, fit.explored()[0], config.passes), config.passes)
-        fit.note(model, "spread")
     if "photograph" in refit and config.photographs:
         scenes = make_scenes(config.data, fit.eye.detector.classes)
         lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
+    settings = training_of(config, fit.mosaics["near"])["training"]
+    model.metadata |= {part: settings for part in refit if part != "photograph"}
     path = inside(config.out, f"{fit.eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
@@ -129,7 +127,6 @@ def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mappin
     looks = [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
     fit_presence(model.requires_grad_(True), pair_windows(looks), config.steps, rate=_FURTHER)
     model.requires_grad_(False)
-    model.metadata["presence"] = {name: getattr(config, name) for name in _PREDICTING}
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]
     for kind, windows in judged.items():
         pairs = zip(before[kind], _cross_entropies(model, windows), strict=True)

@@ -50,8 +50,6 @@ class FitZoomConfig(FitMosaicsConfig):
 class PicturesFit(MosaicFit):
     """A fit on mosaics and on pictures of other kinds."""
 
-    composed = ("kinds", "each", "judged_each")
-
     def __init__(self, config: FitZoomConfig) -> None:
         super().__init__(config)
         self.kinds = config.kinds

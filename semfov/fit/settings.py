@@ -16,7 +16,6 @@ class FitConfig(EyeConfig):
 
     Args:
         data: photographs to learn from (by default all of them, however many objects they have).
-        detector: the detector that processes the foveated views.
         seed: seed of all random choices.
         name: name of the model (None: the detector's name).
         out: folder for the model and the report.
@@ -50,20 +49,15 @@ class FitOnLooksConfig(FitOnCellsConfig):
     """Base of the settings of fits on looks from every cell of photographs.
 
     Args:
-        data: photographs to learn from.
         holdout: one in every n photographs is held out for the evaluation.
         looks: number of looks in a training episode.
         steps: number of training steps.
         batch: number of examples in a step.
         rate: highest learning rate.
-        seed: seed of the choice of classes, the initial parameters and the training.
-        cache: folder for the detections from every cell, shared with the evaluations (None: the user's cache).
     """
 
-    astray: ClassVar[float] = (
-        0.3  # share of the fixations in training that are drawn at random, to learn from all cells
-    )
-
+    # Share of the fixations in training that are drawn at random, so that the model learns from all cells.
+    astray: ClassVar[float] = 0.3
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     holdout: Annotated[int, Range(2, 10**9)] = 5
     looks: Annotated[int, Range(2, 10_000)] = 16
@@ -94,7 +88,6 @@ class FitDetectorConfig(FitOnCellsConfig):
         gaze: pictures that people viewed, to fit where people look to. Without photographs, nothing else is fitted.
         thin: the report lists classes with fewer objects than this in the training photographs.
         out: folder to write the models to.
-        cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
     """
 
     unused = ("name",)

@@ -55,8 +55,6 @@ class VerificationConfig(FitOnCellsConfig):
     """Fit the verification of targets.
 
     Args:
-        data: photographs to learn from.
-        detector: the detector that processes the foveated views and the closer looks.
         classes: maximum number of present classes to search for in each photograph.
         absent: maximum number of absent classes to search for (None: as many as present ones).
         max_target_area: classes that cover a larger share of the image are not searched for.
@@ -65,7 +63,6 @@ class VerificationConfig(FitOnCellsConfig):
         give_up: least probability of a cell that is worth a fixation.
         false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
         folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
-        seed: seed of the choice of classes and of the first fixations.
     """
 
     classes: Count = 2

@@ -241,17 +241,6 @@ def crowded(scenes: Scenes, share: float) -> ChosenScenes:
     return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
 
 
-_SEARCHING = ("searched", "judged", "sought", "passes", "false_alarms", "surest")
-_DEPENDS_ON = {
-    "survey": ("mosaics", "far", "crowded", "judged", "survey_steps"),
-    "decision": (*_SEARCHING, "judging", "lost"),
-    "verification": (*_SEARCHING, "place"),
-    "certainty": ("searched", "far", "judged", "passes"),
-    "spread": ("searched", "far", "judged", "passes"),
-}
-"""Settings that the parts of a model depend on, beside the pictures."""
-
-
 def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
     """Look at all windows of a picture that are not in the store yet; returns what the store has of it."""
     kind, index = task
@@ -268,8 +257,6 @@ class MosaicFit:
 
     kinds: tuple[str, ...] = ()
     """Kinds of pictures to fit on beside the mosaics."""
-    composed: tuple[str, ...] = ()
-    """Settings of these pictures, on which all parts but the survey depend."""
 
     def __init__(self, config: FitMosaicsConfig, eye: WindowEye | None = None) -> None:
         if eye is None:
@@ -343,7 +330,6 @@ class MosaicFit:
         looked = [SurveyExample.of(example) for kind in ("near", "far", "crowded") for example in examples[kind]]
         fit_survey(survey, looked, config.survey_steps)
         model.survey = survey.eval().requires_grad_(False)
-        self.note(model, "survey")
 
     def decisions(self, model: GlimpseEvidence) -> list[str]:
         """Fit the decisions of searches: the probability of presence, and the thresholds."""
@@ -360,7 +346,6 @@ class MosaicFit:
         _fit_judge(model, searches["searched"], config.judging)
         rows = _judge_searches(model, searches["judged"], config)
         assert model.thresholds is not None
-        self.note(model, "decision")
         fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
         return [
             f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them "
@@ -379,17 +364,12 @@ class MosaicFit:
         searched = {
             use: [(self.pictures[kind], self.opened(kind)) for kind in kinds] for use, kinds in self._searched().items()
         }
-        text = _fit_closer(model, searched, self.config, prior)
-        if model.verification is not None:
-            self.note(model, "verification")
-        return ["Closer looks:", "", text]
+        return ["Closer looks:", "", _fit_closer(model, searched, self.config, prior)]
 
     def certainty(self, model: GlimpseEvidence) -> list[str]:
         """Fit the probability that an object is there, and the spread of expected numbers."""
         prepare_worker()
-        lines = certainty_again(model, *self.explored(), passes=self.config.passes)
-        self.note(model, "certainty")
-        return lines
+        return certainty_again(model, *self.explored(), passes=self.config.passes)
 
     def explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
         """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""
@@ -404,9 +384,3 @@ class MosaicFit:
         """Kinds of pictures to fit decisions on, and to choose thresholds on."""
         judged = (f"judged {kind}" for kind in self.kinds)
         return {"searched": ("searched", *self.kinds), "judged": ("judged", *judged)}
-
-    def note(self, model: GlimpseEvidence, part: str) -> None:
-        """Note in the model the settings that a part depends on."""
-        composed = () if part == "survey" else self.composed
-        names = (*_DEPENDS_ON[part], *composed, "tile", "seed")
-        model.metadata[part] = {name: getattr(self.config, name) for name in names}

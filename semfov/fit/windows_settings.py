@@ -16,8 +16,6 @@ class FitMosaicsConfig(FitConfig):
     """Fit evidence by magnification on mosaics.
 
     Args:
-        data: photographs to compose the mosaics from.
-        detector: the detector.
         holdout: one in every n photographs is held out.
         mosaics: number of training mosaics of 4 × 4 photographs.
         far: number of training mosaics of 8 × 6 photographs, in which objects are half as large, and largest number of
@@ -42,11 +40,6 @@ class FitMosaicsConfig(FitConfig):
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
-        seed: seed of the mosaics and the fit.
-        out: folder for the model and the report.
-        cache: folder for the looks (None: the user's cache).
-        workers: number of processes (None: one for each CPU core).
-        scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
     unused = ("sensor", "name")

@@ -234,7 +234,7 @@ class WorkConfig(Settings):
     """Settings of every run and every fit with a detector.
 
     Args:
-        detector: the detector, which is applied to each foveated view.
+        detector: the detector, which is applied to each view.
         out: folder of the outcomes.
         cache: folder for what is stored, shared between runs (None: the user's cache).
         workers: number of processes (None: one per CPU core).
@@ -276,7 +276,6 @@ class LookingConfig(EyeConfig):
 
     Args:
         belief: the belief, a grid of class distributions; its columns and rows are the cells.
-        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         store: keep detections on disk; false computes them anew in each run (the result is the same).
     """
 

@@ -34,7 +34,6 @@ class WindowLookingConfig(WorkConfig):
     """Large pictures, and an eye that looks at windows of them.
 
     Args:
-        data: the photographs (without a root: the embedded scenes).
         mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
         columns: number of photographs in a row of a mosaic.
         rows: number of photographs in a column of a mosaic.
@@ -42,7 +41,6 @@ class WindowLookingConfig(WorkConfig):
         cut: what to do with boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         seed: random seed of mosaics.
-        cache: folder for the stored looks, shared between runs (None: the user's cache).
         store: keep looks on disk; false computes them anew in each run (the result is the same).
     """
 

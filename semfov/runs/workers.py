@@ -19,7 +19,7 @@ from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Generic, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from tqdm import tqdm
@@ -133,19 +133,19 @@ def run_tasks(
         return
     processes = available_cores() if where is None else where
     with closing(task_bar(len(tasks), title, unit, hidden=hidden)) as bar:
-        if isinstance(processes, int):
-            if processes <= 1 or len(tasks) == 1:
-                if made is None:
-                    prepare_worker()
-                    made = make(*settings)
-                for task in tasks:
-                    yield task, function(made, task)
-                    bar.update()
-            else:
-                yield from _in_processes(_Job(function, make, settings), tasks, processes, title, bar)
+        if isinstance(processes, int) and (processes <= 1 or len(tasks) == 1):
+            if made is None:
+                prepare_worker()
+                made = make(*settings)
+            for task in tasks:
+                yield task, function(made, task)
+                bar.update()
             return
-        job = _Job(function, make, settings, package_digest())
-        if isinstance(processes, Executor):
+        code = None if isinstance(processes, int) else package_digest()
+        job: Callable[[_Task], _Result] = _Job(function, make, settings, Path.cwd(), code).run
+        if isinstance(processes, int):
+            yield from _in_processes(job, tasks, processes, title, bar)
+        elif isinstance(processes, Executor):
             yield from _results(processes, job, tasks, lambda _: bar.update())
         else:
             yield from _on_cluster(processes, job, tasks, title, bar)
@@ -162,20 +162,16 @@ def shared_processes() -> Iterator[None]:
             _shared.reset(before)
 
 
-class _Job(Generic[_Made, _Task, _Result]):
+class _Job(NamedTuple):
     """A function and what it needs made, for workers that may have had other jobs; `code` is checked if it is given."""
 
-    def __init__(
-        self,
-        function: Callable[[_Made, _Task], _Result],
-        make: Callable[..., _Made],
-        settings: tuple[object, ...],
-        code: str | None = None,
-    ) -> None:
-        self.function, self.make, self.settings, self.code = function, make, settings, code
-        self.folder = Path.cwd()
+    function: Callable[[Any, Any], Any]
+    make: Callable[..., Any]
+    settings: tuple[object, ...]
+    folder: Path
+    code: str | None = None
 
-    def __call__(self, task: _Task) -> _Result:
+    def run(self, task: Any) -> Any:
         """Prepare the process unless its last task has, and run the task; threads of a worker take turns."""
         with _turn:
             if self.code is not None and package_digest() != self.code:
@@ -235,13 +231,11 @@ def _in_processes(
 ) -> Iterator[tuple[_Task, _Result]]:
     shared = _shared.get()
     try:
-        if shared is None:
-            with _started(min(processes, len(tasks))) as pool:
-                yield from _results(pool, job, tasks, lambda _: bar.update(), _deaf_children())
-        else:
-            pools, executors = shared
+        with ExitStack() as own:
+            pools, executors = shared or (own, {})
             if processes not in executors:
-                executors[processes] = pools.enter_context(_started(processes))
+                number = processes if shared else min(processes, len(tasks))
+                executors[processes] = pools.enter_context(_started(number))
             yield from _results(executors[processes], job, tasks, lambda _: bar.update(), _deaf_children())
     except BrokenProcessPool:
         raise SemfovError(
