@@ -106,7 +106,7 @@ class ZoomPath(Record):
         "found": "The probability is high enough, and a detection shows the target.",
         "absent": "No remaining look is worth a pass, and the target is probably absent.",
         "undecided": "No remaining look is worth a pass, but the target is probably there.",
-        "unseen": "No look shows a candidate: the probability is how frequent the class is, not something seen.",
+        "unseen": "No look shows a candidate: the probability follows from the class's frequency and low score.",
         "first found": "The first look shows the target closely enough.",
         "closer found": "A closer look confirmed the target.",
         "closer absent": "No closer look was sure enough, and the target is probably absent.",

@@ -65,8 +65,7 @@ def episode_data(
     grid, decision = scanpath.grid, scanpath.decision
     size = grid.extent.tolist()
     found = decision if decision is not None and decision.outcome == "found" else None
-    best = None if found is None else found.box
-    best = scanpath.best_place[0] if scanpath.best_place is not None else best
+    best = found.box if found is not None else scanpath.best_place and scanpath.best_place[0]
     timed = len(scanpath.seconds) > 0
     after = [*scanpath.cells.tolist()[1:], None]
     every_view: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views

@@ -214,7 +214,8 @@
     drawValues();
     listDetections();
     listSeconds();
-    const seen = now.detections.slice(0, 3).map((detection) => detection.label).join(", ") || "nothing";
+    const labels = now.detections.map((detection) => detection.label), times = (label) => labels.filter((each) => each === label).length;
+    const seen = [...new Set(labels)].map((label) => `${times(label)} × ${label}`).join(", ") || "nothing";
     const sure = episode.presence === null ? "" : ` Probability that “${episode.target}” is in the picture: ${(episode.presence[fixation] ?? 0).toFixed(2)}.`;
     const end = fixation === last ? ` The end: ${episode.summary}.` : "";
     find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${sure}${end}`;

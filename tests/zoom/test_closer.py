@@ -445,7 +445,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     nothing = agent.search(photograph, "blue")
     assert nothing.decision.outcome == "absent"
     assert nothing.passes == 1
-    assert "not something seen" in nothing.why_it_ended()
+    assert "frequency and low score" in nothing.why_it_ended()
     seen = torch.tensor([0.0, 0.0, PhotographPlaces.least + 1e-6])
     shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
     assert "worth a pass" in shown.why_it_ended()
