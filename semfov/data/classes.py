@@ -89,12 +89,7 @@ def _read(table: str) -> dict[str, tuple[str, ...]]:
     return classes
 
 
-_SYNONYMS = _read(_TABLE)
-"""Names of COCO's classes by their synonyms, in lower case and without spaces.
-
->>> SYNONYMS["mug"], SYNONYMS["glass"]
-(('cup',), ('wine glass', 'cup'))
-"""
+_SYNONYMS = _read(_TABLE)  # names of COCO's classes by their synonyms, in lower case and without spaces
 
 
 # Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
@@ -132,8 +127,7 @@ def canonical_name(name: str) -> str:
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
     """Index the classes by their canonical names."""
     indices = {canonical_name(name): index for index, name in enumerate(classes, 1)}
-    if len(indices) != len(classes):
-        raise InputError(f"classes: expected {len(classes)} different names, got {len(indices)}")
+    check(len(indices) == len(classes), "classes", f"{len(classes)} different names", len(indices))
     return indices
 
 

@@ -113,11 +113,9 @@ def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
         return image
     height, width = image.shape[-2:]
     image = read_image(path, oriented=False)
-    if image.shape[-2:] != size[::-1]:
-        raise DataError(
-            f"image {path}: expected {size[0]} × {size[1]} pixels as annotated, got {width} × {height}; "
-            f"use the image that the annotations were made for"
-        )
+    got = f"{width} × {height}; use the image that the annotations were made for"
+    fits = image.shape[-2:] == size[::-1]
+    check_data(fits, f"image {path}", f"{size[0]} × {size[1]} pixels as annotated", got)
     return image
 
 
@@ -209,11 +207,9 @@ class CocoScenes(Scenes):
             if targets or max_target_area is None:
                 self._rows.append(row)
                 self._targets.append(targets)
-        if not self._rows:
-            raise DataError(
-                f"annotations {annotations}: none of {len(packed.ids)} images has at least {min_instances} boxes "
-                f"and a class that covers at most {max_target_area} of it; relax min_instances or max_target_area"
-            )
+        some = f"images with at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
+        got = f"none among {len(packed.ids)}; relax min_instances or max_target_area"
+        check_data(bool(self._rows), f"annotations {annotations}", some, got)
         self.ids = [packed.ids[row] for row in self._rows]
         names = [packed.names[row] for row in self._rows]
         self._files = [inside(root, name) for name in names]
@@ -269,12 +265,9 @@ def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotatio
     """Ids as text, checked to be in the annotations."""
     chosen = {str(i) for i in ids}
     missing = sorted(chosen - {str(i) for i in image_ids})
-    if missing:
-        some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-        raise DataError(
-            f"annotations {annotations}: expected an image for each of {len(chosen)} ids, got none for "
-            f"{len(missing)} of them: {some}; correct ids or the annotations"
-        )
+    some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+    got = f"none for {len(missing)} of them: {some}; correct ids or the annotations"
+    check_data(not missing, f"annotations {annotations}", f"an image for each of {len(chosen)} ids", got)
     return chosen
 
 
@@ -344,12 +337,9 @@ def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> di
     """Index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
     labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in coco.cats.items()}
-    if not any(labels.values()):
-        names = ", ".join(ascii(category["name"]) for category in list(coco.cats.values())[:5]) or "none"
-        raise DataError(
-            f"annotations {path}: expected some of the detector's {len(classes)} classes "
-            f"({', '.join(classes[:5])}, ...) among the categories, got {names}"
-        )
+    names = ", ".join(ascii(category["name"]) for category in list(coco.cats.values())[:5]) or "none"
+    some = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
+    check_data(any(labels.values()), f"annotations {path}", some, names)
     return labels
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as XML
 
-from semfov.errors import DataError
-from semfov.io.files import check_regular, inside, read_bytes
+from semfov.errors import DataError, check_data
+from semfov.io.files import inside, read_bytes, reading
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
 
@@ -78,12 +78,11 @@ def _mosaic_text(path: Path) -> bytes:
         root = XML.fromstring(read_bytes(path, most=_MOST_BYTES))
     except (XML.ParseError, ValueError, LookupError, RecursionError) as error:
         raise DataError(f"{path}: expected the XML text of a mosaic, got none that can be read ({error})") from None
-    if root.tag != "VRTDataset":
-        raise DataError(f"{path}: expected a mosaic, a VRTDataset, got {root.tag[:40]!r}")
+    check_data(root.tag == "VRTDataset", path, "a mosaic, a VRTDataset", repr(root.tag[:40]))
     checked: dict[str, str] = {}
     for part in _kept(root, _DATASET, path):
-        if part.tag == "SRS" and not _SYSTEM.fullmatch((part.text or "").strip()):
-            raise DataError(f"{path}: expected a reference system as EPSG:number or as WKT, got {part.text!r:.80}")
+        system = part.tag != "SRS" or _SYSTEM.fullmatch((part.text or "").strip())
+        check_data(bool(system), path, "a reference system as EPSG:number or as WKT", f"{part.text!r:.80}")
         for source in _kept(part, (*_BAND, *_SOURCES), path) if part.tag == "VRTRasterBand" else ():
             for name in _kept(source, _SOURCE, path) if source.tag in _SOURCES else ():
                 if name.tag == "SourceFilename":
@@ -97,13 +96,13 @@ def _mosaic_text(path: Path) -> bytes:
 def _kept(element: XML.Element, known: tuple[str, ...], path: Path) -> list[XML.Element]:
     """The known parts of an element, from which those that are not needed are taken; others are refused."""
     kind = next((value for name, value in element.attrib.items() if name.lower() == "subclass"), element.tag)
-    if kind not in (element.tag, "VRTSourcedRasterBand"):
-        raise DataError(f"{path}: expected a mosaic of files, got a part of the kind {kind!r:.60}")
+    plain, files = kind in (element.tag, "VRTSourcedRasterBand"), "a mosaic of files"
+    check_data(plain, path, files, f"a part of the kind {kind!r:.60}")
     for part in [*element]:
         if part.tag in _LEFT_OUT:
             element.remove(part)
-        elif part.tag not in known:
-            raise DataError(f"{path}: expected a mosaic of files, got a part of the kind {part.tag!r:.60}")
+        else:
+            check_data(part.tag in known, path, files, f"a part of the kind {part.tag!r:.60}")
     return [*element]
 
 
@@ -113,14 +112,11 @@ def _source(path: Path, name: str) -> str:
         file = inside(path.parent, name).resolve()
     except DataError:
         raise DataError(f"{path}: expected sources in the folder of the mosaic or below, got {name!a:.200}") from None
-    if not file.is_file() or "<" in str(file):
-        raise DataError(f"{path}: expected sources that are files, got {name!a:.200}")
-    check_regular(file)
-    with file.open("rb") as opened:
+    check_data(file.is_file() and "<" not in str(file), path, "sources that are files", f"{name!a:.200}")
+    with reading(file), file.open("rb") as opened:
         head = opened.read(8)
     kind = next((kind for start, kind in _SIGNATURES.items() if head.startswith(start)), None)
-    if kind is None:
-        raise DataError(f"{path}: expected sources that are TIFF, JPEG 2000, PNG or JPEG files, got {name!a:.200}")
+    check_data(kind is not None, path, "sources that are TIFF, JPEG 2000, PNG or JPEG files", f"{name!a:.200}")
     if kind in _DRIVERS:
         import rasterio
 

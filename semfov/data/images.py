@@ -17,7 +17,7 @@ from torch import Tensor
 
 from semfov.data.tone import White, between, black_and_white, check_white
 from semfov.data.windowed import LargePicture
-from semfov.errors import DataError, SemfovError, check_pixels
+from semfov.errors import DataError, SemfovError, check_data, check_pixels
 from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
@@ -180,8 +180,8 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
             tags: Any = getattr(image, "tag_v2", {})
             side = (tags[322], tags[323]) if 322 in tags else (image.width, tags.get(278, image.height))
             bits = tags.get(258, (1,))
-            if 2 in tags.get(339, ()) and max(bits) == 8:  # Pillow would read -1 as 255
-                raise DataError(f"image {Path(path)}: expected 8 bits without a sign, got some with one; convert it")
+            signed = 2 in tags.get(339, ()) and max(bits) == 8  # Pillow would read -1 as 255
+            check_data(not signed, f"image {Path(path)}", "8 bits without a sign", "some with one; convert it")
             size = math.prod(side) * max(tags.get(277, 1), len(bits)) * max(bits) // 8
             for count in tags.get(325 if 322 in tags else 279, ()):
                 check_tile(size, count, f"image {Path(path)}")
@@ -191,17 +191,15 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
 def _check_proportion(image: Any, path: str | PathLike[str]) -> None:
     """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
     pixels, size = math.prod(image.size), Path(path).stat().st_size
-    if pixels > _SMALL and pixels > _MOST_A_BYTE * size:
-        expected, got = f"at most {MAX_PIXELS:,} pixels, in proportion to the file", f"{pixels:,} in {size:,} bytes"
-        raise DataError(f"image {Path(path)}: expected {expected}, got {got}; replace it")
+    got, fits = f"{pixels:,} in {size:,} bytes; replace it", pixels <= max(_SMALL, _MOST_A_BYTE * size)
+    check_data(fits, f"image {Path(path)}", f"at most {MAX_PIXELS:,} pixels, in proportion to the file", got)
 
 
 def check_tile(size: int, stored: int, name: str) -> None:
     """Raise `DataError` for a tile (or strip) that is stored in far more or far fewer bytes than its pixels take."""
-    if stored > 2 * size + 2**16:
-        raise DataError(f"{name}: expected tiles of {size:,} bytes, got one that is stored in {stored:,}; replace it")
-    if stored and size > 3 * _SMALL and size > _MOST_A_BYTE * stored:
-        raise DataError(f"{name}: expected tiles in proportion, got {size:,} bytes stored in {stored:,}; replace it")
+    got, blank = f"one that is stored in {stored:,}; replace it", stored > 0 and size > 3 * _SMALL
+    fits = stored <= 2 * size + 2**16 and not (blank and size > _MOST_A_BYTE * stored)
+    check_data(fits, name, f"tiles of {size:,} bytes", got)
 
 
 def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
@@ -219,9 +217,8 @@ def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
 
 
 def _check_pixels(size: tuple[int, int], name: str) -> None:
-    width, height = size
-    if not 0 < width * height <= MAX_PIXELS:
-        raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; {_SMALLER}")
+    fits, got = 0 < math.prod(size) <= MAX_PIXELS, f"{size[0]} × {size[1]}; {_SMALLER}"
+    check_data(fits, name, f"1 to {MAX_PIXELS:,} pixels", got)
 
 
 def _orientation(image: Any) -> int:
@@ -256,10 +253,10 @@ def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDA
         pixels = pixels.astype(np.float32) / np.float32(255)
     else:
         most = 1.0 if image.mode == "F" else 65535.0
-        if not (pixels.min() >= 0 and pixels.max() <= most):  # also refuses NaN
-            expected = f"values from 0 to {most:g} in mode {image.mode}"
-            got = f"{pixels.min():g} to {pixels.max():g}; give white='auto', or the values that are black and white"
-            raise DataError(f"{name}: expected {expected}, got {got}")
+        low, high = pixels.min(), pixels.max()
+        got = f"{low:g} to {high:g}; give white='auto', or the values that are black and white"
+        fits = bool(low >= 0 and high <= most)  # also refuses NaN
+        check_data(fits, name, f"values from 0 to {most:g} in mode {image.mode}", got)
         pixels = pixels.astype(np.float32) / np.float32(most)
     pixels = np.repeat(pixels[..., None], 3, axis=-1) if wide else pixels
     return 1 - pixels if inverted else pixels

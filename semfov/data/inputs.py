@@ -168,10 +168,8 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
     batch = pixels if len(shape) == 4 else pixels[None]
     for channels in (3, 1):
         first, last = batch.shape[1] == channels, batch.shape[-1] == channels
-        if first and last and not choose:
-            raise InputError(
-                f"{argument}: expected {_SHAPES}, got shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-            )
+        clear, got = choose or not (first and last), f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+        check(clear, argument, _SHAPES, got)
         if first or last:
             batch = batch if first else batch.movedim(-1, 1)
             return batch.expand(-1, 3, -1, -1)

@@ -32,7 +32,7 @@ from semfov.data.images import (
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture
-from semfov.errors import DataError, check, lookup
+from semfov.errors import DataError, check, check_data, lookup
 from semfov.io.files import check_regular
 
 _Box = tuple[int, int, int, int]
@@ -111,17 +111,14 @@ class _TiffPicture(LargePicture):
         kind = "" if page.dtype is None else page.dtype.kind
         plain = page.dtype in (np.uint8, np.uint16)
         fits = kind in "uif" and len(page.shape) == 2 + (count > 1) and page.bitspersample == 8 * page.dtype.itemsize
-        if not (fits and (plain or known)):
-            more = "give white='auto', or the values that are black and white" if fits else "convert it"
-            raise DataError(f"{self.path}: expected 8 or 16 bits, got {page.dtype} {page.shape}; {more}")
-        if page.photometric == _PALETTE:
-            raise DataError(f"{self.path}: expected grey, RGB or bands, got a palette; convert it")
+        more = "give white='auto', or the values that are black and white" if fits else "convert it"
+        check_data(fits and (plain or known), self.path, "8 or 16 bits", f"{page.dtype} {page.shape}; {more}")
+        check_data(page.photometric != _PALETTE, self.path, "grey, RGB or bands", "a palette; convert it")
         if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
             packed = f"{page.compression.name} compression with predictor {int(page.predictor)}"
             raise DataError(f"{self.path}: expected imagecodecs for {packed}; pip install imagecodecs")
-        if max(self.size) > MOST_SIDE:
-            got = f"{self.size[0]} × {self.size[1]}"
-            raise DataError(f"{self.path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}")
+        fits, got = max(self.size) <= MOST_SIDE, f"{self.size[0]} × {self.size[1]}"
+        check_data(fits, self.path, f"at most {MOST_SIDE:,} pixels along a side", got)
 
     def pixels(self, box: _Box) -> NDArray[np.uint8]:
         with opening(self.path, "decoded"):
@@ -167,12 +164,9 @@ class _TiffPicture(LargePicture):
         with self._lock:
             self.file.filehandle.seek(offset)
             data = self.file.filehandle.read(count)
-        make = _INFLATERS.get(int(page.compression))
-        most = 2 * size + 2**16
-        if make is not None and len(data) > _INFLATED and len(make().decompress(data, most)) >= most:
-            raise DataError(
-                f"image {self.path}: expected tiles of {size:,} bytes, got one that inflates to more; replace it"
-            )
+        make, most = _INFLATERS.get(int(page.compression)), 2 * size + 2**16
+        fits = make is None or len(data) <= _INFLATED or len(make().decompress(data, most)) < most
+        check_data(fits, f"image {self.path}", f"tiles of {size:,} bytes", "one that inflates to more; replace it")
         tile: NDArray[Any] = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
         return tile
 
@@ -219,9 +213,9 @@ def _is_converted(path: str | PathLike[str]) -> bool:
                     tags = {tag.code: tag.value for tag in first.tags.values()}
     kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
     turned, bands = tags.get(_ORIENTATION, 1), tags.get(_SAMPLES, 1)
-    if turned != 1 and kind <= 1 and bands > 2:  # Pillow reads none of them, or the first as grey
-        expected = "orientation 1 of bands without colours"
-        raise DataError(f"image {Path(path)}: expected {expected}, got {turned} of {bands} bands; turn it upright")
+    fits = turned == 1 or kind > 1 or bands <= 2  # of others Pillow reads none, or the first as grey
+    got = f"{turned} of {bands} bands; turn it upright"
+    check_data(fits, f"image {Path(path)}", "orientation 1 of bands without colours", got)
     unusual = kind > _PALETTE and (kind, packed) != (_YCBCR, _JPEG)
     return bool(unusual or turned != 1)
 
@@ -244,11 +238,11 @@ class _RasterPicture(LargePicture):
         weakref.finalize(self, self._file.close)
         meanings = [each.name for each in self._file.colorinterp]
         kinds = {*self._file.dtypes}
-        if "palette" in meanings:
-            raise DataError(f"{path}: expected grey, RGB or bands, got a palette; convert it (gdal_translate)")
-        if not kinds <= {"uint8", "uint16"} and (white is None or any("complex" in kind for kind in kinds)):
-            got = f"{', '.join(sorted(kinds))}; give white='auto', or the values that are black and white"
-            raise DataError(f"{path}: expected bands of 8 or 16 bits, got {got}")
+        plain = "palette" not in meanings
+        check_data(plain, path, "grey, RGB or bands", "a palette; convert it (gdal_translate)")
+        scaled = white is not None and not any("complex" in kind for kind in kinds)
+        got = f"{', '.join(sorted(kinds))}; give white='auto', or the values that are black and white"
+        check_data(scaled or kinds <= {"uint8", "uint16"}, path, "bands of 8 or 16 bits", got)
         named = tuple(meanings.index(name) + 1 for name in ("red", "green", "blue") if name in meanings)
         usual = named if len(named) == 3 else None
         self._bands = _chosen_bands(self._file.count, bands, usual, self.path, alpha="alpha" in meanings)
@@ -257,9 +251,8 @@ class _RasterPicture(LargePicture):
         flags = {each.name for each in self._file.mask_flag_enums[self._bands[0] - 1]}
         self._masked = "per_dataset" in flags
         nodata = self._file.nodatavals[self._bands[0] - 1]
-        self._tone = _tone_of(
-            self, white, lambda box: self._values(box, 1), nodata=nodata, wide="uint16" in kinds
-        )  # fmt: skip
+        wide = "uint16" in kinds
+        self._tone = _tone_of(self, white, lambda box: self._values(box, 1), nodata=nodata, wide=wide)
         if self._masked:
             self.nothing = 255, 255, 255
         elif nodata is not None:
@@ -329,21 +322,13 @@ def open_large(
     kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
     expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
     check(bands is None or kind in BY_WINDOWS, "bands", expected, bands)
-    if (
-        isinstance(source, np.ndarray)
-        and source.dtype == np.uint8
-        and white is None
-        and source.size
-        and (source.ndim == 2 or (source.ndim == 3 and source.shape[2] == 3 and source.shape[0] != 3))
-    ):
+    rows = isinstance(source, np.ndarray) and (source.ndim == 2 or (source.shape[2:] == (3,) and source.shape[0] != 3))
+    of_bytes = isinstance(source, Tensor | np.ndarray) and source.dtype in (torch.uint8, np.dtype(np.uint8))
+    if isinstance(source, np.ndarray) and white is None and of_bytes and source.size and rows:
         swap = lookup(color, get_args(Color), "order of channels") == "bgr" and source.ndim == 3
         return _ArrayPicture(source[..., ::-1] if swap else source)
     if not isinstance(source, str | PathLike):
-        if (
-            white is None
-            and isinstance(source, Tensor | np.ndarray)
-            and source.dtype in (torch.uint8, np.dtype(np.uint8))
-        ):
+        if white is None and of_bytes:
             # Bytes are not converted to floats in between, which would take four times the memory.
             pixels = as_pixels(source, argument="picture", color=color)
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")

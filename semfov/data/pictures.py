@@ -10,7 +10,7 @@ import torch
 
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
-from semfov.errors import DataError
+from semfov.errors import check_data
 from semfov.io.files import inside, json_sha256, sha256
 
 
@@ -25,11 +25,8 @@ class Pictures(Scenes):
         self.ids = sorted(set(names))
         self._sizes: dict[int, tuple[int, int]] = {}
         missing = [name for name in self.ids if not self._path(name).is_file()]
-        if missing:
-            raise DataError(
-                f"{self.root}: expected {len(self.ids)} pictures, but {len(missing)} are missing, such as "
-                f"{missing[0]}; check the folder and the names"
-            )
+        such = f"{len(self.ids) - len(missing)}: {', '.join(missing[:1])} is missing; check the folder and the names"
+        check_data(not missing, self.root, f"{len(self.ids)} pictures", such)
 
     @property
     def fingerprint(self) -> str:  # type: ignore[override]

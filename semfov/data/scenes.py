@@ -19,7 +19,7 @@ from torch import Tensor
 from semfov.data.classes import class_indices
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, ComposedScenes, Scene
-from semfov.errors import DataError, check
+from semfov.errors import check, check_data
 from semfov.io.files import json_sha256, sha256
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
@@ -224,15 +224,9 @@ def _photograph(package: str, file: str) -> NDArray[np.uint8]:
 
 def _path(package: str, file: str) -> Path:
     spec: Any = find_spec(package)
-    if spec is None or spec.origin is None:
-        raise DataError(
-            f"embedded scenes: expected the package {package}, which is not installed; "
-            f"pip install {_DISTRIBUTIONS[package]}"
-        )
+    there, way = spec is not None and spec.origin is not None, f"pip install {_DISTRIBUTIONS[package]}"
+    check_data(there, "embedded scenes", f"the package {package}", f"none, as it is not installed; {way}")
     path = Path(spec.origin).parent / _FOLDERS[package] / file
-    if not path.is_file():
-        raise DataError(
-            f"embedded scenes: expected the photograph {path}, which is missing; "
-            f"pip install --force-reinstall --no-deps {_DISTRIBUTIONS[package]}"
-        )
+    again = way.replace("install", "install --force-reinstall --no-deps")
+    check_data(path.is_file(), "embedded scenes", f"the photograph {path}", f"none; {again}")
     return path

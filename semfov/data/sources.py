@@ -7,7 +7,6 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -21,8 +20,8 @@ from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.errors import DataError, InputError, printable
-from semfov.io.files import check_regular
+from semfov.errors import DataError, InputError, check, check_data, printable
+from semfov.io.files import reading
 
 PHOTOGRAPHS = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".apng", ".webp", ".avif", ".avifs", ".heic", ".heif", ".hif"),
@@ -138,10 +137,9 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         ) from None
     if isinstance(source, Path):
         _check_there(source, "source")
-        check_regular(source)
-        with suppress(OSError), source.open("rb") as file:
-            if file.read(len(_PLAYLIST)) == _PLAYLIST:
-                raise DataError(f"{name}: expected a video, got a playlist, which names other files; give these")
+        with reading(source), source.open("rb") as file:
+            video = file.read(len(_PLAYLIST)) != _PLAYLIST
+            check_data(video, name, "a video", "a playlist, which names other files; give these")
     recorder = _recorder(cv2, source)
     if not recorder.isOpened():
         what = "OpenCV reads videos of this format"
@@ -161,8 +159,7 @@ def _name(address: str) -> str:
     """An address without user, password and query; raises `InputError` where no stream has it."""
     kind, _, rest = address.partition("://")
     kinds = (*STREAMS, "http", "https")
-    if kind not in kinds:
-        raise InputError(f"source: expected an address of a stream ({', '.join(kinds)}), got {kind}://…")
+    check(kind in kinds, "source", f"an address of a stream ({', '.join(kinds)})", f"{kind}://…")
     host, separator, path = rest.partition("/")
     return f"{kind}://{host.rpartition('@')[2]}{separator}{path.partition('?')[0]}"
 

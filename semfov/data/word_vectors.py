@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.classes import canonical_name
-from semfov.errors import DataError, InputError, check, check_number
+from semfov.errors import DataError, check, check_number
 from semfov.io.files import reading, sha256
 
 _LONGEST = 1 << 20  # characters of a line that are read at once
@@ -158,11 +158,8 @@ def spread(
     """
     check_number(least, "least", 0, 1)
     check(0 < temperature < math.inf, "temperature", "a number above 0", temperature)
-    if not vectors.knows(description):
-        raise InputError(
-            f"target: expected a class, or a description with at least one word in the file of word vectors, "
-            f"got {description!r}"
-        )
+    meant = "a class, or a description with at least one word in the file of word vectors"
+    check(vectors.knows(description), "target", meant, repr(description))
     near = vectors.similarity([description], classes)[0]
     has_words = ~near.isnan()
     check(bool(has_words.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))

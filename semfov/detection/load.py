@@ -207,7 +207,7 @@ def _given_names(classes: Any) -> tuple[str, ...]:
     if isinstance(classes, str | PathLike):
         text = fspath(classes)
         if isinstance(classes, PathLike) or Path(text).suffix in (".txt", ".names") or Path(text).is_file():
-            return class_lines(text)
+            return tuple(line.strip() for line in read_text(text).splitlines() if line.strip())
         return tuple(name.strip() for name in text.split(","))
     if isinstance(classes, Mapping):
         known = {str(number): name for number, name in classes.items()}
@@ -216,8 +216,3 @@ def _given_names(classes: Any) -> tuple[str, ...]:
         return tuple(known[number] for number in numbers)
     check(not isinstance(classes, Set), "classes", expected, f"a {type(classes).__name__}, which has no order")
     return tuple(classes)
-
-
-def class_lines(path: str | PathLike[str]) -> tuple[str, ...]:
-    """Class names from the lines of a file."""
-    return tuple(line.strip() for line in read_text(path).splitlines() if line.strip())

@@ -159,4 +159,4 @@ def test_bad_arguments_and_missing_files(monkeypatch):
     monkeypatch.setitem(module._FOLDERS, "skimage", "elsewhere")
     unusable(r"expected the photograph .* pip install", EmbeddedScenes, CLASSES)
     monkeypatch.setattr(module, "find_spec", lambda _: None)
-    unusable(r"expected the package .*, which is not installed; pip install", EmbeddedScenes, CLASSES)
+    unusable(r"expected the package .*, got none, as it is not installed; pip install", EmbeddedScenes, CLASSES)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, check, check_data
 from semfov.io.files import read_text, reading
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
@@ -35,9 +35,8 @@ _REMEDIES = {
 def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
     """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
     frame = hasattr(source, "to_dict") and hasattr(source, "columns")
-    if not frame and not isinstance(source, str | PathLike):
-        expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
-        raise InputError(f"source: expected {expected}, got a {type(source).__name__}")
+    expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
+    check(frame or isinstance(source, str | PathLike), "source", expected, f"a {type(source).__name__}")
     if not frame:
         return str(source), *_of_file(Path(source))
     header = [str(name) for name in source.columns]
@@ -57,14 +56,12 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
 
 def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     """Names of the columns of a file, and its lines; decimal commas become points."""
-    remedy = _REMEDIES.get(path.suffix.lower())
-    if remedy is not None and path.exists():
-        raise DataError(f"{path}: expected a table of text, such as .csv, got {path.suffix}; {remedy}")
+    kind = path.suffix.lower()
     with reading(path), path.open("rb") as file:
-        drawn = path.suffix.lower() in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
-    if drawn or path.suffix.lower() in VIDEOS:
-        got = "a video" if path.suffix.lower() in VIDEOS else "a picture"
-        raise DataError(f"{path}: expected a table of fixations (.csv, .tsv, .json, .asc, …), got {got}")
+        drawn = kind in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
+    check_data(kind not in _REMEDIES, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
+    got = "a video" if kind in VIDEOS else "a picture"
+    check_data(not drawn and kind not in VIDEOS, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
     text = read_text(path)
     before = _BEFORE.match(text)
     text = text[before.end() :] if before else text
@@ -79,9 +76,7 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
     rows = []
     for place, line in lines:
         if None in line:
-            raise DataError(
-                f"{path}: {place}: expected {len(header)} fields, got more; quote fields with {separator!r}"
-            )
+            raise DataError(f"{path}: {place}: expected {len(header)} fields, got more; quote them with {separator!r}")
         values = [(value or "").strip() for value in line.values()]
         if separator != ",":
             values = [value.replace(",", ".") if _DECIMAL.fullmatch(value) else value for value in values]
@@ -91,5 +86,4 @@ def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
 
 def _check_different(where: str, header: Sequence[str]) -> None:
     again = sorted({name for name in header if header.count(name) > 1 and name})
-    if again:
-        raise DataError(f"{where}: expected columns of different names, got several named {', '.join(again)}")
+    check_data(not again, where, "columns of different names", f"several named {', '.join(again)}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
-from semfov.errors import DataError, check
+from semfov.errors import DataError, check, check_data
 from semfov.io.files import read_text
 
 _PICTURE = re.compile(r"^(?:!V IMGLOAD \S+|!V TRIAL_VAR (?:image|picture|img|stimulus))\s+(\S+)", re.IGNORECASE)
@@ -76,10 +76,8 @@ def read_eyelink(
         except (ValueError, IndexError):
             raise DataError(f"{path}: line {number}: expected an event of EyeLink, got {line[:60]!r}") from None
     seen = {each for _, eyes in trials for each in eyes}
-    if not seen:
-        raise DataError(f"{path}: expected lines EFIX after a message TRIALID, got none; convert the events, too")
-    if size is None and frame is None:
-        raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
+    check_data(bool(seen), path, "lines EFIX after a message TRIALID", "none; convert the events, too")
+    check_data(size is not None or frame is not None, path, "a message DISPLAY_COORDS", "none; give size=")
     size = (round(x2 - x1) + 1, round(y2 - y1) + 1) if size is None else size
     chosen = eye[0].upper() if eye is not None else "R" if "R" in seen else "L"
     name = path.stem if subject is None else subject
@@ -88,6 +86,5 @@ def read_eyelink(
         rows = np.array(eyes.get(chosen, []), dtype=np.float64)
         if len(rows):
             records.append(Fixations(picture_name, name, rows[:, :2], size, durations=rows[:, 2]))
-    if not records:
-        raise DataError(f"{path}: expected fixations of the {eye} eye, got those of the other one")
+    check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
     return warn_of_frames(path, records)

@@ -17,7 +17,7 @@ import numpy as np
 from semfov.data.fixations.columns import of_source
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
-from semfov.errors import DataError, InputError, check, lookup
+from semfov.errors import DataError, InputError, check, check_data, lookup
 from semfov.io.files import write_text
 
 _Units = Literal["pixels", "fractions"]
@@ -182,22 +182,20 @@ def _record(
     origin: _Origin,
 ) -> Fixations:
     place, line = group[0]
-    if not line["picture"]:
-        raise DataError(f"{where}: {place}, picture: expected the name of a picture, got nothing")
+    check_data(line["picture"] != "", f"{where}: {place}, picture", "the name of a picture", "nothing")
     for name in (*(() if size is not None else _SIZE), "x1", "y1", "x2", "y2", "found"):
-        other = next((each for each in group if each[1][name] != line[name]), None)
-        if other is not None:
-            expected = f"{line[name]!r}, as in {place}"
-            raise DataError(f"{where}: {other[0]}, {name}: expected {expected}, got {other[1][name]!r}")
+        at, other = next((each for each in group if each[1][name] != line[name]), group[0])
+        expected = f"{line[name]!r}, as in {place}"
+        check_data(other is line, f"{where}: {at}, {name}", expected, repr(other[name]))
     frame = _frame(where, place, line, size)
     points = np.array([[_number(where, at, row, name) for name in ("x", "y")] for at, row in group])
     times = [_maybe(where, at, row, "duration") for at, row in group]
-    if None in times and any(time is not None for time in times):
-        at = group[times.index(None)][0]
-        raise DataError(f"{where}: {at}, duration: expected a number, as in other lines of the scanpath, got nothing")
+    lacking = next((at for (at, _), time in zip(group, times, strict=True) if time is None), place)
+    timed = None not in times or {*times} == {None}
+    check_data(timed, f"{where}: {lacking}, duration", "a number, as in other lines of the scanpath", "nothing")
     edges = [_maybe(where, place, line, name) for name in ("x1", "y1", "x2", "y2")]
-    if None in edges and any(edge is not None for edge in edges):
-        raise DataError(f"{where}: {place}: expected all of x1, y1, x2 and y2, or none, got some")
+    whole = None not in edges or {*edges} == {None}
+    check_data(whole, f"{where}: {place}", "all of x1, y1, x2 and y2, or none", "some")
     box: tuple[float, float, float, float] | None = None
     if None not in edges:
         corners = _placed(np.array(edges, dtype=np.float64).reshape(2, 2), frame, units, origin, edges=True)
@@ -207,8 +205,7 @@ def _record(
         box = x1, y1, x2, y2
     words = {"true": True, "false": False, "1": True, "0": False, "": None}
     found = line["found"].lower()
-    if found not in words:
-        raise DataError(f"{where}: {place}, found: expected true, false or nothing, got {found!r}")
+    check_data(found in words, f"{where}: {place}, found", "true, false or nothing", repr(found))
     try:
         return Fixations(
             picture=line["picture"],
@@ -235,8 +232,7 @@ def _frame(where: str, place: str, line: Mapping[str, str], size: _Size | None) 
         check(isinstance(size, tuple | list | np.ndarray), "size", "(width, height) in pixels", size)
         sides = [*size]
     whole = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
-    if not whole:
-        raise DataError(f"{where}: {place}, size: expected a width and a height in whole pixels, got {sides}")
+    check_data(whole, f"{where}: {place}, size", "a width and a height in whole pixels", sides)
     return int(sides[0]), int(sides[1])
 
 
@@ -418,15 +414,11 @@ def read_export(
         line["trial"] = f"{line['trial']} {viewing}"
         key = line.pop("number") or None
         kept[number if key is None else (viewing, key)] = place, line
-    if not kept:
-        raise DataError(f"{where}: expected fixations of {export.program}, got none that has a place on the picture")
+    check_data(bool(kept), where, f"fixations of {export.program}", "none that has a place on the picture")
     lines = _of_one_eye(list(kept.values()), eye)
-    if not lines:
-        raise DataError(f"{where}: expected fixations of the {eye} eye, got those of the other one")
-    if not all(line["picture"] for _, line in lines):
-        raise DataError(
-            f"{where}: expected the name of the picture, which {export.program} does not give; give picture="
-        )
+    check_data(bool(lines), where, f"fixations of the {eye} eye", "those of the other one")
+    told, lacks = all(line["picture"] for _, line in lines), f"which {export.program} does not give"
+    check_data(told, where, f"the name of the picture, {lacks}", "none; give picture=")
     if size is None and not all(line["width"] and line["height"] for _, line in lines):
         raise FrameError(f"{where}: expected the size of the frame, which {export.program} does not give; give size=")
     return _records_of(where, lines, size, units or export.units, origin or export.origin)
@@ -486,9 +478,8 @@ def _reader(
     }
     for name, side in zip(("width", "height"), export.size or (), strict=False):
         fields[name] = column((side, f"{side}px"))
-    missing = [given for given in named.values() if given not in by_key.values()]
-    if missing:
-        raise DataError(f"{where}: expected the columns of columns=, got none named {', '.join(map(repr, missing))}")
+    missing = ", ".join(repr(given) for given in named.values() if given not in by_key.values())
+    check_data(not missing, where, "the columns of columns=", f"none named {missing}")
     fields |= named
     keep = None if export.keep is None else column((export.keep[0],))
 

@@ -147,7 +147,7 @@ def test_fixations_of_both_eyes_are_those_of_one(tmp_path, names):
 def test_what_is_missing_is_named(tmp_path):
     text, _, _ = FILES["Pupil Cloud"]
     (tmp_path / "a.csv").write_text(text)
-    unusable("Pupil Cloud does not give; give picture=", read_export, tmp_path / "a.csv", size=(1600, 1200))
+    unusable("Pupil Cloud does not give, got none; give picture=", read_export, tmp_path / "a.csv", size=(1600, 1200))
     unusable("Pupil Cloud does not give; give size=", read_export, tmp_path / "a.csv", picture="scene.mp4")
     (tmp_path / "b.csv").write_text("picture,x,y\na.jpg,1,2\n")
     unusable("expected the columns of a table of Tobii Pro Lab", read_export, tmp_path / "b.csv")
