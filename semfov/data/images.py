@@ -197,7 +197,7 @@ def _check_proportion(image: Any, path: str | PathLike[str]) -> None:
 
 def check_tile(size: int, stored: int, name: str) -> None:
     """Raise `DataError` for a tile (or strip) that is stored in far more or far fewer bytes than its pixels take."""
-    got, blank = f"one that is stored in {stored:,}; replace it", stored > 0 and size > 3 * _SMALL
+    got, blank = f"one that is stored in {stored:,}, out of proportion; replace it", stored > 0 and size > 3 * _SMALL
     fits = stored <= 2 * size + 2**16 and not (blank and size > _MOST_A_BYTE * stored)
     check_data(fits, name, f"tiles of {size:,} bytes", got)
 

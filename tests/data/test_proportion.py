@@ -92,7 +92,7 @@ def test_a_tile_that_claims_more_than_is_stored(tmp_path):
             size = {3: 2, 4: 4}[int(tag.dtype)]
             content[tag.valueoffset : tag.valueoffset + size] = (32_768).to_bytes(size, "little")
     path.write_bytes(bytes(content))
-    unusable("in proportion", open_large(path).read, (0, 0, 1, 1))
+    unusable("out of proportion", open_large(path).read, (0, 0, 1, 1))
 
 
 @pytest.mark.parametrize("size", [(3, 40), (40, 3), (3, 3), (1, 5), (4, 1)])
