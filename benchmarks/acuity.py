@@ -180,7 +180,7 @@ def draw(image: Tensor, sensor: LogPolar, path: Path) -> None:
     views = {
         "picture": image,
         "published": named_sensor("published")(image, gaze),
-        "log-polar, back-projected": sensor.back(cortical, gaze, (image.shape[-1], image.shape[-2])),
+        "log-polar, back-projected": sensor(image, gaze),
         "cortical image": cortical,
         "multi-scale": crops.picture(crops.open(image, torch.ones(2)), gaze[None]),
     }

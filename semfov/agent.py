@@ -26,7 +26,7 @@ from semfov.data.windowed import ChosenBands
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, check, check_number, check_options, check_whole, checked_keywords, lookup
+from semfov.errors import InputError, check, check_number, check_options, checked_keywords, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -350,13 +350,11 @@ class ActivePerception(nn.Module):
             InputError: the class is unknown (near names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
-        check_thresholds(confirm, give_up)
-        check_whole(0 if closer is None else closer, "closer", 0, 100)
+        check_thresholds(confirm, give_up, closer)
         # Class numbers may be those of NumPy or a tensor, which have no length.
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
         foveal = start is not None or boxes is not None or len(targets) > 1
-        opened = OpenedPicture.of(picture, color, white, bands)
-        kind = self._kind(opened, how, shifts, duration, foveal=foveal)
+        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, foveal=foveal)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         only_for(kind, "fovea", "passes", boxes=boxes)
         if kind == "fovea":
@@ -422,8 +420,7 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         targets = class_numbers(target, self.classes[1:], "target")
-        opened = OpenedPicture.of(picture, color, white, bands)
-        kind = self._kind(opened, how, shifts, duration, every=True)
+        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, every=True)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
@@ -486,8 +483,8 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        opened = OpenedPicture.of(picture, color, white, bands)
-        kind = self._kind(opened, how, shifts, duration, foveal=start is not None or policy is not None)
+        foveal = start is not None or policy is not None
+        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, foveal=foveal)
         only_for(kind, "fovea", "none", policy=policy)
         if kind == "fovea":
             given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
@@ -572,22 +569,21 @@ class ActivePerception(nn.Module):
             InputError: a class is unknown, or an argument does not fit.
         """
         numbers, one = class_numbers(target, self.classes[1:], "target"), not isinstance(target, list | tuple)
-        check_thresholds(confirm, give_up)
-        check_whole(0 if closer is None else closer, "closer", 0, 100)
+        check_thresholds(confirm, give_up, closer)
         sought, found = numbers[0] if numbers and one else None, () if one else numbers
         settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer, "color": color}
         settings |= {"how": lookup(how, get_args(How), "kind of look"), "rate": rate, "start": start, "seed": seed}
         return LivePerception(self.fovea, self.zoom, sought, found, white=white, **settings)
 
-    def _kind(
-        self, picture: OpenedPicture, how: How, shifts: int | None, duration: float | None, **wanted: bool
-    ) -> KindOfLook:
-        """Choose the kind of look, and check the limits that suit it; wanted as for `kind_of_look`."""
-        foveal = wanted.pop("foveal", False) or shifts is not None
-        kind = self.kind_of_look(picture, how, foveal=foveal, **wanted)
+    def _open(
+        self, picture: PictureLike, how: How, shifts: int | None, duration: float | None, *given: Any, **wanted: bool
+    ) -> tuple[OpenedPicture, KindOfLook]:
+        """Open a picture, choose the kind of look (`kind_of_look`), and check the limits that suit it."""
+        opened, foveal = OpenedPicture.of(picture, *given), wanted.pop("foveal", False) or shifts is not None
+        kind = self.kind_of_look(opened, how, foveal=foveal, **wanted)
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)
-        return kind
+        return opened, kind
 
 
 def _counting(record: Record, least: float | None) -> Record:

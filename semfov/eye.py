@@ -165,7 +165,7 @@ class Eye(StatedModule):
         Args:
             view: the opened image.
             fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
-            lap: called with `foveate` and `detect` when they are done (`semfov.episode.Stopwatch`).
+            lap: called with `foveate` and `detect` when they are done (`semfov.episode.stopwatch`).
 
         Returns:
             The detections, a batch of F, boxes in pixels of the image.

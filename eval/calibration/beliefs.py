@@ -20,7 +20,8 @@ from eval.decide.run import detected_on_landing, landing
 from eval.search.run import SearchConfig
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
-from semfov.episode import Step, Stopwatch, rollout
+from semfov.episode import Step, rollout
+from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from

@@ -27,7 +27,8 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conclude, confirms, decide
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Step, Stopwatch, StoredLooks
+from semfov.episode import Looks, Step, StoredLooks
+from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.policies import Policy

@@ -15,7 +15,8 @@ from eval.comparison.settings import ComparedConfig
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
-from semfov.episode import Stopwatch, StoredLooks
+from semfov.episode import StoredLooks
+from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig

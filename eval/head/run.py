@@ -20,7 +20,7 @@ from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
-from semfov.episode import Stopwatch
+from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver

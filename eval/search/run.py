@@ -9,7 +9,8 @@ import torch
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.settings import ComparedConfig
-from semfov.episode import Stopwatch, StoredLooks
+from semfov.episode import StoredLooks
+from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import PolicyConfig
 from semfov.runs.protocols import Trial, episodes_of, run_episodes

@@ -24,7 +24,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST
-from semfov.episode import Stopwatch
+from semfov.episode.stopwatch import Stopwatch
 from semfov.paths import ZoomPath
 from semfov.runs.protocols import choose_classes
 from semfov.runs.results import ResultRecord

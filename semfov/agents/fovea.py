@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +30,8 @@ from semfov.decision import (
     gains_less,
 )
 from semfov.detection.detections import Detections
-from semfov.episode import LiveLooks, Step, Stopwatch, rollout
+from semfov.episode import LiveLooks, Step, rollout
+from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
@@ -67,20 +69,16 @@ class FoveaAgent:
         target: TargetLike,
         limits: EpisodeLimits,
         *,
-        start: Start = None,
         shifts: int | None = None,
-        seed: int = 0,
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
-        give_up: float | None = None,
         closer: int = 0,
+        **settings: Any,
     ) -> Scanpath:
         """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`)."""
         strategy, index, weights = self.searching.sought(target, ("background", *self.eye.detector.classes))
-        episode = FoveaEpisode(
-            self, index, strategy=strategy, limits=limits, start=start, shifts=_shifts(shifts, 30, limits), seed=seed,
-            confirm=confirm, give_up=give_up, closer=closer if boxes is None else 0,
-        )  # fmt: skip
+        settings |= {"shifts": _shifts(shifts, 30, limits), "closer": closer if boxes is None else 0}
+        episode = FoveaEpisode(self, index, strategy=strategy, limits=limits, confirm=confirm, **settings)
         grid = episode.open(image)
         if boxes is not None:
             goal, episode.to_goal = _goal_cells(boxes, grid, image).long(), True
@@ -96,11 +94,10 @@ class FoveaAgent:
         image: Tensor,
         limits: EpisodeLimits,
         *,
-        start: Start = None,
         shifts: int | None = None,
-        seed: int = 0,
         worth: float | None = None,
         policy: str | None = None,
+        **settings: Any,
     ) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`)."""
         observer = on_cpu(self.exploring.observer)
@@ -110,9 +107,7 @@ class FoveaAgent:
             )
         check(policy in (None, "people"), "policy", "'people', or None", policy)
         viewed = None if policy is None else GazePrediction.of(self.eye.detector, image[0])
-        episode = FoveaEpisode(
-            self, limits=limits, start=start, shifts=_shifts(shifts, 20, limits), seed=seed, viewed=viewed
-        )
+        episode = FoveaEpisode(self, limits=limits, shifts=_shifts(shifts, 20, limits), viewed=viewed, **settings)
         grid = episode.open(image)
         if isinstance(observer, LearnedMap) and (policy is None or worth is not None):
             least = _WORTH if worth is None else worth
@@ -442,11 +437,7 @@ def _goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Ten
     check_shape(tensor, "boxes", None, 4)
     check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
     check_finite(tensor, "boxes")
+    got = "others; convert (x, y, width, height) to (x, y, x + width, y + height)"
     full = bool((tensor[:, 2:] > tensor[:, :2]).all())
-    check(
-        full,
-        "boxes",
-        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
-        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
-    )
+    check(full, "boxes", "(x1, y1, x2, y2) with x1 < x2 and y1 < y2", got)
     return grid.footprint(tensor).any(-2)

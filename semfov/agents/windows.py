@@ -137,8 +137,7 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        check_thresholds(confirm, give_up)
-        check_whole(0 if closer is None else closer, "closer", 0, 100)
+        check_thresholds(confirm, give_up, closer)
         episode = self.episode(
             class_index(target, self.classes[1:], "target"),
             limits=EpisodeLimits(WindowEpisode.usual_passes if passes is None else passes, seconds, on_look),

@@ -12,7 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check
+from semfov.errors import check, check_whole
 from semfov.io.schema import is_number
 
 Outcome = Literal["found", "absent", "undecided"]
@@ -132,10 +132,11 @@ def verified(places: Sequence[float], presence: float, confirm: float, *, over: 
     return OUTCOMES.index("absent") if presence < _ABSENT else len(OUTCOMES) - 1
 
 
-def check_thresholds(confirm: float | None, give_up: float | None) -> None:
-    """Raise `InputError` unless each threshold is None or a probability."""
+def check_thresholds(confirm: float | None, give_up: float | None, closer: int | None = None) -> None:
+    """Raise `InputError` unless each threshold is None or a probability, and closer looks are None or 0 to 100."""
     for name, value in (("confirm", confirm), ("give_up", give_up)):
         check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
+    check_whole(0 if closer is None else closer, "closer", 0, 100)
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:

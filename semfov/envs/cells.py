@@ -15,8 +15,10 @@ from semfov.belief.observers.base import Look
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import Scenery
-from semfov.episode import Looks, Memory, Sight, Step, Stopwatch, StoredLooks
+from semfov.episode import Looks, Sight, Step, StoredLooks
 from semfov.episode.loop import attend
+from semfov.episode.memory import Memory
+from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import check, check_whole
 from semfov.metrics.episodes import right_cells
 from semfov.paths import Scanpath

@@ -2,18 +2,16 @@
 
 from semfov.episode.looks import LiveLooks, Looks, Sight, StoredLooks
 from semfov.episode.loop import Step, rollout
-from semfov.episode.memory import Forgetting, Memory
-from semfov.episode.stopwatch import STAGES, Stopwatch
+from semfov.episode.memory import Forgetting
+from semfov.episode.stopwatch import STAGES
 
 __all__ = [
     "STAGES",
     "Forgetting",
     "LiveLooks",
     "Looks",
-    "Memory",
     "Sight",
     "Step",
-    "Stopwatch",
     "StoredLooks",
     "rollout",
 ]

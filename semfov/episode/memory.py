@@ -60,20 +60,9 @@ class Forgetting:
 
 @dataclass(frozen=True)
 class Memory:
-    """State of A episodes between two looks: the belief, and the cells that were fixated.
+    """State of A episodes between two looks: their belief, and cells `(A, X·Y)` that the gaze is kept from (`visited`).
 
-    Attributes:
-        belief: the belief.
-        visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from.
-        age: `(A, X·Y)`, number of looks since each cell was fixated, infinity for never; only counted with forgetting.
-
-    >>> from semfov import Detections, Grid
-    >>> from semfov.belief.observers import Semantic
-    >>> from semfov.episode import StoredLooks
-    >>> nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 2), torch.zeros(2, 0, dtype=torch.bool))
-    >>> memory = Memory.empty(StoredLooks(nothing, Grid(2, 1, (10, 10))), Semantic(2), episodes=3)
-    >>> memory.visited.shape
-    torch.Size([3, 2])
+    The `age` `(A, X·Y)` of a cell is the number of looks since its fixation, infinity for never, with forgetting.
     """
 
     belief: Belief
@@ -82,16 +71,7 @@ class Memory:
 
     @classmethod
     def empty(cls, looks: Looks, observer: Observer, episodes: int) -> "Memory":
-        """State before the first look.
-
-        Args:
-            looks: the source of looks.
-            observer: the observer.
-            episodes: A, number of episodes.
-
-        Returns:
-            The state.
-        """
+        """State before the first look."""
         cells, device = len(looks.grid), looks.like.device
         visited = torch.zeros(episodes, cells, dtype=torch.bool, device=device)
         age = torch.full(visited.shape, torch.inf, device=device)
@@ -102,14 +82,6 @@ class Memory:
         return Memory(self.belief[index], self.visited[index], self.age[index])
 
     def put(self, index: Tensor, other: "Memory") -> "Memory":
-        """Replace the state of some episodes. Both states must have had a look.
-
-        Args:
-            index: `(n,)`, the episodes.
-            other: their new state, of n episodes.
-
-        Returns:
-            A new state of all episodes.
-        """
+        """The state with that of some episodes `(n,)` replaced; both must have had a look."""
         visited, age = self.visited.index_copy(0, index, other.visited), self.age.index_copy(0, index, other.age)
         return Memory(self.belief.put(index, other.belief), visited, age)

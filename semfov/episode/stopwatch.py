@@ -7,27 +7,14 @@ STAGES = ("foveate", "detect", "weigh", "update belief", "choose")
 
 
 class Stopwatch:
-    """Measures the seconds of stages.
-
-    Args:
-        seconds: seconds of stages that were measured before; they are copied.
-
-    >>> watch = Stopwatch({"foveate": 0.01})
-    >>> watch.lap("detect")
-    >>> list(watch.seconds)
-    ['foveate', 'detect']
-    """
+    """Measures the seconds of stages, beside those that were measured before."""
 
     def __init__(self, seconds: dict[str, float] | None = None) -> None:
         self.seconds = dict(seconds or {})
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last lap to a stage.
-
-        Args:
-            stage: name of the stage.
-        """
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
         self._last = now

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Stopwatch, rollout
+from semfov.episode import Looks, Sight, rollout
+from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_by

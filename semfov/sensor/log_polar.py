@@ -189,19 +189,6 @@ class LogPolar(Sensor):
         retina = self.retina
         return log_polar(image, gaze, fovea=retina.fovea, spacing=retina.spacing, pooling=retina.pooling)
 
-    def back(self, cortical: Tensor, gaze: Tensor, size: tuple[int, int]) -> Tensor:
-        """Project cortical images back to images, see `from_log_polar`.
-
-        Args:
-            cortical: `(B, C, M, N)` or `(B, G, C, M, N)`.
-            gaze: the fixations of the cortical images.
-            size: `(width, height)` of the images.
-
-        Returns:
-            Images `(B, C, height, width)` or `(B, G, C, height, width)`.
-        """
-        return from_log_polar(cortical, gaze, size, fovea=self.retina.fovea, spacing=self.retina.spacing)
-
     def forward(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
         """Compute the back-projection of the cortical images of fixations.
 
@@ -213,7 +200,8 @@ class LogPolar(Sensor):
             Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
         """
         finest = image[0] if isinstance(image, tuple) else image
-        return self.back(self.cortical(image, gaze), gaze, _size(finest))
+        cortical, retina = self.cortical(image, gaze), self.retina
+        return from_log_polar(cortical, gaze, _size(finest), fovea=retina.fovea, spacing=retina.spacing)
 
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""

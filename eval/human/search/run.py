@@ -16,7 +16,8 @@ from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
-from semfov.episode import Stopwatch, StoredLooks
+from semfov.episode import StoredLooks
+from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition.base import Task
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.protocols import Trial, run_episodes
