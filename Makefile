@@ -14,7 +14,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 unexport PYTHONDONTWRITEBYTECODE
 
 NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
-	$(patsubst %,tests/head/test_%.py,belief modules world) \
+	$(patsubst %,tests/head/test_%.py,belief modules) \
 	$(patsubst %,tests/zoom/test_%.py,belief decision modules survey)
 
 .DEFAULT_GOAL := help

@@ -1,14 +1,16 @@
 """Public functions and modules on a GPU, which is pretended on a machine without one: all but those that are named.
 
 Modules are run by their testers. A function is run by the example in its docstring: its arguments are moved to the GPU,
-its results are moved back, and the example must print what the docstring says.
+its results are moved back, and the example must print what the docstring says. Small tensors need one thread.
 """
 
 import copy
 import doctest
 import inspect
+import multiprocessing
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +23,9 @@ from torch import Tensor, nn
 
 import semfov
 from docs.api import entries
+from semfov import DirichletBelief, Grid, acquisition, foveate
 from semfov.agents.episode import on_cpu
+from semfov.belief import fuse
 from semfov.belief.observers import Semantic
 from semfov.data.fixations import Fixations
 from semfov.detection.detections import Detections
@@ -30,8 +34,12 @@ from semfov.detection.selection import Selection, select
 from semfov.episode import StoredLooks
 from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
+from semfov.sensor import laplacian_pyramid
+from semfov.sensor import pyramid as pyramids
+from semfov.threads import _MANY_ELEMENTS, beside, one_thread_if_small
 from tests import small
 from tests.pretended import a_gpu, waits
+from tests.small import draw, model
 from tests.test_modules import find_testers
 from tests.viz.test_places import calls
 
@@ -257,3 +265,79 @@ def test_more_episodes_do_not_wait_for_the_gpu_more_often(work):
                 work(count)
             often.append(found)
     assert often[0] == often[1]
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield 3
+    torch.set_num_threads(before)
+
+
+@one_thread_if_small
+def used(*values):
+    return torch.get_num_threads()
+
+
+def test_only_small_tensors_are_worked_on_by_one_thread(threads):
+    small, large = torch.zeros(_MANY_ELEMENTS - 1), torch.zeros(_MANY_ELEMENTS)
+    bands = pyramids.Bands((large,), small, "kornia")
+    assert [used(), used(small), used((small,), 1.0)] == [1, 1, 1]
+    assert [used(large), used(small, large), used((small, (large,))), used(bands)] == [threads] * 4
+    assert torch.get_num_threads() == threads
+
+
+def test_an_error_restores_the_threads(threads):
+    @one_thread_if_small
+    def fails(value):
+        raise ValueError(value)
+
+    with pytest.raises(ValueError, match="7"):
+        fails(7)
+    assert torch.get_num_threads() == threads
+
+
+@pytest.mark.parametrize("name", ["foveate", "laplacian_pyramid", "fuse", "KL divergence"])
+def test_hot_paths_use_one_thread(threads, name, monkeypatch):
+    """Seen from an operation inside."""
+    counts = set()
+
+    class Watch(torch.overrides.TorchFunctionMode):
+        def __torch_function__(self, func, types, args=(), kwargs=None):
+            counts.add(torch.get_num_threads())
+            return func(*args, **(kwargs or {}))
+
+    image, grid = torch.rand(1, 3, 64, 64), Grid(4, 3, (64, 48))
+    beta = 1 + draw(1, 12, 4, dtype=torch.float32).abs()
+    value = acquisition.KLDivergence(model(), grid)
+    runs = {
+        "foveate": lambda: foveate(image, (3.0, 4.0), sigma=9.0),
+        "laplacian_pyramid": lambda: laplacian_pyramid(image, 3),
+        "fuse": lambda: fuse(beta, torch.full((1, 2, 4), 0.5), torch.ones(1, 2, 12, dtype=torch.bool)),
+        "KL divergence": lambda: value(DirichletBelief(beta, torch.ones(1, 12)), torch.zeros(1, 12, dtype=torch.bool)),
+    }
+    with Watch():
+        runs[name]()
+    assert 1 in counts
+    assert counts <= {1, threads}
+    assert torch.get_num_threads() == threads
+
+
+def test_work_is_done_beside_a_block_where_a_core_is_left(monkeypatch):
+    """What fails in it is left out, and none is done without a core, or in a process that shares its cores."""
+    names = []
+
+    def work() -> None:
+        names.append(threading.current_thread().name)
+        raise ValueError
+
+    for cores, idle, parent, done in ((1, False, None, 0), (8, False, None, 1), (1, True, None, 1), (8, True, 1, 0)):
+        names.clear()
+        monkeypatch.setattr("semfov.threads.available_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(multiprocessing, "parent_process", lambda parent=parent: parent)
+        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+        with beside(work, idle=idle):
+            pass
+        assert len(names) == done
+        assert threading.current_thread().name not in names

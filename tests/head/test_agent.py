@@ -1,19 +1,28 @@
-"""The agent that turns its head, and the pictures of what it did."""
+"""The agent with a head, in scenes, in files and at cameras."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from semfov import ActivePerception, Detections, Flat, HeadAgent, Panorama
+from examples.pan_tilt import SimulatedCamera
+from semfov import ActivePerception, Detections, Eye, Flat, Foveation, HeadAgent, Panorama
 from semfov.agents.head import _decide_look
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.gaze.policies import Policy
-from semfov.head.belief import SceneBelief
+from semfov.head import CameraFrame, PanTiltCamera, PerSecond, SearchGain, Speeds, open_scene
+from semfov.head.belief import SceneBelief, SceneObserver
 from semfov.head.episode import HeadStep, live
+from semfov.head.gain import OUT
+from semfov.head.scenes import Sphere
+from semfov.head.views import Views
+from semfov.paths import HeadPath
 from semfov.sensor.sphere import Regions
-from tests.refusals import refused
+from tests.refusals import refused, unusable
+from tests.small import Coloured, rand
 
 
 @pytest.fixture
@@ -207,3 +216,261 @@ def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
     assert set(blue.objects.labels.tolist()) == {3}
     middles = (blue.objects.boxes[:, :2] + blue.objects.boxes[:, 2:]) / 2
     assert ((middles - torch.tensor([210.0, 90])).abs() < 15).all()
+
+
+BLUE = (30.0, 0.0)
+"""Pan and tilt of the middle of the blue square of `panorama`."""
+
+
+@pytest.fixture
+def exact(models):
+    """An agent whose detector gives the box of a colour to the pixel."""
+    return HeadAgent(Eye(Foveation(100.0, growth=2.0), Coloured(("red", "green", "blue"), (416, 312))), *models).eval()
+
+
+def towards_blue(agent, camera):
+    """The action in the middle of the view nearest to the blue square."""
+    views = agent.views(camera)
+    there = views.poses.new_tensor([*BLUE, 60.0]).expand_as(views.poses)
+    return int(views.world.turn(views.poses, there).argmin()) * 100 + 55
+
+
+class Own(PanTiltCamera):
+    """The least that a camera needs; its frames are those of OpenCV."""
+
+    size = (104, 78)
+
+    def __init__(self, panorama):
+        self.panorama, self.asked = Panorama(panorama, self.size), []
+
+    def look_at(self, direction, field):
+        self.asked.append(direction)
+        return self.panorama.look_at(direction, field).mul(255).byte().permute(1, 2, 0).flip(-1).numpy()
+
+
+def middle_of(path, look=-1):
+    """Pan and tilt of the middle of the first object of a look."""
+    regions, *_ = path.places(look, 0.5)
+    return tuple(path.views.world.angles_of(regions.samples(3)[:1, 4])[0].tolist())
+
+
+def test_a_camera_needs_a_size_and_a_way_to_look(exact, panorama):
+    camera = Own(panorama)
+    start = towards_blue(exact, camera)
+    path = exact.search(camera, "blue", confirm=0.0, color="bgr", start=start)
+    assert path.found
+    assert middle_of(path) == pytest.approx(BLUE, abs=1)
+    assert exact.explore(camera, passes=1, start=start).detections[0].labels[0, 0] == 1  # blue is taken for red
+    assert camera.asked == [(30.0, 0.0)] * 2
+
+
+def test_every_look_at_a_camera_takes_a_new_frame(agent, panorama):
+    camera = Own(panorama)
+    path = agent.search(camera, "green", passes=6, confirm=1.0)
+    assert camera.asked == [tuple(path.pose(number)[:2].tolist()) for number in range(6)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_objects_are_where_they_are_though_the_camera_is_a_little_off(exact, panorama, noise):
+    """A camera that reports its direction knows where an object is, whatever the error of its motors."""
+    world, errors = Panorama(panorama), []
+    for seed in range(6 if noise else 1):
+        for reports in (True, False):
+            camera = SimulatedCamera(world, noise=noise, delay=0.0, reports=reports, seed=seed)
+            start = towards_blue(exact, camera)
+            found = middle_of(exact.search(camera, "blue", passes=1, confirm=1.0, color="bgr", start=start))
+            if reports:
+                assert found == pytest.approx(BLUE, abs=0.5)
+            else:
+                errors.append(math.dist(found, BLUE))
+    assert np.mean(errors) < 0.5 if noise == 0 else np.mean(errors) > noise / 2
+
+
+def test_the_eye_fixates_the_same_direction_from_a_pose_nearby(agent, panorama):
+    """The evidence of a cell does not depend on where the camera stopped."""
+    beliefs = []
+    for noise in (0.0, 1.0):
+        camera = SimulatedCamera(Panorama(panorama), noise=noise, delay=0.0, seed=3)
+        path = agent.search(camera, "blue", passes=4, confirm=1.0, color="bgr", start=0)
+        beliefs.append(path.maps[-1])
+    torch.testing.assert_close(*beliefs, atol=0.06, rtol=0)
+
+
+def test_frames_from_before_the_camera_arrived_are_not_used(agent, panorama):
+    """Each frame that the agent uses is from the direction it asked for; late ones are asked for again."""
+    camera = SimulatedCamera(Panorama(panorama), delay=0.5, noise=0.0)
+    given, look_at = [], camera.look_at
+
+    def watched(direction, field):
+        given.append((direction, look_at(direction, field)))
+        return given[-1][1]
+
+    camera.look_at = watched
+    path = agent.explore(camera, passes=12, color="bgr")
+    assert path.turns >= 1
+    late = [frame for direction, frame in given if frame.direction != pytest.approx(direction, abs=6)]
+    assert late
+    assert len(given) - len(late) == 12
+    # The camera's own clock agrees with the time that its speeds predict, but for the way to the first direction.
+    # A frame of the last few degrees of a movement counts already.
+    ahead = float(camera.speeds.turn(torch.tensor(max(map(abs, given[0][0])))))
+    predicted = path.seconds[-1] + ahead + camera.delay * (ahead > 0)
+    turns = path.turns + 1
+    assert predicted - turns * camera.delay <= camera.clock <= predicted + turns * camera.interval
+
+
+def test_fewer_turns_are_made_when_settling_takes_long(agent, panorama):
+    turns = []
+    for settle in (0.0, 5.0):
+        world = Panorama(panorama, speeds=Speeds(settle=settle))
+        turns.append(agent.explore(world, passes=12, duration=math.inf).turns)
+    assert turns[1] < turns[0]
+
+
+def test_turns_within_the_dead_zone_have_no_value(eye, models, panorama):
+    views = Views(Panorama(panorama, speeds=Speeds(dead_zone=50.0)))
+    belief = SceneObserver(Target(models[0]), views).start(1, views.grid, torch.zeros(1))
+    gain, here = SearchGain(views), views.ahead
+    values = PerSecond(gain, views.world.speeds, here, range(len(views)))(
+        belief, torch.zeros(1, len(views.grid)).bool()
+    )
+    made = (values.view(len(views), 100) > OUT).any(-1)
+    angles = views.world.turn(views.poses[here // 100].expand_as(views.poses), views.poses)
+    assert torch.equal(made, (angles < 0.1) | (angles >= 50))
+    assert 1 < int(made.sum()) < len(views)
+
+
+@pytest.mark.parametrize("limits", [((-170, 170), (-30, 60)), ((-40, 100), (0, 0)), ((10, 10), (-90, 20))])
+@pytest.mark.parametrize("field", [35.0, 60.0])
+def test_views_show_what_is_between_the_limits(limits, field):
+    (left, right), (down, up) = limits
+    world = Sphere((720, 360), (64, 48), pan=(left, right), tilt=(down, up))
+    rows = world.poses(field)
+    for pose in (pose for row in rows for pose in row):
+        assert left - 1e-3 <= float(pose[0]) <= right + 1e-3
+        assert down - 1e-3 <= float(pose[1]) <= up + 1e-3
+    pan = torch.deg2rad(left + (right - left) * rand(400))
+    tilt = torch.deg2rad(down + (up - down) * rand(401)[:400])
+    across = tilt.cos()
+    directions = torch.stack([across * pan.sin(), -tilt.sin(), across * pan.cos()], -1)
+    tiling = [pose for row in rows[::2] for pose in row[::2]]
+    seen = torch.stack([world.to_view(directions, pose)[1] for pose in tiling]).any(0)
+    # The upper and lower edges of views bend away from a limit, which leaves out slivers there.
+    assert float(seen.float().mean()) > 0.98
+    assert seen[(tilt.rad2deg() < up - 10) & (tilt.rad2deg() > down + 10)].all()
+
+
+def test_motors_turn_together_and_between_their_limits(panorama):
+    class Stopped(Own):
+        pan = (-170.0, 170.0)
+
+    one, other = torch.tensor([-160.0, 10.0, 60.0]), torch.tensor([150.0, -20.0, 60.0])
+    assert float(open_scene(Stopped(panorama)).turn(one, other)) == 310
+    assert float(open_scene(Own(panorama)).turn(one, other)) == 50
+
+
+def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
+    class Bare:
+        size = (40, 30)
+
+        def look_at(self, direction, field):
+            return torch.zeros(3, 30, 40)
+
+    refused(r"got Bare without pan, tilt, fields, speeds; derive it from", agent.explore, Bare())
+
+    class Stuck(Own):
+        def look_at(self, direction, field):
+            return CameraFrame(super().look_at(direction, field), (30.0, 0.0))
+
+    unusable(r"from pan 0\.0°.*got pan 30\.0°.*; wait in look_at", agent.explore, Stuck(panorama))
+
+    class Large(Own):
+        def look_at(self, direction, field):
+            return super().look_at(direction, field)[:-1]
+
+    refused(r"frame: expected 104 × 78 pixels, as `size` has it, got \(104, 77\)", agent.explore, Large(panorama))
+    refused(r"camera: expected a camera, got the class Own; give Own\(…\)", agent.explore, Own)
+    for fields in (60, (), (60.0, 30.0), (0.0, 60.0), (180.0,), ("60",)):
+        for make in (Panorama, Flat):
+            refused(r"fields: expected one or more angles .*, such as", make, panorama, fields=fields)
+    refused("color: expected rgb for a Panorama", agent.explore, Panorama(panorama), color="bgr")
+    refused("tilt: expected limits", open_scene, type("Upside", (Own,), {"tilt": (10.0, -10.0)})(panorama))
+
+
+def test_a_picture_is_a_panorama_if_it_is_twice_as_wide_as_high(agent, panorama, tmp_path):
+    pixels = panorama.mul(255).byte().permute(1, 2, 0).numpy()
+    Image.fromarray(pixels).save(tmp_path / "around.png")
+    whole = agent.explore(Panorama(panorama), passes=3)
+    for picture, color in ((tmp_path / "around.png", "rgb"), (pixels[..., ::-1], "bgr"), (panorama, "rgb")):
+        path = agent.explore(picture, passes=3, color=color)
+        assert isinstance(path.views.world, Panorama)
+        torch.testing.assert_close(path.maps, whole.maps)
+    flat = open_scene(torch.rand(3, 300, 400))
+    assert isinstance(flat, Flat)
+    assert len(Views(flat)) >= 1  # the widest view fits
+
+
+def test_the_record_of_a_camera_shows_what_it_saw_and_is_stored(agent, panorama, tmp_path):
+    world = Panorama(panorama)
+    camera = SimulatedCamera(world, noise=0.0, delay=0.0)
+    path = agent.explore(camera, passes=8, color="bgr")
+    small = path.image
+    assert small.shape[-1] == 2 * small.shape[-2]
+    points = path.views.world.pixels_of(torch.stack([path.gaze(look) for look in range(8)]))
+    for x, y in points.tolist():
+        column, row = int(x / path.size[0] * small.shape[-1]), int(y / path.size[1] * small.shape[-2])
+        truth = panorama[:, int(y / path.size[1] * 180), int(x / path.size[0] * 360)]
+        torch.testing.assert_close(small[:, row, column], truth, atol=0.3, rtol=0)
+    assert float((small == 128 / 255).all(0).float().mean()) > 0.2  # not everything was seen
+    path.save(tmp_path / "path.safetensors")
+    loaded = HeadPath.load(tmp_path / "path.safetensors")
+    assert loaded.views.world.tilt == (-30.0, 60.0)
+    torch.testing.assert_close(loaded.gaze(-1), path.gaze(-1))
+    assert len(loaded.objects) == len(path.objects)
+
+
+def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_path):
+    """The kind of look follows from the picture; the record is that of the part of the agent that turns a head."""
+    one = ActivePerception(
+        eye, (Target(models[0]), Policy("non-predictive")), (LearnedMap(models[1]), Policy("random"))
+    ).eval()
+    head = HeadAgent(eye, *models).eval()
+    file = tmp_path / "around.png"
+    Image.fromarray(panorama.mul(255).byte().permute(1, 2, 0).numpy()).save(file)
+    limits = {"passes": 4, "duration": 20.0}
+    expected = head.search(Panorama(panorama), "blue", confirm=1.0, **limits)
+    for picture, how in ((Panorama(panorama), "auto"), (file, "head"), (panorama, "head")):
+        path = one.search(picture, "blue", how=how, confirm=1.0, **limits)
+        assert isinstance(path, HeadPath)
+        assert path.actions == expected.actions
+        torch.testing.assert_close(path.maps, expected.maps)
+    camera = Own(panorama)
+    assert one.search(camera, "blue", color="bgr", confirm=1.0, **limits).actions[0] == head.views(camera).ahead
+    assert one.find_all(camera, ["red", "blue"], color="bgr", **limits).targets == (1, 3)
+    assert [look.number for look in one.explore(camera, color="bgr", worth=0.0, **limits)] == [0, 1, 2, 3]
+    for wrong, message in (
+        ({"picture": camera, "shifts": 3}, "shifts: expected none"),
+        ({"picture": camera, "how": "windows"}, "how: expected 'head' or 'auto' for a scene"),
+        ({"picture": panorama, "duration": 3.0}, "duration: expected none"),
+    ):
+        refused(message, one.explore, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("limits", "unit"),
+    [
+        ((90, (-20, 20)), "got 90"),
+        (((-3.15, 3.15), (-0.5, 1.57)), "radians"),
+        (((-1, 1), (-1, 1)), "ONVIF"),
+        (((0, 0), (-1, 0.5)), "ONVIF"),
+    ],
+)
+def test_limits_in_other_units_are_refused(limits, unit):
+    class Narrow(PanTiltCamera):
+        size, (pan, tilt) = (40, 30), limits
+
+        def look_at(self, direction, field):
+            return torch.rand(3, 30, 40)
+
+    refused(f"pan: expected .*limits in degrees.*{unit}", open_scene, Narrow())

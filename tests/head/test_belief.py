@@ -1,20 +1,24 @@
-"""A scene seen one window at a time: the belief about it, and the value of a look."""
+"""The world of a head and the belief about it: views, panoramas, speeds, and cells of several looks."""
 
 from itertools import pairwise
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional as F
 
 from eval.head.run import _rests_on
 from eval.head.scan import Scan
-from semfov import Panorama, rollout
+from semfov import EmbeddedScenes, Panorama, TargetEvidence, rollout
 from semfov.belief.observers import LearnedMap, Target
 from semfov.gaze.choice import Given
-from semfov.head import ExploreGain, PerSecond, SearchGain, Speeds
+from semfov.head import ExploreGain, Flat, Panoramas, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import _HeadLooks, live, look_around
 from semfov.head.gain import OUT
 from semfov.head.views import Views
+from semfov.sensor import glimpse, perspective
 from tests.refusals import refused
 
 
@@ -230,3 +234,262 @@ def test_one_episode_at_a_time(views, models):
     observer = SceneObserver(Target(models[0]), views)
     refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
     refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)
+
+
+@pytest.fixture(params=["panorama", "flat"])
+def world(request):
+    torch.manual_seed(0)
+    if request.param == "panorama":
+        return Panorama(torch.rand(3, 180, 360), (64, 48))
+    return Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
+
+
+def test_points_are_converted_to_the_scene_and_back(world):
+    points = torch.rand(40, 2) * 40
+    for row in world.poses(60.0):
+        there = world.to_scene(points, row[0])
+        back, inside = world.to_view(there, row[0])
+        torch.testing.assert_close(back, points, atol=2e-3, rtol=0)
+        assert inside.all()
+
+
+def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
+    """All of a flat scene, and of a panorama the part that the head can reach."""
+    rows = world.poses(60.0)
+    tiling = [pose for row in rows[::2] for pose in row[::2]]
+    seen = torch.stack([world.to_view(world.centres, pose)[1] for pose in tiling]).any(0)
+    if isinstance(world, Flat):
+        assert seen.all()
+    else:
+        latitude = torch.rad2deg(torch.asin(-world.centres[:, 1]))
+        assert seen[latitude.abs() < 60].all()
+
+
+def test_boxes_are_converted_to_places_and_back(world):
+    boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
+    pose = world.poses(60.0)[1][1]
+    places = world.places(boxes, pose)
+    for number, (x1, y1, x2, y2) in enumerate(boxes.tolist()):
+        inside = torch.tensor([[x1 + 0.5, y1 + 0.5], [x2 - 1.5, y2 - 1.5], [(x1 + x2) / 2, (y1 + y2) / 2]])
+        outside = torch.tensor([[x1 - 2, y1], [x1, y1 - 2]])
+        assert places.contain(world.to_scene(inside, pose))[number].all()
+        assert not places.contain(world.to_scene(outside, pose))[number].any()
+    back, _ = world.to_view(places.samples(2).flatten(0, 1), pose)
+    corners = back.view(2, 4, 2)[:, [0, 3]].flatten(1) + 0.5
+    torch.testing.assert_close(corners, boxes, atol=5e-2, rtol=0)
+
+
+def test_cells_contain_their_centres_and_panoramas_are_twice_as_wide_as_high(world):
+    assert torch.equal(world.scene.cell_of(world.pixels_of(world.centres)), torch.arange(len(world.scene)))
+    torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
+    assert float(world.area.mean()) == pytest.approx(1)
+    with pytest.warns(UserWarning, match="twice as wide as high, got 64 × 48 px"):
+        Panorama(torch.rand(3, 48, 64), (32, 24))
+    Panorama(torch.rand(3, 48, 98), (32, 24))
+
+
+def test_views_are_perspectives_of_panoramas_and_glimpses_of_flat_scenes():
+    torch.manual_seed(0)
+    image = torch.rand(3, 90, 180)
+    pose = torch.tensor([33.0, 20.0, 60.0])
+    expected = perspective(image[None], pose[None], (32, 24))[0]
+    world = Panorama(image, (32, 24))
+    torch.testing.assert_close(world.view(pose)[0], expected.clamp(0, 1))
+    torch.testing.assert_close(world.look_at((33.0, 20.0), 60.0), expected.clamp(0, 1))
+    # Without the border pixels, where a glimpse also uses pixels from outside the window.
+    torch.manual_seed(0)
+    image = torch.rand(3, 120, 160).mul(255).round() / 255
+    view = Flat(image, (32, 24), degree=5).look_at((-4.0, 2.0), 16.0)  # 20 px to the left, 10 px up
+    expected = glimpse(image[None], torch.tensor([[20.0, 20, 100, 80]]), (32, 24))[0]
+    torch.testing.assert_close(view[:, 1:-1, 1:-1], expected[:, 1:-1, 1:-1], atol=1e-5, rtol=0)
+
+
+def test_angles_of_eye_and_head():
+    """Closed forms: poses of a ring differ by equal steps, and the angle from side to side is the field of view."""
+    panorama = Panorama(torch.rand(3, 90, 180), (64, 48))
+    ring = torch.stack(panorama.poses(60.0)[2])
+    assert float(ring[0, 1]) == 0
+    torch.testing.assert_close(panorama.turn(ring[0].expand_as(ring), ring)[:4], torch.tensor([0.0, 30, 60, 90]))
+    sides = torch.tensor([[-0.5, 23.5], [63.5, 23.5]])
+    assert float(panorama.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
+    flat = Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
+    assert float(flat.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
+    assert float(flat.turn(torch.tensor([0.0, 0, 60]), torch.tensor([7.5, 10, 60]))) == pytest.approx(12.5)
+
+
+def test_a_head_that_turns_to_the_angles_of_a_point_has_it_in_the_middle_of_its_view(world):
+    points = world.centres[torch.randint(len(world.centres), (30,), generator=torch.Generator().manual_seed(1))]
+    middle = torch.tensor(world.size) / 2 - 0.5
+    for point, (pan, tilt) in zip(points, world.angles_of(points).tolist(), strict=True):
+        pose = torch.tensor([pan, tilt, 20.0])
+        if isinstance(world, Flat) and not (abs(pan) < 70 and abs(tilt) < 52):
+            continue  # the window would not fit
+        seen, inside = world.to_view(point[None], pose)
+        assert inside.all()
+        torch.testing.assert_close(seen[0], middle, atol=0.6 if isinstance(world, Flat) else 1e-2, rtol=0)
+
+
+def test_actions_are_cells_of_a_strip(world):
+    views = Views(world)
+    assert len(views.grid) == len(views.poses) * 100
+    centres = views.grid.centres
+    for action in (0, 137, 555, len(views.grid) - 1):
+        pose = action // 100
+        point = centres[action] - torch.tensor([0, pose * world.size[1]])
+        torch.testing.assert_close(point, views.view_grid.centres[action % 100], atol=1e-3, rtol=0)
+        expected = world.to_scene(point[None], views.poses[pose])[0]
+        torch.testing.assert_close(views.gaze[action], expected, atol=1e-3, rtol=1e-4)
+
+
+def test_durations_equal_brute_force(world):
+    from semfov.head import Speeds
+
+    views, speeds = Views(world, (40.0, 80.0) if isinstance(world, Panorama) else (60.0,)), Speeds()
+    here = 7 * 100 + 33
+    durations = views.durations(here, speeds)
+    generator = torch.Generator().manual_seed(0)
+    for action in torch.randint(len(views.grid), (20,), generator=generator).tolist():
+        one, other = views.poses[7], views.poses[action // 100]
+        points = views.view_grid.centres[[33, action % 100]]
+        eye = world.shift(points[0], points[1], float(other[2]))
+        expected = speeds.duration(eye, world.turn(one, other), (other[2] / one[2]).log2())
+        assert float(durations[action]) == pytest.approx(float(expected), abs=1e-4)
+    assert float(durations[here]) == pytest.approx(speeds.look)
+
+
+def test_windows_beyond_a_picture_are_refused():
+    flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
+    refused("pose: expected a window inside 64 × 48 pixels", flat.look_at, (-16.0, 0.0), 20.0)
+    refused("field: expected a window inside the picture", flat.poses, 60.0)
+    refused("fields: expected", Views, flat, (30.0, 20.0))
+
+
+CLASSES = ("person", "cat", "cup")
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return EmbeddedScenes(CLASSES, count=5)
+
+
+@pytest.mark.slow
+def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
+    panoramas = Panoramas(scenes, width=1024, count=1)
+    panorama = panoramas[0].image[None]
+    for patch in panoramas.patches(0):
+        seen = perspective(panorama, torch.tensor([patch.pose]), (160, 120))[0]
+        photograph = F.interpolate(scenes[patch.scene].image[None], (120, 160), mode="bilinear", antialias=True)[0]
+        inner = slice(3, -3)
+        apart = (seen - photograph)[:, inner, inner].abs()
+        assert apart.mean() < 0.02
+        # Another photograph differs much more.
+        other = scenes[(patch.scene + 1) % 5].image[None]
+        other = F.interpolate(other, (120, 160), mode="bilinear", antialias=True)[0]
+        assert (seen - other)[:, inner, inner].abs().mean() > 3 * apart.mean()
+
+
+def test_regions_match_the_boxes_of_the_photographs(scenes):
+    """A camera that looks at a patch sees each object where the photograph has it."""
+    panoramas = Panoramas(scenes, width=512, count=2, seed=4)
+    regions, labels = panoramas.regions(1), panoramas.annotation(1).labels
+    start = 0
+    from semfov.sensor.sphere import Camera
+
+    for patch in panoramas.patches(1):
+        annotation = scenes.annotation(patch.scene)
+        own = regions[torch.arange(start, start + len(annotation.boxes))]
+        assert torch.equal(labels[start : start + len(own)], annotation.labels)
+        start += len(own)
+        corners = own.samples(2)
+        camera = Camera(torch.tensor(patch.pose), (640, 480))
+        points, _ = camera.points(corners.flatten(0, 1))
+        seen = points.view(-1, 4, 2) + 0.5
+        scale = torch.tensor([640 / annotation.size[0], 480 / annotation.size[1]]).repeat(2)
+        expected = annotation.boxes * scale
+        torch.testing.assert_close(torch.cat([seen[:, 0], seen[:, 3]], -1), expected, atol=1e-2, rtol=0)
+    assert start == len(regions)
+
+
+def test_a_seed_repeats_a_panorama_and_uses_each_photograph_once(scenes):
+    one, same, other = (Panoramas(scenes, rings=((0.0, 5),), width=256, count=3, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one[2].image, same[2].image)
+    assert one.fingerprint == same.fingerprint != other.fingerprint
+    assert one.digest(2) == same.digest(2) != one.digest(1)
+    assert one.patches(0) != other.patches(0)
+    assert sorted(patch.scene for patch in one.patches(0)) == [0, 1, 2, 3, 4]
+
+
+def test_no_two_photographs_overlap(scenes):
+    from semfov.sensor.sphere import Camera, Regions
+
+    patches = Panoramas(scenes, width=256, count=1).patches(0)
+    slots = Regions(torch.tensor([p.box for p in patches]), Camera(torch.tensor([p.pose for p in patches]), (640, 480)))
+    held = slots.contain(slots.samples(21).flatten(0, 1)).view(len(patches), len(patches), -1)
+    for number in range(len(patches)):
+        others = torch.cat([held[number, :number], held[number, number + 1 :]])
+        assert not others.any()
+
+
+def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
+    panoramas = Panoramas(scenes, width=1024, count=1)
+    annotation = panoramas.annotation(0)
+    assert annotation.size == (1024, 512)
+    assert (annotation.boxes[:, 2:] > annotation.boxes[:, :2]).all()
+    assert (annotation.boxes[:, 0] >= 0).all()
+    assert (annotation.boxes[:, 0] <= 1024).all()
+    assert panoramas.targets(0) == sorted(set(annotation.labels.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"width": 101}, "width"), ({"slot": 180.0}, "slot"), ({"rings": ((95.0, 1),)}, "rings"), ({"count": 0}, "count")],
+)
+def test_invalid_settings_are_refused(scenes, settings, message):
+    refused(message, Panoramas, scenes, **settings)
+
+
+@given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
+def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, speed, acceleration):
+    found = float(Speeds(head=speed, acceleration=acceleration).turn(torch.tensor(angle, dtype=torch.float64)))
+    # Step by step: accelerate as long as there is room to brake.
+    step, time, done, pace = found / 20_000, 0.0, 0.0, 0.0
+    while done < angle and time < 2 * found:
+        braking = pace**2 / (2 * acceleration) >= angle - done
+        pace = max(pace - acceleration * step, 1e-9) if braking else min(pace + acceleration * step, speed)
+        done, time = done + pace * step, time + step
+        if braking and pace <= acceleration * step:
+            break
+    assert time == pytest.approx(found, rel=0.01)
+
+
+def test_durations_of_movements_follow_the_main_sequence_and_settling():
+    speeds = Speeds()
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
+    none = torch.tensor(0.0)
+    assert float(speeds.duration(none, none, none)) == speeds.look
+    assert float(speeds.duration(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
+    assert float(speeds.duration(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
+    assert float(speeds.duration(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
+    # 21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time.
+    found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
+    plain, slow, none = Speeds(), Speeds(settle=0.4), torch.tensor(0.0)
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-1.0)
+    for moved, later in (((eye, none, none), 0.0), ((eye, head, none), 0.4), ((none, none, zoom), 0.4)):
+        assert float(slow.duration(*moved) - plain.duration(*moved)) == pytest.approx(later)
+
+
+def test_turns_within_the_dead_zone_are_not_made():
+    views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    every = range(len(views))
+    for dead_zone in (0.0, 15.0, 25.0):
+        gain = PerSecond(SearchGain(views), Speeds(dead_zone=dead_zone), 55, every)
+        made = (gain(belief, torch.zeros(1, len(views.grid), dtype=torch.bool))[0] > OUT).unflatten(0, (-1, 100)).any(1)
+        turns = (views.poses[:, :2] - views.poses[0, :2]).norm(dim=-1)
+        assert made.tolist() == [turn == 0 or turn >= dead_zone for turn in turns.tolist()]
+
+
+@pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])
+def test_invalid_speeds_are_refused(settings):
+    refused(next(iter(settings)), Speeds, **settings)
