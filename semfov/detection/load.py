@@ -172,7 +172,7 @@ def load_yolo(
     name_or_cfg: str,
     *,
     weights: str | PathLike[str] | None = None,
-    classes: Sequence[str] = COCO_CLASSES,
+    classes: Sequence[str] | None = None,
     input_size: int | tuple[int, int] | None = None,
     stride: int | None = 32,
     runtime: Runtime = "auto",
@@ -191,7 +191,7 @@ def load_yolo(
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,
-        tuple(classes),
+        COCO_CLASSES if classes is None else tuple(classes),
         name=name,
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         stride=stride,
