@@ -89,10 +89,11 @@ def test_emptiness_is_finite_for_certain_cells():
 
 
 @pytest.mark.parametrize("wide", [False, True], ids=["same for all", "of each"])
-def test_gain_equals_a_loop(toy_map, dtype, wide, device):
-    model = toy_map().to(device, dtype)
+@pytest.mark.parametrize("components", [3, 5])
+def test_gain_equals_a_loop(toy_map, dtype, wide, components, device):
+    model = toy_map(components=components).to(device, dtype)
     generator = torch.Generator().manual_seed(0)
-    probabilities = torch.rand(3, 24, 5, generator=generator).to(device, dtype)
+    probabilities = torch.rand(3, 24, components, generator=generator).to(device, dtype)
     closest = torch.rand(3, 24, generator=generator).to(device, dtype) / 2
     looks = torch.tensor([1.0, 4, 9], device=device, dtype=dtype)
     distance = GRID.cell_distance[[3, 8, 17, 20]].to(device, dtype)
@@ -111,14 +112,6 @@ def test_gain_equals_a_loop(toy_map, dtype, wide, device):
                 reference.array(where),
             )
             np.testing.assert_allclose(reference.array(got[episode, fixation]), expected, atol=1e-5)
-
-
-def test_gain_with_two_classes_equals_a_loop(toy_map):
-    model, probabilities = toy_map(components=3).double(), draw(1, 24, 3).sigmoid()
-    closest, distance = torch.full((1, 24), 0.5, dtype=torch.float64), GRID.cell_distance[[3]].double()
-    got = model.gain(probabilities, closest, torch.ones(1).double(), distance)[0, 0]
-    expected = reference.gain(model, *map(reference.array, (probabilities[0], closest[0])), 1.0, distance[0].numpy())
-    np.testing.assert_allclose(reference.array(got), expected, atol=1e-9)
 
 
 def test_gain_is_zero_where_the_look_is_not_closer_than_before(toy_map):

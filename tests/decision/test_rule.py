@@ -116,28 +116,6 @@ def random_looks(count, most, seed):
     return Detections(boxes, scores, torch.rand(count, most, generator=generator) < 0.6)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_box_of_a_decision_is_that_of_the_strongest_detection_by_a_loop(seed):
-    grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
-    parts, belief = [looks[row : row + 1] for row in range(3)], Known(torch.zeros(1, 12), torch.ones(1), None)
-    for cell in range(12):
-        for target in (1, 3):
-            best, expected = 0.0, None
-            for look in range(3):
-                for detection in range(4):
-                    if not looks.mask[look, detection]:
-                        continue
-                    box = looks.boxes[look, detection]
-                    weight = float(grid.footprint(box[None], "soft")[0, cell])
-                    score = weight * float(looks.scores[look, detection, target])
-                    if score > best * (1 + 1e-6):
-                        best, expected = score, box
-            got = conclude(1, belief, parts, grid, target, cell).box
-            assert (got is None) == (expected is None)
-            if expected is not None:
-                assert torch.equal(got, expected)
-
-
 def test_a_decision_has_no_box_where_no_detection_overlaps_the_cell():
     far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
     masked, belief = replace(far, mask=torch.zeros(1, 1).bool()), Known(torch.zeros(1, 12), torch.ones(1), None)
@@ -238,26 +216,25 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     known = torch.rand(1, 12, generator=torch.Generator().manual_seed(seed))
     belief = Known(known, torch.tensor([0.75]), known)
     weight = grid.footprint(looks.boxes, "soft")
-    value = [
-        float(known[0, cell])
-        * max(
-            float(weight[look, n, cell] * looks.scores[look, n, 2]) if looks.mask[look, n] else 0.0
-            for look in range(3)
-            for n in range(4)
-        )
-        for cell in range(12)
-    ]
-    decision = conclude(1, belief, parts, grid, 2)
-    assert decision.cell == value.index(max(value))
-    assert torch.equal(decision.box, conclude(1, belief, parts, grid, 2, decision.cell).box)
+    for target in (1, 2, 3):
+        value = []
+        for cell in range(12):
+            best, expected = 0.0, None
+            for look, detection in looks.mask.nonzero().tolist():
+                score = float(weight[look, detection, cell] * looks.scores[look, detection, target])
+                if score > best * (1 + 1e-6):
+                    best, expected = score, looks.boxes[look, detection].tolist()
+            made = conclude(1, belief, parts, grid, target, cell)
+            assert (made.cell, made.box if made.box is None else made.box.tolist()) == (cell, expected)
+            value.append(float(known[0, cell]) * best)
+        decision = conclude(1, belief, parts, grid, target)
+        assert decision.cell == value.index(max(value))
+        assert torch.equal(decision.box, conclude(1, belief, parts, grid, target, decision.cell).box)
     assert decision.probability == 0.75
-    assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
     # Without detections the belief alone decides.
-    nothing = [Detections.empty(1, 3)]
-    assert conclude(1, belief, nothing, grid, 2) == Decision(
-        "found", 0.75, int(known.argmax()), None, float(known.max())
-    )
+    made = conclude(1, belief, [Detections.empty(1, 3)], grid, 2)
+    assert made == Decision("found", 0.75, int(known.argmax()), None, float(known.max()))
 
 
 @pytest.mark.parametrize(

@@ -113,22 +113,10 @@ def record(policy, present, outcome, probability, looks, **more):
 
 def test_table_matches_hand_calculations():
     """Four searches for a present target, two for an absent one; the second policy decides nothing."""
+    landed = {"landing_seen": True}
     first = [
-        record(
-            "a", True, "found", 0.9, 3, right_place=True, place=0.9, overlap=0.75, landing=[0.2, 0.8], landing_seen=True
-        ),
-        record(
-            "a",
-            True,
-            "found",
-            0.8,
-            5,
-            right_place=False,
-            place=0.7,
-            overlap=0.25,
-            landing=[0.4, 0.9],
-            landing_seen=True,
-        ),
+        record("a", True, "found", 0.9, 3, right_place=True, place=0.9, overlap=0.75, landing=[0.2, 0.8], **landed),
+        record("a", True, "found", 0.8, 5, right_place=False, place=0.7, overlap=0.25, landing=[0.4, 0.9], **landed),
         record("a", True, "absent", 0.3, 4, landing=[0.3, 0.1], landing_seen=False),
         record("a", True, "undecided", 0.6, 8),
         record("a", False, "found", 0.85, 2, right_place=False, place=0.8),

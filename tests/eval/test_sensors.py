@@ -191,17 +191,9 @@ def test_cells_around_chosen_and_empty_ones_are_not_chosen(escape):
 
 def test_the_command_writes_its_table(home, capsys):
     few = [
-        "--data.limit",
-        "3",
-        "--protocol.shifts",
-        "3",
-        "--sensor.settings.side",
-        "64",
-        "--belief.columns",
-        "7",
-        "--belief.rows",
-        "5",
-    ]
+        "--data.limit", "3", "--protocol.shifts", "3", "--sensor.settings.side", "64",
+        "--belief.columns", "7", "--belief.rows", "5",
+    ]  # fmt: skip
     assert semba.main(given(home, "semba", *few)) == 0
     shown = capsys.readouterr().out
     assert "escape, semba" in shown

@@ -314,19 +314,6 @@ def test_localisation_equals_the_adaptive_integral(seed):
         assert float(got) == pytest.approx(exact, abs=tolerance)
 
 
-def test_localisation_equals_a_simulation_of_responses():
-    """Every cell gives a noisy response; the search answers with the cell of the largest posterior."""
-    rng = np.random.default_rng(0)
-    place, signal, count = rng.dirichlet(np.full(8, 0.7)), rng.uniform(0.2, 2.5, 8), 400_000
-    target = rng.choice(8, count, p=place)
-    answer = rng.normal(-0.5, 1 / signal, (count, 8))
-    answer[np.arange(count), target] += 1
-    posterior = np.log(place) + signal**2 * answer
-    share = (posterior.argmax(1) == target).mean()
-    got = float(_correct_localisation(torch.tensor(place), torch.tensor(signal)))
-    assert got == pytest.approx(share, abs=5 * (0.25 / count) ** 0.5)
-
-
 class Sharp:
     """Sees targets perfectly in the fixated cell, and not at all in other cells."""
 

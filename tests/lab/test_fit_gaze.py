@@ -277,17 +277,9 @@ def test_the_command_fits_a_model_and_studies_compare_it(tmp_path, monkeypatch, 
     page.write_text("<!-- table viewing -->\n<!-- end -->\n")
     words = [word.replace("gaze.", "") for word in words]
     more = [
-        "--detectors",
-        "[colours]",
-        "--saliency",
-        "[vocus2]",
-        "--studied",
-        "0",
-        "--sequences",
-        "2",
-        "--glimpses",
-        "1",
-    ]
+        "--detectors", "[colours]", "--saliency", "[vocus2]", "--studied", "0",
+        "--sequences", "2", "--glimpses", "1",
+    ]  # fmt: skip
     more += ["--out", str(tmp_path / "viewing"), "--page", str(page)]
     assert compare(["viewing", *words, *more]) == 0, capsys.readouterr().err
     lines = page.read_text().splitlines()
