@@ -80,15 +80,12 @@ def tracked(folder):
     return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", ".pyi", *DATA}}
 
 
-def test_the_wheel_contains_exactly_the_package_its_data_and_the_licence(built):
+def test_wheel_and_sdist_contain_what_they_must(built):
     every = names_in(built, "*.whl")
     assert any(name.endswith("licenses/LICENSE") for name in every)
     names = {name for name in every if ".dist-info/" not in name}
     assert names == tracked(PACKAGE)
     assert sum(name.endswith(".safetensors") for name in names) > 15
-
-
-def test_the_sdist_contains_the_files_that_the_tests_need(built):
     names = names_in(built, "*.tar.gz")
     assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "Makefile"} <= names
     assert {"tests/conftest.py", "eval/search/__init__.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names

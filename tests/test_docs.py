@@ -149,9 +149,6 @@ def test_every_equation_of_the_paper_is_listed_with_its_code_or_the_reason_for_n
     assert [int(number) for number, *_ in rows] == list(range(1, len(EQUATIONS) + 1))
     assert [None if label == "without a label" else label.strip("`") for _, label, *_ in rows] == EQUATIONS
     assert [row for row in rows if not re.match(r"`semfov\.|none: ", row[-1])] == []
-
-
-def test_equations_of_the_page_are_those_of_the_paper():
     assert len(ROWS) > 50
     assert len(SYMBOLS) > 40
     cited = {int(number) for group in re.findall(r"\((\d+(?:, \d+)*)\) \|", PAGE) for number in group.split(", ")}

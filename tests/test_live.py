@@ -219,17 +219,14 @@ def test_frames_may_have_any_type_but_must_have_the_same_size():
     refused("frame: expected one picture", live.step, torch.rand(2, 3, 120, 160))
     for wrong in ({"target": "gren"}, {"start": 48}, {"seed": -1}, {"rate": -1}, {"confirm": 50}):
         refused(f"^{next(iter(wrong))}: ", agent_with(Semantic(3)).live, **wrong)
+    with pytest.raises(InputError, match="observer: expected one whose belief can fade, got NotFading"):
+        agent_with(NotFading(3)).live("green").step(scene(8))
 
 
 class NotFading(Semantic):
     """An observer that does not implement fading."""
 
     fade = Semantic.__mro__[1].fade
-
-
-def test_observers_without_fading_are_refused():
-    with pytest.raises(InputError, match="observer: expected one whose belief can fade, got NotFading"):
-        agent_with(NotFading(3)).live("green").step(scene(8))
 
 
 def test_frames_of_opencv_give_the_same_moments():

@@ -61,7 +61,7 @@ def test_each_pinned_version_has_digests_and_no_registry(name):
     assert [line for line in lines if not re.fullmatch(pin, line.strip())] == []
 
 
-def test_what_is_installed_before_tests_and_releases_is_checked_against_digests():
+def test_what_is_installed_before_tests_and_releases_and_actions_are_pinned():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert "$(STAMP): pyproject.toml constraints.txt" in makefile
     assert makefile.count("' constraints.txt\n") == 1  # which is split in parts
@@ -70,9 +70,6 @@ def test_what_is_installed_before_tests_and_releases_is_checked_against_digests(
     release = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
     assert "install --require-hashes --requirement .ci/build.txt && python -m build --no-isolation" in release
     assert all(PINS[".ci/app.txt"].get(each.name, "6") in each.specifier for each in required("app"))
-
-
-def test_actions_are_pinned_by_commit():
     for path in (ROOT / ".github/workflows").glob("*.yml"):
         used = re.findall(r"uses: (.*)", path.read_text(encoding="utf-8"))
         assert used
@@ -118,16 +115,13 @@ def test_the_workflows_test_the_oldest_python_and_a_newer_one():
     assert set(versions) == set(tried)
 
 
-def test_the_commands_that_try_a_release_exist():
+def test_the_commands_that_try_a_release_exist_and_issue_templates_are_valid():
     steps = [step["run"] for step in read(".github/workflows/release.yml")["jobs"]["try"]["steps"] if "run" in step]
     (commands,) = (step.split(" && ") for step in steps if step.startswith("semfov"))
     for command in commands:
         name, *options = command.split()[1:]
         known = {f"--{each.name}".replace("_", "-") for each in fields(_options_of(name))}
         assert {option for option in options if option.startswith("--")} <= known
-
-
-def test_issue_templates_are_valid():
     for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml"):
         form = read(path.relative_to(ROOT))
         assert path.stem == "config" or {"name", "description", "body"} <= set(form)

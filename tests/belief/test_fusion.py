@@ -235,7 +235,7 @@ def test_fuse_vectorises_over_one_argument_alone(batched):
         torch.testing.assert_close(together[row], fuse(*alone))
 
 
-def test_shapes_that_do_not_fit_are_refused():
+def test_shapes_and_numbers_that_do_not_fit_are_refused():
     for shape in [(2,), (2, 2), (1, 3)]:
         with pytest.raises(InputError, match=r"^fixation: expected a tensor of shape \(..., 1, 2\)"):
             likelihoods(seen(Grid(4, 3, (100, 60))), torch.zeros(shape), Grid(4, 3, (100, 60)))
@@ -251,6 +251,10 @@ def test_shapes_that_do_not_fit_are_refused():
     ]:
         with pytest.raises(InputError, match=rf"^{argument}: expected a tensor of shape"):
             fuse(torch.ones(beta), torch.ones(likelihood), torch.ones(footprint))
+    refused(".", lambda: Grid(0, 3, (10, 10)))
+    refused(".", lambda: Grid(3, 3, (10, 0)))
+    refused(".", lambda: Grid(3, 3, (10, 10, 10)))
+    refused(".", lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"))
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
@@ -355,13 +359,6 @@ def test_batch_of_sizes_equals_single_grids():
     single = Grid(5, 4, sizes[1]).box_distance(boxes[1], fixation[1])
     torch.testing.assert_close(batch.box_distance(boxes, fixation)[1], single)
     torch.testing.assert_close(batch.distance(fixation)[1], Grid(5, 4, sizes[1]).distance(fixation[1]))
-
-
-def test_bad_input():
-    refused(".", lambda: Grid(0, 3, (10, 10)))
-    refused(".", lambda: Grid(3, 3, (10, 0)))
-    refused(".", lambda: Grid(3, 3, (10, 10, 10)))
-    refused(".", lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"))
 
 
 def test_centres_edges_and_distances():

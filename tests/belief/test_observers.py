@@ -113,13 +113,6 @@ def test_models_are_submodules_of_the_observer():
     assert not Semantic(4, misses=MISSES).state_dict()
 
 
-def test_invalid_settings_are_refused(looks):
-    for options in [{"memory": "best"}, {"fusion": "max"}, {"prior": 0}]:
-        refused(".", Semantic, 3, **options)
-    refused("tempering", likelihoods, looks, FIXATIONS, GRID, tempering=0)
-    refused("tempering", Semantic(4, tempering=0).weigh, looks, FIXATIONS, GRID)
-
-
 @pytest.mark.parametrize("footprint", ["overlap", "soft"])
 def test_looks_with_different_numbers_of_detections_can_be_joined(looks, footprint):
     observer = Semantic(4, footprint=footprint, misses=MISSES)
@@ -138,17 +131,14 @@ def test_looks_with_different_numbers_of_detections_can_be_joined(looks, footpri
         assert torch.equal(together.closest[row], alone.closest[0])
 
 
-def test_a_belief_keeps_its_dtype_whatever_the_dtype_of_the_look(looks):
+def test_a_belief_keeps_its_dtype_and_a_look_has_that_of_the_scores(looks, dtype):
     observer = Semantic(4, misses=MISSES)
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
-    for dtype in (torch.float32, torch.float64):
-        said = SemanticLook(look.likelihood.to(dtype), look.footprint, look.distance.to(dtype))
+    for given in (torch.float32, torch.float64):
+        said = SemanticLook(look.likelihood.to(given), look.footprint, look.distance.to(given))
         for other in (torch.float32, torch.float64):
             start = observer.start(1, GRID, torch.empty(0, dtype=other))
             assert observer.update(start, said).beta.dtype == other
-
-
-def test_a_look_has_the_dtype_of_the_scores(looks, dtype):
     seen = Detections(looks.boxes, looks.scores.to(dtype), looks.mask)
     for fixations in (FIXATIONS, FIXATIONS.double()):
         look = Semantic(4).weigh(seen, fixations, GRID)
@@ -223,7 +213,7 @@ def test_a_look_is_weighed_once_for_each_class_or_once_for_all(inner, looks):
     assert observer.weights == {1: 1.0, 3: 0.4}
 
 
-def test_bad_input(inner):
+def test_bad_input(inner, looks):
     for weights in ({}, {1: 0.0}, {1: 1.5}, {1: -0.1, 2: 1.0}):
         refused("weights", AnyOf, inner, weights)
     classes, strategy = ("background", "cup", "wine glass"), Strategy(Semantic(3), Policy("non-predictive"))
@@ -235,6 +225,10 @@ def test_bad_input(inner):
         ({99: 1.0}, "^target:"),
     ):
         refused(message, strategy.sought, target, classes)
+    for options in [{"memory": "best"}, {"fusion": "max"}, {"prior": 0}]:
+        refused(".", Semantic, 3, **options)
+    refused("tempering", likelihoods, looks, FIXATIONS, GRID, tempering=0)
+    refused("tempering", Semantic(4, tempering=0).weigh, looks, FIXATIONS, GRID)
 
 
 LEARNED = Grid(6, 4, (90, 60))

@@ -283,15 +283,12 @@ def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
     assert max(copies.rows) <= 24 + 8
 
 
-def test_small_pictures_and_fine_windows_are_read_as_they_are(strips):
+def test_small_pictures_are_read_as_they_are_and_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     small, large = _ArrayPicture(pixels(60, 70)), _ArrayPicture(pixels(128, 192))
     assert [small.reduction(ratio) for ratio in (1, 9, 40)] == [1, 1, 1]
     assert [large.reduction(ratio) for ratio in (0.3, 1, 4, 5.9, 6, 17, 40)] == [1, 1, 1, 1, 4, 8, 16]
     assert small.read((0, 0, 70, 60), 4).shape == (3, 60, 70)
     assert large.read((10, 10, 20, 20), 2).shape == (3, 10, 10)
-
-
-def test_a_tiff_is_reduced_like_an_array(strips, tmp_path):
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)

@@ -199,7 +199,7 @@ def test_a_thumbnail_before_the_picture_is_not_the_picture(tmp_path):
         assert np.array_equal(fovea(tmp_path / name), want)
 
 
-def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
+def test_decoders_say_nothing_beside_our_words_and_what_nobody_would_turn_is_refused(tmp_path, caplog):
     tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8)[..., 0], extratags=[(42113, "s", 0, "none", True)])
     open_large(tmp_path / "a.tif")
     many = np.zeros((6, 8, 300), np.uint8)
@@ -209,10 +209,6 @@ def test_decoders_say_nothing_beside_our_words(tmp_path, caplog):
     (tmp_path / "c.tif").write_bytes(b"II*\0\x08\0\0\0")
     unusable("cannot be opened", open_large, tmp_path / "c.tif")
     assert not caplog.records
-
-
-def test_a_turned_tiff_that_pillow_does_not_read_is_refused(tmp_path):
-    """Nobody would turn it."""
     tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8), bigtiff=True, byteorder=">", extratags=[(274, "H", 1, 6, True)])
     unusable("not an image in a format that is read", open_large, tmp_path / "a.tif")
 

@@ -37,16 +37,13 @@ def test_coverage_equals_counts_on_a_pixel_grid(case):
     assert box_coverage(tensor, (width, height), "union") == pytest.approx((grid > 0).mean(), abs=1e-12)
 
 
-def test_a_target_that_covers_exactly_the_limit_is_legal():
+def test_a_target_that_covers_exactly_the_limit_is_legal_and_a_size_is_width_and_height():
     boxes = torch.tensor(
         [[0.0, 0.0, 128.0, 480.0], [0.0, 0.0, 129.0, 480.0]]
     )  # exactly 20 % of 640 x 480, and slightly more
     scene = Annotation(boxes, torch.tensor([2, 5]), torch.zeros(2, dtype=torch.bool), (640, 480))
     assert legal_targets(scene, 0.2) == [2]
     assert legal_targets(scene, None) == [2, 5]
-
-
-def test_size_is_width_and_height():
     assert Scene(1, "a", torch.zeros(3, 4, 6), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64)).size == (6, 4)
 
 

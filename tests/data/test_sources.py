@@ -84,14 +84,11 @@ def test_a_playlist_is_no_video(video, tmp_path, suffix):
     unusable("expected a video, got a playlist", open_stream, path)
 
 
-def test_streams_are_opened_by_their_address(video, serve):
+def test_streams_are_opened_by_their_address_and_refused_without_their_password(video, serve):
     place = serve(video.parent).removeprefix("http://")
     stream = open_stream(f"http://admin:secret@{place}/video.avi?key=secret")
     assert stream.name == f"http://{place}/video.avi"
     assert len(list(stream.frames)) == 8
-
-
-def test_addresses_that_cannot_be_opened_are_refused_without_their_passwords():
     with pytest.raises(DataError, match=r"rtsp://127.0.0.1:9/a: cannot be opened; check that address, user") as caught:
         open_stream("rtsp://admin:secret@127.0.0.1:9/a")
     assert "secret" not in str(caught.value)

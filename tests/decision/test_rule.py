@@ -47,19 +47,16 @@ class Guided(Known):
         return self.present / 10
 
 
-def test_thresholds_change_one_at_a_time():
-    assert AT.changed() == AT
-    assert AT.changed(0.0, None) == Thresholds(0.0, 0.1)
-    assert AT.changed(None, 0.0, 0.5) == Thresholds(0.8, 0.0, 0.5)
-
-
-def test_a_search_gives_up_by_the_chance_of_a_hit():
+def test_a_search_gives_up_by_the_chance_of_a_hit_and_thresholds_change_alone():
     """The probability of a cell given that no fixated cell holds the target."""
     stated = Known(torch.tensor([[0.7, 0.3, 0.2]]), torch.tensor([0.1]), torch.zeros(1, 3))
     visited = torch.tensor([[True, False, False]])
     assert int(decide(SimpleNamespace(belief=stated, visited=visited), 1, AT)) == 0
     guided = Guided(stated.present, stated.anywhere, stated.closest)
     assert int(decide(SimpleNamespace(belief=guided, visited=visited), 1, AT)) == 2
+    assert AT.changed() == AT
+    assert AT.changed(0.0, None) == Thresholds(0.0, 0.1)
+    assert AT.changed(None, 0.0, 0.5) == Thresholds(0.8, 0.0, 0.5)
 
 
 def test_presence_defaults_to_the_probability_of_the_most_probable_cell():

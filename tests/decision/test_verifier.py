@@ -135,23 +135,17 @@ def test_what_is_probable_enough_is_examined_even_if_not_fixated():
     assert judge.conclude().probability == pytest.approx(0.6)
 
 
-def test_when_the_shifts_are_spent_what_is_left_of_closer_looks_is_made():
+def test_as_many_closer_looks_as_are_allowed_are_made_also_when_the_shifts_are_spent():
     judge, closer = verifier({5: 0.6, 7: 0.75})
     last = step(0, {5: 0.5, 7: 0.4}, [5], 0.8, look(5, 7))
     assert int(judge(last)) == 0
     assert closer.cells == [5]
     assert judge.conclude().cell == 7
     assert closer.cells == [5, 7]
-
-
-def test_as_many_closer_looks_as_are_allowed():
     for most in (1, 2):
         judge, closer = verifier({5: 0.1, 7: 0.1, 2: 0.1}, most=most)
         assert int(judge(step(0, {5: 0.6, 7: 0.55, 2: 0.5}, [5, 7, 2], 0.9, look(5, 7, 2)))) > 1
         assert len(closer.cells) == most
-
-
-def test_a_wrong_setting_is_named():
     for most in (0, 101, 1.5):
         refused("most: expected a whole number", verifier, {}, most=most)
     refused("thresholds: expected", verifier, {}, thresholds=None)
@@ -285,9 +279,6 @@ def test_thresholds_can_be_changed_and_are_checked(image):
     for wrong in (-1, 101, 0.5):
         with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
             agent(Scripted(*script)).search(image, "red", closer=wrong)
-
-
-def test_given_boxes_end_a_search_without_closer_looks(image):
     script = [(cells(c11=0.9), 0.9)]
     boxes = [[130.0, 90, 150, 110]]
     assert agent(Scripted(*script)).search(image, "red", start=11, boxes=boxes).closer == ()

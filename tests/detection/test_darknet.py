@@ -285,7 +285,7 @@ def test_refuses_damaged_weights_with_an_error_of_one_line(small_cfg, write_weig
     assert "\n" not in str(caught.value)
 
 
-def test_refuses_what_cannot_be_read_or_has_an_unsuitable_size(small_cfg, tmp_path):
+def test_refuses_what_cannot_be_read_and_invalid_settings(small_cfg, tmp_path):
     for size in [(3, 32, 31), (3, 0, 32), (1, 32, 32)]:
         refused("image: expected", Darknet(read_cfg(small_cfg)), torch.zeros(1, *size))
     for text in ["width=3", "[net]\nwidth 3", "[net"]:
@@ -296,6 +296,14 @@ def test_refuses_what_cannot_be_read_or_has_an_unsuitable_size(small_cfg, tmp_pa
     unusable("expected a file of text", read_cfg, binary)
     with pytest.raises(DataError, match=r"missing\.weights': no such file"):
         Darknet(read_cfg(small_cfg)).read_weights(tmp_path / "missing.weights")
+    refused("raw: expected a multiple of 2 anchors", decode_yolo, torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
+    for options, message in [
+        ({"classes": ("cat",)}, "classes: expected 2 names, got 1"),
+        ({"input_size": (30, 32)}, "input_size: expected a multiple of 8"),
+        ({"input_size": (0, 32)}, "input_size: expected a multiple of 8"),
+        ({"stride": 6}, "stride: expected None or a multiple of 8"),
+    ]:
+        refused(message, YoloV3, Darknet(read_cfg(small_cfg)), **{"classes": ("cat", "dog")} | options)
 
 
 ANCHORS = [(10.0, 14.0), (23.0, 27.0)]
@@ -349,17 +357,6 @@ def test_proposals_of_all_heads_are_concatenated(make_small):
     second = decode_yolo(fine, [(4.0, 6.0)], (64, 32))
     torch.testing.assert_close(candidates.boxes, torch.cat([first.boxes, second.boxes], 1))
     torch.testing.assert_close(candidates.classes, torch.cat([first.classes, second.classes], 1))
-
-
-def test_refuses_invalid_settings_and_channels(small_cfg):
-    refused("raw: expected a multiple of 2 anchors", decode_yolo, torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
-    for options, message in [
-        ({"classes": ("cat",)}, "classes: expected 2 names, got 1"),
-        ({"input_size": (30, 32)}, "input_size: expected a multiple of 8"),
-        ({"input_size": (0, 32)}, "input_size: expected a multiple of 8"),
-        ({"stride": 6}, "stride: expected None or a multiple of 8"),
-    ]:
-        refused(message, YoloV3, Darknet(read_cfg(small_cfg)), **{"classes": ("cat", "dog")} | options)
 
 
 def test_settings_contain_runtime_digest_and_cfg(make_small, small_cfg):

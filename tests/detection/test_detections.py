@@ -47,12 +47,6 @@ def test_stack_pads_to_the_longest():
     torch.testing.assert_close(whole.scores[0, :2], parts[0].scores[0])
 
 
-def test_refuses_tensors_of_inconsistent_shapes():
-    refused(".", Detections, torch.zeros(1, 2, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2, dtype=torch.bool))
-    refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 3, 3), torch.zeros(1, 2, dtype=torch.bool))
-    refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 2, 3), torch.zeros(1, 2))
-
-
 def test_batches_are_indexed_by_image_and_may_be_empty():
     d = detections([2, 1, 3])
     assert d[1:].count.tolist() == [1, 3]
@@ -121,11 +115,6 @@ def test_compiles_to_a_single_graph():
     c = Candidates(torch.rand(5, 4), torch.rand(5, 3), torch.rand(5))
     compiled = torch.compile(score_vectors, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(c), score_vectors(c))
-
-
-def test_refuses_unsuitable_policies():
-    refused("'residual'", score_vectors, candidates([0.5]), "residul")
-    refused("expects a head with a background score", score_vectors, candidates([0.5]), "own")
 
 
 CLASSES = ("person", "cup", "tvmonitor")
@@ -262,7 +251,7 @@ def test_category_names_may_be_spelled_differently():
     assert category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "TVmonitor"]) == [1, 72]
 
 
-def test_inconsistent_arguments_are_refused_by_name():
+def test_inconsistent_arguments_are_refused_by_name(monkeypatch):
     two = Detections.stack([some(), some()])
     for call in (two.to_supervision, two.to_torchvision, lambda: two.to_coco(1, [1, 2, 3])):
         refused(r"one image, such as detections\[0\], got a batch of shape \(2,\)", call)
@@ -284,8 +273,10 @@ def test_inconsistent_arguments_are_refused_by_name():
     ):  # fmt: skip
         given = {"boxes": torch.zeros(1, 4), "labels": torch.tensor(labels), "scores": torch.tensor(scores)}
         refused(message, Detections.from_torchvision, given, 3)
-
-
-def test_to_supervision_without_the_package_names_the_remedy(monkeypatch):
+    refused(".", Detections, torch.zeros(1, 2, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2, dtype=torch.bool))
+    refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 3, 3), torch.zeros(1, 2, dtype=torch.bool))
+    refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 2, 3), torch.zeros(1, 2))
+    refused("'residual'", score_vectors, candidates([0.5]), "residul")
+    refused("expects a head with a background score", score_vectors, candidates([0.5]), "own")
     monkeypatch.setitem(sys.modules, "supervision", None)
     refused("pip install supervision", some().to_supervision)

@@ -33,9 +33,6 @@ def test_landmarks_of_a_pyramid():
     assert landmarks(steps) == {
         "backbone8": "c8", "backbone16": "c16", "backbone32": "c32", "head16": "p16", "head32": "h32"
     }  # fmt: skip
-
-
-def test_landmarks_without_maps():
     assert landmarks([]) == {}
     assert landmarks([step("numbers", None, "image")]) == {}
 

@@ -71,7 +71,7 @@ def test_what_newcomers_name_is_refused_with_the_remedy(name, said):
         load_detector("yolov3-tiny", device="gpu")
 
 
-def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_path):
+def test_missing_and_unsuitable_files_names_and_modules_are_refused(small_cfg, small_weights, tmp_path):
     refused(r"expected a cfg and its weights", load_detector, "x.weights")
     refused("weights: expected the path", load_detector, small_cfg)
     unusable(r"missing.cfg: no such file", load_detector, tmp_path / "missing.cfg", weights="x")
@@ -79,6 +79,9 @@ def test_missing_and_unsuitable_files_are_refused(small_cfg, small_weights, tmp_
     refused("classes: expected 2 names, got 80", load_detector, small_cfg, weights=small_weights, stride=None)
     with pytest.raises(DataError, match=r"missing\.names: no such file"):
         load_detector(small_cfg, weights=small_weights, classes=tmp_path / "missing.names")
+    for name in ["yolov3-tinny", "nothing"]:
+        refused(f"unknown detector '{name}'; .*yolov3-tiny", load_detector, name)
+    refused(r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear", load_detector, nn.Linear(1, 1))
 
 
 def test_coco_classes_equal_those_of_the_annotations(shared):
@@ -126,15 +129,12 @@ def test_one_thread_is_reproducible_and_two_threads_agree_with_it(tiny_weights, 
     torch.testing.assert_close(two.classes, one.classes, atol=1e-5, rtol=1e-4)
 
 
-def test_a_detector_is_returned_as_it_is(small_cfg, small_weights):
+def test_a_detector_is_returned_as_it_is_and_names_have_any_case(small_cfg, small_weights):
     detector = load_detector(small_cfg, weights=small_weights, classes=["cat", "dog"])
     assert load_detector(detector) is detector
     assert ActivePerception.raw(detector).eye.detector is detector
     with pytest.raises(InputError, match="options: expected none for a detector that is made already, got threshold"):
         load_detector(detector, threshold=0.1)
-
-
-def test_names_are_the_same_in_upper_and_lower_case():
     assert _detector_name("YOLOv3-Tiny") == "yolov3-tiny"
     assert _detector_name("Torchvision:FCOS_resnet50_fpn") == "torchvision:fcos_resnet50_fpn"
     assert _detector_name("HF:Owner/Name") == "hf:Owner/Name"
@@ -197,9 +197,3 @@ def test_networks_of_ultralytics(cells):
     assert load_detector(cells).digest == detector.digest
     with pytest.raises(InputError, match=r"all class scores of each box, \(B, 7, N\), got \(1, 6, 400\)"):
         load_detector(cells, classes=["red", "green", "blue"])(torch.rand(1, 3, 64, 64))
-
-
-def test_unknown_names_and_modules_are_refused_with_the_known_ones():
-    for name in ["yolov3-tinny", "nothing"]:
-        refused(f"unknown detector '{name}'; .*yolov3-tiny", load_detector, name)
-    refused(r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear", load_detector, nn.Linear(1, 1))

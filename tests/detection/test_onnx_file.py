@@ -199,15 +199,12 @@ def test_sizes_metadata_and_threads(make_onnx):
     refused("threads", OnnxSession, path, threads=0)
 
 
-def test_threads_do_not_spin_unless_asked(make_onnx):
+def test_threads_do_not_spin_unless_asked_and_sessions_are_copied(make_onnx):
     path = make_onnx({"a": values(1, 5, 4)})
     entry = "session.intra_op.allow_spinning"
     for spinning in (False, True):
         options = OnnxSession(path, spinning=spinning)._session.get_session_options()
         assert options.get_session_config_entry(entry) == str(int(spinning))
-
-
-def test_sessions_can_be_pickled_and_copied(make_onnx):
     session = OnnxSession(make_onnx({"a": values(1, 5, 4)}), threads=1)
     for twin in (pickle.loads(pickle.dumps(session)), copy.deepcopy(session)):
         assert twin.threads == 1

@@ -105,12 +105,6 @@ def test_decoders_are_differentiable_and_compile():
     torch.testing.assert_close(compiled(raw), decode("yolox", (64, 64), raw).boxes)
 
 
-def test_wrong_shapes_are_refused_by_name():
-    refused("84 rows, one for each cell of a 64 x 64 canvas", decode, "yolox", (64, 64), noise(1, 83, 8))
-    refused("bins", heads._decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
-    refused("boxes", heads._decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
-
-
 def signature(*outputs, canvas=(640, 640), image="images", producer="pytorch", classes=None, **metadata):
     named = tuple(o if isinstance(o[0], str) else (f"output{i}", o) for i, o in enumerate(outputs))
     return Signature(image, named, canvas, producer, classes, metadata)
@@ -187,6 +181,9 @@ def test_models_without_score_vectors_or_of_other_tasks_are_refused():
     for task in ["segment", "pose", "obb", "classify"]:
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
             signature((1, 116, 8400), classes=80, task=task).head()
+    refused("84 rows, one for each cell of a 64 x 64 canvas", decode, "yolox", (64, 64), noise(1, 83, 8))
+    refused("bins", heads._decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
+    refused("boxes", heads._decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
 
 def test_places_of_a_pass_tell_heads_of_one_shape_apart():
@@ -232,8 +229,5 @@ def test_corners_that_were_read_as_centres_and_sizes_are_told():
     rows = torch.cat([low, low + size, noise(1, 84, 3).sigmoid()], -1)
     assert heads.misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
     assert "corners" in heads.misplaced(heads.decode_yolov8(rows.mT).boxes, (64, 64))
-
-
-def test_few_boxes_as_centres_and_sizes_are_told():
     assert "comes first" in heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
     assert heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None

@@ -155,14 +155,11 @@ def test_resize_equals_bilinear_opencv_down_to_half_the_size_and_pillow_below():
         np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
 
 
-def test_resize_to_the_same_size_returns_a_copy():
+def test_resize_to_the_same_size_is_a_copy_and_letterbox_is_differentiable():
     image = torch.rand(1, 3, 8, 8)
     canvas = resize(image, (8, 8))
     canvas.zero_()
     assert image.any()
-
-
-def test_letterbox_is_differentiable():
     image = torch.rand(1, 1, 5, 7, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
 

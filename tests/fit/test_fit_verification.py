@@ -90,9 +90,6 @@ def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without(
     assert distances == sorted(distances)
     assert distances[0] < 0.3
     assert distances[-1] > 0.85
-
-
-def test_a_single_closer_look_is_not_enough():
     known = examined(4)
     with pytest.raises(DataError, match=r"expected closer looks in all folds but one, got 1; give more photographs"):
         fit(known, known.fold == 0, shipped_mean())

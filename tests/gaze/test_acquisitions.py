@@ -152,12 +152,6 @@ def test_a_belief_without_a_batch_gives_the_values_of_its_episode(name):
     torch.testing.assert_close(function(beliefs()[1], visits()[1]), function(beliefs(), visits())[1])
 
 
-def test_targets_and_widths_out_of_range_are_refused():
-    for target in [-1, 4]:
-        refused("target", acquisition.TargetPosterior(target), beliefs(), visits())
-    refused(r"^sigma:", acquisition.NeighbourhoodPosterior, 3, model(), small.GRID, sigma=0.0)
-
-
 GRID = Grid(4, 3, (80, 60))
 
 
@@ -244,10 +238,6 @@ def test_a_closer_look_equals_the_loop(belief):
             assert float(got[episode, f]) == pytest.approx(total, rel=1e-5, abs=1e-6)
 
 
-def test_a_fovea_of_zero_width_is_refused():
-    refused("fovea", CloserLook, GRID, 0.0)
-
-
 BELIEF = DirichletBelief(0.3 + 4 * draw(3, 12, 5) ** 2)
 NOWHERE = torch.zeros(3, 12, dtype=torch.bool)
 SALIENCY = draw(3, 12, seed=1) ** 3
@@ -292,13 +282,7 @@ def test_uniform_saliency_changes_nothing(name, level):
     torch.testing.assert_close(guided - guided.mean(-1, keepdim=True), plain.log() - plain.log().mean(-1, keepdim=True))
 
 
-def test_one_saliency_map_applies_to_all_episodes():
-    one = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1], weight=0.3))
-    each = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1].expand(3, 12), weight=0.3))
-    assert torch.equal(one, each)
-
-
-def test_cells_whose_value_is_not_positive_come_last():
+def test_one_saliency_map_applies_to_all_episodes_and_cells_without_value_come_last():
     """Such a value has no logarithm: it counts as a very small positive one, and gives no NaN."""
     worth = torch.tensor([0.5, 0.0, -3.0, 1e-9])
     guided = SaliencyPrior(Static(worth), torch.tensor([0.0, 1.0, 1.0, 1.0]), weight=0.3)
@@ -306,6 +290,9 @@ def test_cells_whose_value_is_not_positive_come_last():
     assert bool(got.isfinite().all())
     assert got.argsort(-1, descending=True)[0, :2].tolist() == [0, 3]
     assert got[0, 1] == got[0, 2]
+    one = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1], weight=0.3))
+    each = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1].expand(3, 12), weight=0.3))
+    assert torch.equal(one, each)
 
 
 def test_bad_arguments():
@@ -314,6 +301,10 @@ def test_bad_arguments():
     with pytest.raises(InputError, match="saliency: expected numbers of 0 or more"):
         SaliencyPrior(TargetPosterior(2), SALIENCY * math.nan, weight=0.3)
     refused("saliency", values, SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
+    refused("fovea", CloserLook, GRID, 0.0)
+    for target in [-1, 4]:
+        refused("target", acquisition.TargetPosterior(target), beliefs(), visits())
+    refused(r"^sigma:", acquisition.NeighbourhoodPosterior, 3, model(), small.GRID, sigma=0.0)
 
 
 def test_visited_cells_are_passed_to_the_acquisition():

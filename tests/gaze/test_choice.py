@@ -110,9 +110,6 @@ def test_ties_are_not_broken_by_rounding_negative_values_or_infinities():
     values = torch.tensor([[-3.0, -2.0, -float("inf")]])
     noise = torch.tensor([[0.9, 0.2, 0.95]])
     assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [1]
-
-
-def test_selection_compiles_to_one_graph():
     values, noise = torch.rand(4, 9), torch.rand(4, 9)
     visited = torch.rand(4, 9) < 0.5
     compiled = torch.compile(select_fixation, fullgraph=True, backend="eager")
@@ -169,13 +166,23 @@ def test_soft_fixations_at_low_temperature_are_cell_centres(visited):
     torch.testing.assert_close(soft, centres[cell])
 
 
-def test_wrong_arguments_of_choices_are_refused():
+def test_wrong_arguments_of_choices_and_policies_are_refused(model):
     refused("inverse_temperature", Softmax, lambda *_: torch.zeros(1, 9), -1.0)
     refused("NaN", select_fixation, torch.tensor([[float("nan")]]), torch.tensor([[False]]), torch.rand(1, 1))
     refused("visited", select_fixation, torch.zeros(1, 3), torch.zeros(1, 2, dtype=torch.bool), torch.rand(1, 3))
     zeros = torch.zeros(1, 3)
     refused("temperature", soft_fixation, zeros, zeros > 0, torch.zeros(3, 2), zeros, temperature=0.0)
     refused("centres", soft_fixation, zeros, zeros > 0, torch.zeros(4, 2), zeros)
+    own = {"name": "own", "tasks": ("search",), "__init__": lambda self, *values: None}
+    with pytest.raises(InputError, match=r"^__init__: expected arguments that can be given by name, got Own\(\*v"):
+        type("Own", (AcquisitionFunction,), own)
+    assert "own" not in FUNCTIONS
+    refused("^function", Policy, nn.Linear, model)
+    refused("^unknown policy", Policy, 3, model)
+    refused("^samples", Policy, "kl", model, samples=True)
+    refused("unknown task 'find'; known: search, exploration", policy_names, "find")
+    for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:
+        refused(f"did you mean '{meant}'", Policy, name)
 
 
 SCENE = Grid(4, 3, (80, 60))
@@ -318,31 +325,12 @@ def test_settings_of_names_that_a_policy_has_are_refused(name):
         Policy(type("Own", (acquisition.Uniform,), {"__signature__": takes}))
 
 
-def test_arguments_without_names_are_refused():
-    own = {"name": "own", "tasks": ("search",), "__init__": lambda self, *values: None}
-    with pytest.raises(InputError, match=r"^__init__: expected arguments that can be given by name, got Own\(\*v"):
-        type("Own", (AcquisitionFunction,), own)
-    assert "own" not in FUNCTIONS
-
-
 @pytest.mark.parametrize(("name", "tasks"), [("kl", ("search",)), ("own", "search"), ("own", ("searching",))])
 def test_a_name_that_is_taken_and_other_tasks_are_refused(name, tasks):
     with pytest.raises(InputError, match=r"^name: expected one not taken|^tasks: expected a tuple"):
         type("Own", (AcquisitionFunction,), {"name": name, "tasks": tasks})
     assert "own" not in FUNCTIONS
     assert FUNCTIONS["kl"] is acquisition.KLDivergence
-
-
-def test_what_is_no_function_and_other_numbers_of_samples_are_refused(model):
-    refused("^function", Policy, nn.Linear, model)
-    refused("^unknown policy", Policy, 3, model)
-    refused("^samples", Policy, "kl", model, samples=True)
-
-
-def test_other_names_are_refused_with_a_suggestion():
-    refused("unknown task 'find'; known: search, exploration", policy_names, "find")
-    for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:
-        refused(f"did you mean '{meant}'", Policy, name)
 
 
 SIZE = (60, 80)

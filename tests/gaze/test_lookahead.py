@@ -94,16 +94,12 @@ def test_gain_is_summed_over_all_cells(model, dtype, device):
     assert bool((got[~visited] != 0).all())
 
 
-def test_other_beliefs_are_refused(model):
+def test_other_beliefs_are_refused_but_closer_look_takes_a_learned_map(model):
     acquisition, visited = ExpectedGain(model, GRID), torch.zeros(1, 20, dtype=torch.bool)
     like = torch.empty(0)
     for observer in (Semantic(4), Target(TargetEvidence(4, 4, components=4))):
         belief = observer.start(1, GRID, like)
         refused(f"belief: expected MapBelief, got {type(belief).__name__}", acquisition, belief, visited)
-
-
-def test_closer_look_accepts_a_learned_map(model):
-    """Only the shares of the objects count, so a Dirichlet belief with these shares has the same values."""
     belief, visited = belief_of(model)
     shares = DirichletBelief(belief.probabilities, belief.closest)
     torch.testing.assert_close(CloserLook(GRID, 0.2)(belief, visited), CloserLook(GRID, 0.2)(shares, visited))
@@ -341,13 +337,6 @@ def test_looks_are_drawn_from_the_dirichlets_by_a_seed():
     assert not torch.equal(calibrated, sampled_likelihoods(model, 9, seed=1))
 
 
-def test_models_of_the_posterior_and_no_samples_are_refused():
-    with pytest.raises(InputError, match="model: expected an observation model whose Dirichlets are densities"):
-        sampled_likelihoods(two_classes(expected=torch.full((2, 2, 2), 0.5, dtype=torch.float64)), 4)
-    refused("samples: expected a whole number from 1 to 65,536, got 0", policies.Policy, "kl", two_classes(), samples=0)
-    refused("likelihoods", look_ahead_by_samples, torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)
-
-
 def test_policies_take_the_expectation_by_their_settings():
     model = four_classes()
     for name, kind in acquisition.FUNCTIONS.items():
@@ -437,3 +426,7 @@ def test_bad_arguments(observation):
     refused("prior", KLDivergence, observation, grid, prior=0.0)
     refused("kappa", UpperConfidenceBound, observation, grid, kappa=-1.0)
     refused("margin", ProbabilityOfImprovement, observation, grid, margin=1.0)
+    with pytest.raises(InputError, match="model: expected an observation model whose Dirichlets are densities"):
+        sampled_likelihoods(two_classes(expected=torch.full((2, 2, 2), 0.5, dtype=torch.float64)), 4)
+    refused("samples: expected a whole number from 1 to 65,536, got 0", policies.Policy, "kl", two_classes(), samples=0)
+    refused("likelihoods", look_ahead_by_samples, torch.ones(3, 5), sampled_likelihoods(two_classes(), 4), UNSEEN)

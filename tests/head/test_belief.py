@@ -230,12 +230,6 @@ def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
     assert hits > 20
 
 
-def test_one_episode_at_a_time(views, models):
-    observer = SceneObserver(Target(models[0]), views)
-    refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
-    refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)
-
-
 @pytest.fixture(params=["panorama", "flat"])
 def world(request):
     torch.manual_seed(0)
@@ -357,11 +351,14 @@ def test_durations_equal_brute_force(world):
     assert float(durations[here]) == pytest.approx(speeds.look)
 
 
-def test_windows_beyond_a_picture_are_refused():
+def test_windows_beyond_a_picture_and_several_episodes_are_refused(views, models):
     flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
     refused("pose: expected a window inside 64 × 48 pixels", flat.look_at, (-16.0, 0.0), 20.0)
     refused("field: expected a window inside the picture", flat.poses, 60.0)
     refused("fields: expected", Views, flat, (30.0, 20.0))
+    observer = SceneObserver(Target(models[0]), views)
+    refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
+    refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)
 
 
 CLASSES = ("person", "cat", "cup")

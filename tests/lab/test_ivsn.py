@@ -198,10 +198,6 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
-def test_a_detector_without_access_to_its_features_is_refused():
-    refused(r"access to its features.*fixed", Fixed().head_input, torch.zeros(1, 3, 32, 32))
-
-
 @pytest.fixture(scope="module")
 def ivsn():
     with torch.random.fork_rng():
@@ -270,3 +266,4 @@ def test_invalid_arguments_are_refused():
     refused("image", identity, image[:, :2], target)
     refused("target", identity, image, target.expand(2, -1, -1, -1))
     refused("target's features", IVSN(nn.Identity(), nn.Identity(), picture=8, target=2), image, target)
+    refused(r"access to its features.*fixed", Fixed().head_input, torch.zeros(1, 3, 32, 32))

@@ -64,8 +64,5 @@ def test_whole_photographs_keep_all_their_objects():
         assert len(told.boxes) == 3 * len(cutouts)
         assert len({cutout.scene for cutout in cutouts}) == len(cutouts)
         assert {cutout.part for cutout in cutouts} <= {(0, 0, 200, 150)}
-
-
-def test_settings_out_of_range_are_refused():
     for wrong in ({"size": (8, 8)}, {"sides": (40, 24)}, {"most": 0}, {"count": 0}):
         refused(next(iter(wrong)), make, **wrong)

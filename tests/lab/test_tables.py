@@ -126,9 +126,6 @@ def test_csv_has_a_row_for_every_gaze_shift():
     assert [int(row["shifts"]) for row in rows] == [0, 1, 2]
     for row, shift in zip(rows, range(3), strict=True):
         assert float(row["error_over_repetitions"]) == pytest.approx(standard_error(found_by(shift)[1]), abs=1e-6)
-
-
-def test_one_repetition_has_no_error_over_repetitions():
     curve = curve_of([r for r in explorations() if r["repetition"] == 0], lambda r: np.asarray(r["right"]) / 4)
     assert np.isnan(curve.over_repetitions).all()
     assert curve.over_images == pytest.approx([0.125] * 3)

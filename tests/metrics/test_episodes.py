@@ -131,13 +131,6 @@ def test_hits_equal_trying_every_threshold(hits, misses, share):
     assert hits_at(*cases(hits, misses), share) == pytest.approx(expected, abs=1e-12)
 
 
-def test_cases_of_both_kinds_are_needed():
-    for present in [[True, True], [False, False], []]:
-        with pytest.raises(InputError, match="present: expected both true and false values"):
-            area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
-    refused("absent: expected at least one case", _threshold_for, torch.zeros(0), 0.1)
-
-
 def test_hits_lie_above_the_false_alarms():
     # The threshold is the next double above the absent case, so an equal score does not reach it.
     score = torch.tensor([0.3, 0.3, 0.30000004])
@@ -147,6 +140,10 @@ def test_hits_lie_above_the_false_alarms():
     score = torch.tensor([0.5, 0.7, 0.1], dtype=torch.float64)
     assert _threshold_for(score, 1.0) == -math.inf
     assert hits_at(score, torch.tensor([False, True, True]), 1.0) == 1
+    for present in [[True, True], [False, False], []]:
+        with pytest.raises(InputError, match="present: expected both true and false values"):
+            area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
+    refused("absent: expected at least one case", _threshold_for, torch.zeros(0), 0.1)
 
 
 def ece_by_loop(confidence, correct, bins):

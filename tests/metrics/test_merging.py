@@ -43,9 +43,6 @@ def test_reliability_is_that_of_the_whole_sample(cases):
         assert float(value) == pytest.approx(getattr(whole, name), rel=1e-6)
     brier = float((score - outcome.float()).square().mean())
     assert float(found["brier"]) == pytest.approx(brier, rel=1e-5)
-
-
-def test_one_kind_of_cases_has_no_area():
     area = AreaUnderRoc()
     area.update(torch.tensor([0.5]), torch.tensor([True]))
     refused("both true and false", area.compute)

@@ -169,8 +169,5 @@ def test_visibility_is_zero_where_nothing_is_ever_detected():
     assert torch.equal(seen[:, 2], torch.zeros(4, dtype=torch.float64))
     assert torch.equal(seen[0], torch.zeros(3, dtype=torch.float64))
     assert bool((seen[1:, :2] > 0).all())
-
-
-def test_a_model_without_miss_rates_is_refused():
     with pytest.raises(InputError, match="model: expected an observation model with miss rates"):
         visibility(FovealObservationModel.identity(["a"], [0.1]))

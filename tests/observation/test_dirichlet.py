@@ -40,14 +40,7 @@ def test_divergence_is_not_negative_and_zero_between_equal_distributions(alpha, 
     assert float(dirichlet.kl_divergence(alpha, alpha)) == 0
 
 
-def test_moments_match_scipy():
-    alpha = torch.tensor([0.4, 2.0, 7.5, 1.1], dtype=torch.float64)
-    reference = scipy.stats.dirichlet(alpha.numpy())
-    np.testing.assert_allclose(dirichlet.mean(alpha), reference.mean(), rtol=1e-14)
-    np.testing.assert_allclose(dirichlet.covariance(alpha), reference.cov(), rtol=1e-12)
-
-
-def test_mean_matches_the_compound_multinomial_of_equation_4():
+def test_moments_match_scipy_and_the_mean_the_compound_multinomial_of_equation_4():
     """eq:finalsemanticmap, as printed, for one draw of class k: n_k = 1 and all other n_i = 0."""
     beta = [0.5, 2.0, 7.5, 1.1]
     for k, got in enumerate(dirichlet.mean(torch.tensor(beta, dtype=torch.float64)).tolist()):
@@ -56,6 +49,10 @@ def test_mean_matches_the_compound_multinomial_of_equation_4():
         printed = math.factorial(n) / sum(beta) ** n
         printed *= math.prod(b**m / math.factorial(m) for b, m in zip(beta, drawn, strict=True))
         assert got == pytest.approx(printed, rel=1e-14)
+    alpha = torch.tensor([0.4, 2.0, 7.5, 1.1], dtype=torch.float64)
+    reference = scipy.stats.dirichlet(alpha.numpy())
+    np.testing.assert_allclose(dirichlet.mean(alpha), reference.mean(), rtol=1e-14)
+    np.testing.assert_allclose(dirichlet.covariance(alpha), reference.cov(), rtol=1e-12)
 
 
 def test_covariance_of_the_class_matches_equation_6():

@@ -79,7 +79,7 @@ def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
 
 
-def test_extreme_scores_neither_overflow_nor_vanish():
+def test_extreme_scores_neither_overflow_nor_vanish_and_identity_returns_them(dtype):
     alpha = torch.full((4, 3, 4), 0.2)
     alpha += 500 * torch.eye(4)[:, None]
     model = FovealObservationModel(alpha, EDGES, CLASSES)
@@ -88,9 +88,6 @@ def test_extreme_scores_neither_overflow_nor_vanish():
     assert bool(got.isfinite().all())
     torch.testing.assert_close(got.sum(-1), torch.ones(3))
     assert got[0].argmax() == 1
-
-
-def test_identity_returns_the_scores(dtype):
     model = FovealObservationModel.identity(CLASSES, EDGES).to(dtype)
     scores, distance = looks(dtype=dtype)
     torch.testing.assert_close(model.calibrate(scores, distance), dirichlet.floor(scores, 1e-6))

@@ -37,15 +37,11 @@ def test_match_equals_a_loop():
         assert match(boxes, truth, labels, iou=0.3).tolist() == expected
 
 
-def test_boxes_without_area_and_empty_lists_match_nothing():
+def test_an_overlap_of_one_half_is_a_match_and_boxes_without_area_match_nothing():
     flat = torch.tensor([[3.0, 3, 3, 9]])
     assert box_iou(flat, flat).tolist() == [[0.0]]
     assert match(torch.zeros(0, 4), some_boxes(3, 0), torch.tensor([1, 2, 3])).tolist() == []
     assert match(some_boxes(2, 0), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)).tolist() == [0, 0]
-
-
-def test_an_overlap_of_one_half_is_a_match():
-    """The boxes cover two thirds of the first object's 6 px², and half of the second object's 8 px²."""
     truth = torch.tensor([[0.0, 0, 3, 2], [10, 0, 14, 2]])
     boxes = torch.tensor([[0.0, 0, 2, 2], [10, 0, 12, 2], [10, 0, 11.9, 2]])
     assert match(boxes, truth, torch.tensor([4, 9])).tolist() == [4, 9, 0]

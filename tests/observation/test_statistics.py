@@ -68,23 +68,17 @@ def test_statistics_do_not_depend_on_the_order_or_split_of_samples(seed, shards,
     assert parts[0] == whole
 
 
-def test_a_sum_over_cells_equals_pooled_statistics():
-    scores, labels, levels = samples(200)
-    pooled = gather(scores, labels, levels).sum(1)
-    assert pooled == DirichletStatistics((3,), 5).update(scores, labels)
-    assert gather(scores, labels, levels).sum(-2) == DirichletStatistics((2,), 5).update(scores, levels)
-
-
-def test_merging_does_not_change_the_other_table():
+def test_sums_of_tables_are_pooled_and_cells_without_samples_have_no_mean():
     one, two = (gather(*samples(20, seed=seed)) for seed in (0, 1))
     before = gather(*samples(20, seed=1))
     one.merge(two)
     assert two == before
     assert one != two
     assert int(one.count.sum()) == 40
-
-
-def test_cells_without_samples_have_no_mean():
+    scores, labels, levels = samples(200)
+    pooled = gather(scores, labels, levels).sum(1)
+    assert pooled == DirichletStatistics((3,), 5).update(scores, labels)
+    assert gather(scores, labels, levels).sum(-2) == DirichletStatistics((2,), 5).update(scores, levels)
     empty = DirichletStatistics((2,), 3).update(torch.empty(0, 3), torch.empty(0, dtype=torch.int64))
     assert int(empty.count.sum()) == 0
     for mean in (empty.mean_log, empty.mean, empty.variance):

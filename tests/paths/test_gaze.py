@@ -91,20 +91,17 @@ def test_scanpaths_last_as_long_as_people_view(gaze):
     assert len(gaze.scanpaths(3, seconds=0.1)) == 3
 
 
-def test_the_seed_repeats_scanpaths(gaze):
-    again = gaze.scanpaths(4, seed=1), gaze.scanpaths(4, seed=1)
-    assert all(np.array_equal(a.points, b.points) for a, b in zip(*again, strict=True))
-    other = gaze.scanpaths(4, seed=2)
-    assert not all(np.array_equal(a.points, b.points) for a, b in zip(again[0], other, strict=True))
-
-
-def test_the_next_fixation_of_viewers_is_the_mean_of_their_densities(gaze):
+def test_the_seed_repeats_scanpaths_whose_next_fixation_has_the_mean_of_the_densities(gaze):
     paths = gaze.scanpaths(5, seed=3)
     mean = gaze.given(paths, 2)
     each = torch.stack([gaze.given([path], 2) for path in paths if len(path) >= 2])
     torch.testing.assert_close(mean, each.mean(0))
     assert float(mean.sum()) == pytest.approx(1, abs=1e-5)
     torch.testing.assert_close(gaze.given(paths, 90), gaze.cells)
+    again = gaze.scanpaths(4, seed=1), gaze.scanpaths(4, seed=1)
+    assert all(np.array_equal(a.points, b.points) for a, b in zip(*again, strict=True))
+    other = gaze.scanpaths(4, seed=2)
+    assert not all(np.array_equal(a.points, b.points) for a, b in zip(again[0], other, strict=True))
 
 
 def test_the_next_density_is_over_the_pixels(gaze):
@@ -215,9 +212,6 @@ def test_what_cannot_be_drawn_or_compared_is_refused(gaze):
         refused(r"^people: expected a list of Fixations, one for each person, got ", gaze.compare, wrong)
     only = Fixations("a.png", "1", np.array([[5.0, 5.0]]), (104, 78))
     refused("after the first of each person", gaze.compare, [only])
-
-
-def test_words(gaze):
     assert "entropy" in gaze.describe()
     assert repr(gaze).count("\n") == len(gaze.peaks())
     assert gaze.plot() is not None

@@ -29,15 +29,12 @@ def test_invalid_images_are_refused_by_the_detector_and_the_eye(agent, image):
         refused(r"^images: expected RGB in \[0, 1\]", look)
 
 
-def test_rounding_errors_just_above_one_are_accepted(agent):
-    agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
-
-
-def test_invalid_selections_and_strides_are_refused():
+def test_invalid_selections_and_strides_are_refused(agent):
     for wrong in [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}]:
         refused(f"^{next(iter(wrong))}: expected a (whole )?number from 0 to ", Selection, **wrong)
     for stride in ["auto", 0, -32, 1.5, True]:
         refused(r"^stride: expected a whole number from 1", small.Fixed, stride=stride)
+    agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
 
 
 def test_unused_settings_are_no_options_and_are_not_written(capsys):

@@ -154,23 +154,17 @@ def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
     changed = strategy(own, belief=run, observation=model).observer
     settings = changed.prior, changed.fusion, changed.footprint, changed.tempering, changed.memory, changed.misses
     assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
-
-
-def test_policies_use_the_prior_and_the_fovea_of_the_run(model):
     explorer = strategy("kl-raw", "exploration", BeliefConfig(prior=0.25), observation=model)
     assert explorer.policy(None, GRID).prior == explorer.observer.prior == 0.25
     assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
 
 
-def test_target_evidence_brings_its_own_belief():
+def test_target_evidence_brings_its_own_belief_and_saliency_keeps_that_of_the_run(model):
     evidence = TargetEvidence(4, 4)
     sought = strategy("target-evidence", evidence=evidence)
     assert isinstance(sought.observer, observers.Target)
     assert sought.observer.model is evidence
     assert sought.policy.name == "non-predictive"
-
-
-def test_saliency_alone_keeps_the_belief_of_the_run(model):
     made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
     assert made.policy.name == "saliency"
     assert made.observer.observation is model

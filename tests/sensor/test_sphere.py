@@ -279,13 +279,7 @@ def test_padding_beyond_the_border_equals_that_of_kornia(padding):
     torch.testing.assert_close(glimpse(image, box, (70, 60), padding_mode=padding), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_the_fill_value_is_used_beyond_the_border():
-    view = glimpse(picture(), torch.tensor([[-200.0, -200, -100, -100]]).double(), (8, 8), padding_mode="fill",
-                   fill_value=0.4)  # fmt: skip
-    torch.testing.assert_close(view, torch.full_like(view, 0.4))
-
-
-def test_many_windows_equal_a_loop_over_windows():
+def test_many_windows_equal_a_loop_and_the_fill_value_is_used_beyond_the_border():
     image = torch.cat([picture(seed=1), picture(seed=2)])
     boxes = torch.tensor([[[0.0, 0, 30, 20], [5, 5, 50, 40], [-9, 3, 12, 70]]] * 2).double()
     boxes[1] += 1.5
@@ -294,6 +288,9 @@ def test_many_windows_equal_a_loop_over_windows():
     for b in range(2):
         for g in range(3):
             torch.testing.assert_close(together[b, g], glimpse(image[b : b + 1], boxes[b, g][None], (16, 12))[0])
+    view = glimpse(picture(), torch.tensor([[-200.0, -200, -100, -100]]).double(), (8, 8), padding_mode="fill",
+                   fill_value=0.4)  # fmt: skip
+    torch.testing.assert_close(view, torch.full_like(view, 0.4))
 
 
 def test_gradients_in_image_position_and_magnification():

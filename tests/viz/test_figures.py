@@ -148,13 +148,6 @@ def test_the_best_place_of_an_undecided_search_is_told_apart_from_other_closer_l
     assert not [box for box in early.patches if box.get_linestyle() == "--"]
 
 
-def test_belief_refuses_unknown_fixations_and_targets(scanpath):
-    for arguments, named in [((3,), "fixation"), ((-4,), "fixation")]:
-        refused(named, plot_belief, scanpath, *arguments)
-    for path, target in ((scanpath, 3), (replace(scanpath, target=None), None)):
-        refused("target", plot_belief, path, target=target)
-
-
 def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
     searched = replace(scanpath, posterior=torch.rand(3, 12))
     shown = np.asarray(draw(plot_belief(searched)).axes[0].images[0].get_array())
@@ -162,6 +155,10 @@ def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
     other = np.asarray(draw(plot_belief(searched, target=1)).axes[0].images[0].get_array())
     belief = scanpath.probabilities[-1]
     np.testing.assert_allclose(other, (belief[:, 1]).reshape(3, 4), rtol=1e-6)
+    for arguments, named in [((3,), "fixation"), ((-4,), "fixation")]:
+        refused(named, plot_belief, scanpath, *arguments)
+    for path, target in ((scanpath, 3), (replace(scanpath, target=None), None)):
+        refused("target", plot_belief, path, target=target)
 
 
 def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):

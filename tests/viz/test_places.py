@@ -93,7 +93,7 @@ def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):
     assert len(page.images) == 1  # only the photograph is a pixel image
 
 
-def test_an_svg_contains_its_text_as_outlines(scanpath, tmp_path):
+def test_an_svg_contains_its_text_as_outlines_and_a_png_has_its_resolution(scanpath, tmp_path):
     figure = viz.plot_curves(CURVES, label="targets found (%)")
     root = ET.parse(viz.save_figure(figure, tmp_path / "a.svg")).getroot()
     tags = [element.tag.rpartition("}")[2] for element in root.iter()]
@@ -102,9 +102,6 @@ def test_an_svg_contains_its_text_as_outlines(scanpath, tmp_path):
     assert "text" not in tags
     text = (tmp_path / "a.svg").read_text(encoding="utf-8")
     assert "targets found (%)" in re.sub(r"<!-- (.*?) -->", r"\1", text)
-
-
-def test_a_png_has_the_requested_resolution(tmp_path):
     figure = viz.plot_curves(CURVES, label="targets found (%)")
     with Image.open(viz.save_figure(figure, tmp_path / "a.png", dpi=50)) as picture:
         assert picture.size == (310, 200)

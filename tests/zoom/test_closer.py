@@ -454,12 +454,6 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert made[0] == made[1] > max(path.passes, 3)
 
 
-def test_closer_looks_can_be_left_out(detector, photograph):
-    path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", closer=0)
-    assert path.passes == 1
-    assert not path.closer
-
-
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
     path = agent.search(photograph, "red")
@@ -471,6 +465,9 @@ def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph
     assert moment.decision.probability == pytest.approx(path.decision.probability, abs=1e-9)
     assert torch.equal(moment.decision.box, path.decision.box)
     assert [look.box.tolist() for look in moment.closer] == [look.box.tolist() for look in path.closer]
+    path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", closer=0)
+    assert path.passes == 1
+    assert not path.closer
 
 
 def test_all_objects_of_a_photograph_are_those_of_the_whole_and_of_slices(detector, photograph):

@@ -75,9 +75,6 @@ def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, p
     background = nothing.look(nothing.open(picture), fixation)
     assert float(background.confidence[seen.cut].max()) == 0
     torch.testing.assert_close(background.boxes, seen.detections.boxes)
-
-
-def test_boxes_at_the_border_of_the_picture_do_not_count_as_cut(detector):
     image = torch.zeros(3, 256, 256)
     image[0, :32, :32] = 1
     eye = WindowEye(detector)

@@ -18,7 +18,7 @@ from tests.refusals import refused
 from tests.zoom.test_closer import Fickle, evidence
 
 
-def test_search_finds_a_target_in_the_picture(agent, picture):
+def test_search_finds_a_target_in_the_picture_and_ends_without_one(agent, picture):
     path = agent.search(picture, "red")
     assert path.decision.outcome == "found"
     assert path.decision.probability >= 0.3
@@ -26,6 +26,10 @@ def test_search_finds_a_target_in_the_picture(agent, picture):
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
     assert path.passes == len(path.glances)
+    path = agent.search(picture, "green", passes=7)
+    assert path.decision.outcome in ("absent", "undecided")
+    assert path.passes <= 7
+    assert path.decision.box is None
 
 
 def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_path):
@@ -50,13 +54,6 @@ def test_the_records_of_each_look_have_the_picture(agent, picture):
         assert seen[1].plot().axes[0].images
 
 
-def test_search_for_an_absent_target_ends(agent, picture):
-    path = agent.search(picture, "green", passes=7)
-    assert path.decision.outcome in ("absent", "undecided")
-    assert path.passes <= 7
-    assert path.decision.box is None
-
-
 def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
     path = agent.find_all(picture, "blue", passes=12, worth=0.0)
     assert path.target == 3
@@ -66,9 +63,6 @@ def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
     assert set(everything.objects.above(0.3).labels.tolist()) == {1, 3}
     assert everything.target is None
     assert everything.passes <= 24
-
-
-def test_find_all_ends_when_no_look_has_enough_value(agent, picture):
     assert agent.find_all(picture, "blue", worth=1e9).passes == 1
 
 
@@ -100,7 +94,7 @@ def test_zooming_pays_only_for_large_pictures(agent, picture):
     assert kinds == ["windows", "fovea"]
 
 
-def test_invalid_arguments_are_refused(agent, picture):
+def test_invalid_arguments_are_refused(agent, picture, detector):
     refused("did you mean 'red'", agent.search, picture, "rad")
     refused("passes: expected a whole number from 1", agent.explore, picture, passes=0)
     refused("batch: expected a whole number from 1", agent.find_all, picture, 1, batch=0)
@@ -127,9 +121,6 @@ def test_invalid_arguments_are_refused(agent, picture):
         (7, "picture: expected a path"),
     ):
         refused(message, agent.explore, image)
-
-
-def test_evidence_must_have_the_classes_of_the_detector(detector):
     with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
         ZoomAgent(WindowEye(detector), GlimpseEvidence(5, 8))
     for wrong, message in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):

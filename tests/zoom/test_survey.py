@@ -90,9 +90,6 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
         expected = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, LATTICE.levels)])
         torch.testing.assert_close(expected, rates[0].exp()[: len(expected), : LATTICE.rows, : LATTICE.columns])
         assert belief.foresight == (0.125 if target == 0 else 0.35)
-
-
-def test_rates_of_background_are_refused():
     with pytest.raises(InputError, match=r"targets: expected classes from 1 on, got \[0, 2\]"):
         GlimpseEvidence(CLASSES, 8).rates(gist(), torch.tensor([0, 2]))
 

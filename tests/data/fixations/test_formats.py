@@ -154,16 +154,13 @@ def test_files_of_another_format_are_refused(tmp_path, content, read, said):
     unusable(rf"{tmp_path.name}/f: .*{said}", read, tmp_path / "f")
 
 
-def test_pictures_are_sorted_by_name():
-    assert list(by_picture([record("b"), record("a"), record("b", "2")])) == ["a", "b"]
-    refused("name", coco_name, "dog.jpg")
-
-
-def test_what_is_no_record_is_refused(tmp_path):
+def test_pictures_are_sorted_by_name_and_what_is_no_record_is_refused(tmp_path):
     unusable(r"nothing\.csv", read_table, tmp_path / "nothing.csv")
     refused(r"several for a\.jpg", write_ruarte, tmp_path / "s.json", [record(), record()])
     for broken in [{"points": ()}, {"points": ((np.nan, 1.0),)}, {"durations": np.ones(3)}]:
         refused(".", record, **broken)
+    assert list(by_picture([record("b"), record("a"), record("b", "2")])) == ["a", "b"]
+    refused("name", coco_name, "dog.jpg")
 
 
 def test_points_count_as_inside_up_to_the_edges_of_pixels():

@@ -171,11 +171,6 @@ def test_a_saved_model_gives_the_same_density(model, maps, tmp_path):
     unusable("damaged", FixationDensity.from_pretrained, tmp_path / "model.safetensors")
 
 
-def test_weights_of_other_layers_are_refused(model):
-    other = FixationDensity({"fine": 5, "coarse": 3}, readouts=2, units=4, centre=torch.zeros(4, 5))
-    refused("layers", other.load_state_dict, model.state_dict())
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -237,12 +232,14 @@ def test_gradients_and_compilation() -> None:
         torch.testing.assert_close(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
 
 
-def test_bad_input():
+def test_bad_input(model):
     refused("saliency", cell_saliency, torch.zeros((4, 4)), 2, 2, "mean")
     refused("saliency", cell_saliency, torch.zeros((1, 1, 4, 4)), 2, 2, "mean")
     refused("saliency", cell_saliency, torch.zeros((1, 0, 4)), 2, 2, "mean")
     refused("columns", cell_saliency, torch.zeros((1, 4, 4)), 0, 2, "mean")
     refused("reduction", cell_saliency, torch.zeros((1, 4, 4)), 2, 2, "sum")
+    other = FixationDensity({"fine": 5, "coarse": 3}, readouts=2, units=4, centre=torch.zeros(4, 5))
+    refused("layers", other.load_state_dict, model.state_dict())
 
 
 def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():

@@ -56,17 +56,13 @@ def test_scanmatch_is_the_best_of_all_alignments(n, m, gap, threshold):
     assert got == pytest.approx(best / (threshold * max(n, m)))
 
 
-def test_durations_repeat_letters():
+def test_durations_repeat_letters_whose_substitution_has_the_published_range():
     ours, theirs = path(2), path(3)
     longer = scanmatch(ours.repeat([3, 1], axis=0), theirs, SIZE)
     times = ([150.0, 20.0], [50.0, 60.0, 40.0])
     assert scanmatch(ours, theirs, SIZE, durations=times) == pytest.approx(longer)
     assert scanmatch(ours, ours, SIZE, durations=(times[0], times[0])) == 1
     refused("durations", scanmatch, ours, theirs, SIZE, durations=([1.0], [1.0]))
-
-
-def test_the_substitution_matrix_of_the_toolbox_has_the_published_range():
-    """ScanMatch's default of 12 × 8 cells and 3.5: equal letters add 3.5, opposite corners 3.5 - √(11² + 7²)."""
     corners = [[0.0, 0.0]], [[79.0, 59.0]]
     assert scanmatch(*corners, SIZE, gap=-1e5) * 3.5 == pytest.approx(3.5 - np.hypot(11, 7))
 
@@ -94,16 +90,6 @@ def test_time_delay_embedding_by_loops(length):
         for i in range(len(ours) - length + 1)
     ]
     assert time_delay_embedding(ours, theirs, length=length) == pytest.approx(np.mean(nearest))
-
-
-def test_short_and_wrong_scanpaths_durations_and_cells():
-    for wrong in [{"durations": ([np.nan], [1.0])}, {"durations": ([1e12], [1.0])}, {"cells": (0, 1)}]:
-        refused(f"^{next(iter(wrong))}: expected", scanmatch, [[1.0, 1.0]], [[1.0, 1.0]], SIZE, **wrong)
-    assert np.isnan(time_delay_embedding(path(2), path(5)))
-    for measure in (dynamic_time_warping, time_delay_embedding):
-        for bad in (np.zeros((0, 2)), np.zeros((3, 3)), [[np.nan, 0.0]]):
-            for pair in ((bad, path(3)), (path(3), bad)):
-                refused(r"ours|theirs", measure, *pair)
 
 
 package = pytest.importorskip("multimatch_gaze", reason="pip install multimatch-gaze")
@@ -145,6 +131,17 @@ def test_invalid_and_short_scanpaths_are_refused_by_name():
     refused(r"^theirs:", multimatch, [[0, 0]] * 3, [0, 1, 2], (10, 10))
     with pytest.raises(InputError, match=r"^durations: expected 3 and 4 numbers, one for each fixation, got \(3, 2\)"):
         multimatch([[0, 0]] * 3, [[0, 0]] * 4, (10, 10), ([1, 2, 3], [1, 2]))
+    refused(r"^points: .*got 2 outside it", cell_labels, [[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
+    for figure in [sequence_score, edit_distance]:
+        refused(r"^ours:", figure, [], [1])
+        refused(r"^theirs:", figure, [1], [])
+    for wrong in [{"durations": ([np.nan], [1.0])}, {"durations": ([1e12], [1.0])}, {"cells": (0, 1)}]:
+        refused(f"^{next(iter(wrong))}: expected", scanmatch, [[1.0, 1.0]], [[1.0, 1.0]], SIZE, **wrong)
+    assert np.isnan(time_delay_embedding(path(2), path(5)))
+    for measure in (dynamic_time_warping, time_delay_embedding):
+        for bad in (np.zeros((0, 2)), np.zeros((3, 3)), [[np.nan, 0.0]]):
+            for pair in ((bad, path(3)), (path(3), bad)):
+                refused(r"ours|theirs", measure, *pair)
 
 
 def test_byte_coordinates_do_not_overflow_and_zero_durations_are_equal():
@@ -156,14 +153,7 @@ def test_byte_coordinates_do_not_overflow_and_zero_durations_are_equal():
     assert multimatch(path, path, (256, 256), ([0] * 4, [0] * 4)).duration == 1
 
 
-def test_lengths_as_scipy():
-    a, b = RNG.exponential(3, 7), RNG.exponential(5, 11)
-    assert length_distance(a, b) == pytest.approx(wasserstein_distance(a, b))
-    assert length_distance(a, a) == 0
-    assert np.isnan(length_distance([], a))
-
-
-def test_directions_are_the_cheapest_matching_around_the_circle():
+def test_lengths_of_saccades_as_scipy_and_directions_by_the_cheapest_matching():
     """Twin: of as many directions, the best cyclic matching of the sorted ones."""
     a, b = RNG.uniform(-np.pi, np.pi, (2, 9))
     away = lambda x, y: np.abs((x - y + np.pi) % (2 * np.pi) - np.pi)  # noqa: E731
@@ -172,9 +162,10 @@ def test_directions_are_the_cheapest_matching_around_the_circle():
     assert direction_distance(a, a + 2 * np.pi) == pytest.approx(0)
     assert direction_distance([0.0], [np.pi]) == pytest.approx(np.pi)
     assert np.isnan(direction_distance(a, []))
-
-
-def test_saccades_of_several_paths():
+    a, b = RNG.exponential(3, 7), RNG.exponential(5, 11)
+    assert length_distance(a, b) == pytest.approx(wasserstein_distance(a, b))
+    assert length_distance(a, a) == 0
+    assert np.isnan(length_distance([], a))
     lengths, directions = saccades([np.array([[0, 0], [0, 2], [0, 2]]), np.array([[5, 5]]), [[1, 1], [0, 1]]])
     np.testing.assert_allclose(lengths, [2, 1])
     np.testing.assert_allclose(np.abs(directions), [np.pi / 2, np.pi])
@@ -234,13 +225,6 @@ def test_consecutive_fixations_closer_than_half_a_window_are_merged():
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [5, 0]], (10, 10)), [[0, 0], [5, 0]])
     # Bytes do not wrap around.
     np.testing.assert_allclose(merge_close(np.array([[200, 0], [202, 2]], dtype=np.uint8), (10, 10)), [[201, 1]])
-
-
-def test_empty_sequences_and_points_outside_the_picture_are_refused_by_name():
-    refused(r"^points: .*got 2 outside it", cell_labels, [[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
-    for figure in [sequence_score, edit_distance]:
-        refused(r"^ours:", figure, [], [1])
-        refused(r"^theirs:", figure, [1], [])
 
 
 def test_labels_in_an_array_equal_labels_in_a_list():

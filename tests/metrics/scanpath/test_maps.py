@@ -72,9 +72,6 @@ def test_batches_of_tensors_equal_single_maps():
         together = figure(maps, x, y)
         assert together.shape == (2, 3, 4)
         np.testing.assert_allclose(together[1, 2], figure(maps[1, 2], x[1, 2], y[1, 2]))
-
-
-def test_points_belong_to_the_nearest_pixel():
     values = np.arange(6.0).reshape(2, 3)
     assert log_likelihood(values, [0.49], [0.4]) == log_likelihood(values, [0], [0])
     assert log_likelihood(values, [0.51], [0.4]) == log_likelihood(values, [1], [0])
