@@ -46,9 +46,9 @@ class RecordedLook:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Number, point, region and number of detections in one line."""
-        (x, y), count = self.fixation, int(self.detections.count.sum())
-        seen = f"{count} detection{'s' if count != 1 else ''}"
+        """Number, point, region and number of detections from score 0.1 on in one line."""
+        (x, y), count = self.fixation, int(confident_detections(self.detections).count)
+        seen = f"{count} detection{'s' if count != 1 else ''} from score {CONFIDENT:g} on"
         return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {seen}"
 
 

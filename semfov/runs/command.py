@@ -241,7 +241,7 @@ def _in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str
         words = unknown[1].split()
         option = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
         if option is None:
-            return f"unexpected argument {unknown[1]!r}; put a name with spaces in quotes"
+            return f"unexpected argument {unknown[1]!r}; put a name with spaces in quotes, and commas in a list"
         plain = [each[2:].replace("_", "-") for each in options]
         near = get_close_matches(option.lstrip("-").replace("_", "-"), plain, n=1, cutoff=0.6)
         remedy = f"did you mean --{near[0]}?" if near else "--help-all lists all options"

@@ -105,6 +105,7 @@ def test_looks_tell_the_target_first_and_count_detections_from_one_score_on():
     path = scanpath(seen, look((LEFT, 1, 0.09)), target=1)
     assert [row["detections"] for row in path.rows()] == [3, 0]
     assert [row["seen"] for row in path.rows()] == ["cat", None]
+    assert repr(path[0]).endswith(": 3 detections from score 0.1 on")
     fixations = episode_data(path, None, None, name="a")["fixations"]
     assert [len(each["detections"]) for each in fixations] == [3, 0]
 
