@@ -20,21 +20,13 @@ def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
 
 
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-    r"""Ten features that describe the evidence of looks for a target in every cell, `(B, X·Y, 10)`.
+    r"""Ten features that describe the evidence of looks for a target in every cell, `(B, X·Y, 10)`, of about unit size.
 
-    Let :math:`s_l` be the scores of detection l, :math:`w_l(x)` its weight in cell x (the `soft` footprint of `Grid`),
-    and b the detection with the largest :math:`s_{lt} w_l(x)`. The features, each scaled to about unit size, are
-
-    1. the distance from the fixation to the cell,
-    2. :math:`\ln s_{bt} w_b`,
-    3. :math:`\ln \max_l s_{lt}` over the detections that overlap the cell,
-    4. the objectness of b, :math:`1 - s_{b0}`,
-    5. the weight of b,
-    6. the size of b,
-    7. the share of the target in the objectness of b,
-    8. the strongest objectness, :math:`\max_l (1 - s_{l0}) w_l`,
-    9. the strongest evidence for other classes, :math:`\max_l (1 - s_{l0} - s_{lt}) w_l`,
-    10. whether no detection overlaps the cell.
+    With the scores :math:`s_l` of detection l, its weight :math:`w_l` in the cell (the `soft` footprint of `Grid`), and
+    the detection b of the largest :math:`s_{lt} w_l`, they are: the distance of the fixation; :math:`\ln s_{bt} w_b`;
+    :math:`\ln \max_l s_{lt}` of those that overlap the cell; of b the objectness :math:`1 - s_{b0}`, the weight, the
+    size, and the share of the target; :math:`\max_l (1 - s_{l0}) w_l`; :math:`\max_l (1 - s_{l0} - s_{lt}) w_l`; and
+    whether nothing overlaps the cell.
     """
     components = detections.scores.shape[-1]
     check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.belief import Belief
-from semfov.belief.observers import Observer, Semantic
-from semfov.belief.observers.base import Look
+from semfov.belief.observers import Look, Observer, Semantic
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import Scenery

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
@@ -14,13 +14,11 @@ from semfov.errors import lookup
 
 _IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
 
-_Action = Literal["cell", "window"]
-"""Kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
-
 _KINDS: dict[str, dict[str, Callable[..., EpisodeEnv]]] = {
     "cell": {"search": GazeSearch, "exploration": GazeExplore},
     "window": {task: partial(ZoomEnv, task) for task in ("search", "exploration")},
 }
+"""Makers by kind of actions: a cell to fixate, or a window of a large picture as `(x, y, magnification)`."""
 
 
 def register() -> None:
@@ -36,12 +34,12 @@ def register() -> None:
             gymnasium.register(name, entry_point=one, vector_entry_point=many, kwargs={"task": task})
 
 
-def _make(task: str, action: _Action = "cell", **options: Any) -> EpisodeEnv:
+def _make(task: str, action: str = "cell", **options: Any) -> EpisodeEnv:
     """Make an environment; options of `GazeEnv`, or of `ZoomEnv` where actions are windows."""
     return _KINDS[lookup(action, _KINDS, "action")][task](**options)
 
 
-def _make_vector(task: str, num_envs: int = 1, action: _Action = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
+def _make_vector(task: str, num_envs: int = 1, action: str = "cell", **options: Any) -> VectorEnv[Any, Any, Any]:
     """Make environments side by side; options of `GazeVectorEnv`, or of `ZoomEnv` where actions are windows."""
     if lookup(action, _KINDS, "action") == "cell":
         return GazeVectorEnv(task, num_envs, **options)

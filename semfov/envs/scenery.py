@@ -13,11 +13,10 @@ from torch import Tensor
 
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import LearnedMap, Observer, Target
-from semfov.data.classes import class_index
+from semfov.data import Annotation, Scenes, class_index
 from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
 from semfov.data.pictures import Pictures
-from semfov.data.scene import Annotation, Scenes
 from semfov.data.sources import PHOTOGRAPHS
 from semfov.detection.objects import LEAST
 from semfov.episode import StoredLooks

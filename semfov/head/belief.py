@@ -7,10 +7,9 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief, pick
 from semfov.belief.grid import Grid
+from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.observers.base import Look, Observer, own
 from semfov.belief.observers.gathering import EvidenceLook
-from semfov.belief.observers.learned_map import LearnedMap
-from semfov.belief.observers.target import Target
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views

@@ -6,8 +6,7 @@ from itertools import chain
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief
-from semfov.belief.map_evidence import MapEvidence
+from semfov.belief import Belief, MapEvidence
 from semfov.belief.observers.base import own
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief

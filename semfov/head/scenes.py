@@ -254,20 +254,17 @@ class _Plane(_Scene):
         return within[0], within[1], within[0] + wide, within[1] + high
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of the view that show points of the picture."""
         x1, y1, x2, y2 = self._box(pose)
         size = points.new_tensor(self.size)
         pixels = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
         return pixels, ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Points of the picture that pixels of the view show."""
         x1, y1, x2, y2 = self._box(pose)
         extent = points.new_tensor([x2 - x1, y2 - y1])
         return (points + 0.5) * extent / points.new_tensor(self.size) + points.new_tensor([x1, y1]) - 0.5
 
     def pixels_of(self, points: Tensor) -> Tensor:
-        """The points themselves."""
         return points
 
     def angles_of(self, points: Tensor) -> Tensor:
@@ -300,11 +297,9 @@ class _Plane(_Scene):
         return [[torch.tensor([x, -y, field]) for x in across] for y in down]
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
-        """Regions of the picture that boxes `(M, 4)` in the view from a pose cover."""
         return Boxes(self.boxes(boxes, pose))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Boxes `(M, 4)` of the picture."""
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
 
 

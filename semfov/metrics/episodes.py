@@ -53,10 +53,9 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
     return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
 
 
-def standard_error(values: FloatArray, axis: int = 0) -> FloatArray:
-    """Standard error of the mean along one axis, the root of Σ (x - x̄)² / (n (n - 1))."""
+def standard_error(values: FloatArray) -> FloatArray:
+    """Standard error of the mean along the first axis, the root of Σ (x - x̄)² / (n (n - 1))."""
     values = np.asarray(values, dtype=np.float64)
-    count = values.shape[axis]
-    if count < 2:
-        return np.full(np.delete(values.shape, axis), np.nan)
-    return np.asarray(values.std(axis, ddof=1) / np.sqrt(count))
+    if len(values) < 2:
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(values.std(0, ddof=1) / np.sqrt(len(values)))

@@ -19,9 +19,7 @@ from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, write_table
 from semfov.data.fixations.suspicions import check_viewed, warn_outside
-from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import FeatureMaps
+from semfov.detection import Detections, Detector, FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density

@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
-from semfov.belief.grid import Grid
+from semfov.belief import Belief, Grid
 from semfov.belief.observers.base import Observer
 from semfov.data.inputs import as_image
 from semfov.data.windowed import LargePicture

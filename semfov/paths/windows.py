@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from semfov.detection.detections import Detections
-from semfov.detection.objects import Objects
+from semfov.detection import Detections, Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record

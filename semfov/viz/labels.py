@@ -34,7 +34,8 @@ def place_numbers(
         for x, y in _around(points[number], (width, height), reach):
             label = _into(x - width / 2, y - height / 2, width, height, frame)
             x1, y1, x2, y2 = label
-            if not _covers_any(label, placed) and not any(x1 < x < x2 and y1 < y < y2 for x, y in others):
+            covers = any(boxes_meet(label, each) for each in placed)
+            if not covers and not any(x1 < x < x2 and y1 < y < y2 for x, y in others):
                 places[number] = label
                 placed.append(label)
                 break
@@ -45,10 +46,11 @@ def place_within(
     candidates: Sequence[Iterable[_Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
     """Rectangles for labels whose first corner may be at any of several points: at a free one, or further down."""
-    placed: list[LabelBox] = list(obstacles)
+    placed = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x, y, width, height, frame) for x, y in points]
-        x1, y1, x2, y2 = next((label for label in inside if not _covers_any(label, placed)), inside[0])
+        free = (label for label in inside if not any(boxes_meet(label, each) for each in placed))
+        x1, y1, x2, y2 = next(free, inside[0])
         while covered := [other for other in placed if boxes_meet((x1, y1, x2, y2), other)]:
             y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1
         placed.append((x1, y1, x2, y2))
@@ -69,7 +71,3 @@ def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
 def _into(x: float, y: float, width: float, height: float, frame: _Size) -> LabelBox:
     x, y = max(0.0, min(x, frame[0] - width)), max(0.0, min(y, frame[1] - height))
     return x, y, x + width, y + height
-
-
-def _covers_any(label: LabelBox, placed: list[LabelBox]) -> bool:
-    return any(boxes_meet(label, other) for other in placed)

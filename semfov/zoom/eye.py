@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
-from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
+from semfov.detection import Detections, Detector
 from semfov.detection.scores import BackgroundPolicy, Candidates, shares
 from semfov.detection.selection import check_numbers, select
 from semfov.errors import check, check_number, check_shape, lookup

@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.reading import read_fixations
-from semfov.data.fixations.record import Fixations
+from semfov.data.fixations import Fixations, read_fixations
 from semfov.data.fixations.suspicions import check_viewed, warn_outside
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
 from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
-from semfov.paths import Record
-from semfov.paths.gaze import GazePrediction
+from semfov.paths import GazePrediction, Record
 
 _CELLS = 8
 _LONGEST = 64
