@@ -101,7 +101,7 @@ def test_photographs_are_chosen_by_their_ids(photographs, ids):
 def test_selections_apply_in_order_and_have_their_fingerprint(photographs):
     assert choose(photographs, ids=[15, 92, 14], limit=2).ids == [14, 15]
     assert choose(photographs).ids == choose(photographs, ids=None).ids == [3, 14, 15, 92]
-    with pytest.raises(DataError, match="none of 4 images"):
+    with pytest.raises(DataError, match="none among 4"):
         CocoScenes(photographs, photographs / "cups.json", ("cup",), min_instances=2, ids=[14])
     every, some, same = (choose(photographs, ids=ids).fingerprint for ids in (None, [3, 14], ["14", "3"]))
     assert some == same != every
