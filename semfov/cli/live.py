@@ -19,8 +19,7 @@ from semfov.paths import Moment
 from semfov.paths.look import detections_in_words
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
 
-_UNKNOWN_RATE = 15.0
-"""Frames per second of the written video if the source does not give its own."""
+_UNKNOWN_RATE = 15.0  # frames per second of the written video if the source does not give its own
 
 _WARM_UP = 3
 """Number of first frames that take longer than the others, because the detector gets ready; they have no rate."""

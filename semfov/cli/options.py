@@ -20,8 +20,7 @@ ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 OF_ANY_LOOK: tuple[Drawing, ...] = ("scanpath", "animation")
 """Figures of looks of any kind; the others are of a fovea, and `belief_bars` of a search."""
 
-_MostCloserLooks = Annotated[int, Range(0, 100)]
-"""Largest number of closer looks."""
+_MostCloserLooks = Annotated[int, Range(0, 100)]  # largest number of closer looks
 
 
 @dataclass(frozen=True)

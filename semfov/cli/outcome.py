@@ -28,8 +28,7 @@ from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.semantic import named_regions, plot_semantic_map
 from semfov.viz.style import save_figure
 
-_OBJECTS_LISTED = 20
-"""Largest number of objects that are listed."""
+_OBJECTS_LISTED = 20  # largest number of objects that are listed
 
 
 def _outcome_text(record: Record, name: str, seconds: float) -> str:

@@ -20,8 +20,7 @@ from semfov.paths.conversion import COLUMNS
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
 
-_RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")
-"""Ends of the names of files of results."""
+_RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")  # ends of the names of files of results
 
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
 

@@ -377,8 +377,7 @@ _TASKS: dict[str, tuple[type[PictureOptions], type[_PictureJob]]] = {
     "explore": (ExploreOptions, _ExploreJob),
 }
 
-_turn = threading.Lock()
-"""Calls of several threads take turns: a process has one job, and one standard output."""
+_turn = threading.Lock()  # calls of several threads take turns: a process has one job, and one standard output
 
 
 def look_at(options: PictureOptions, stream: TextIO) -> int:

@@ -53,8 +53,7 @@ _TITLES = {
 _UNUSED = {"verification": "no, no closer looks", "windows": "no, slices in the order of raw scores"}
 """What the agent does without a part that it does not use, other than to use raw scores."""
 
-_MOST_FAULTS = 5
-"""Largest number of photographs that a message names."""
+_MOST_FAULTS = 5  # largest number of photographs that a message names
 
 _log = logging.getLogger(__name__)
 

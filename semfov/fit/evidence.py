@@ -46,10 +46,8 @@ from semfov.runs.tables import mean_or_dash, share, table
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
-_JUDGED = (1, 5, 15)
-"""Numbers of looks after which a belief is evaluated."""
-_ABSENT = 1000
-"""Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
+_JUDGED = (1, 5, 15)  # numbers of looks after which a belief is evaluated
+_ABSENT = 1000  # thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph
 SUREST, SUREST_OF_FEW = 0.99, 0.9
 """Upper limit of the threshold for found targets, and that for few searches, in which one false alarm pushes it up."""
 

@@ -17,15 +17,12 @@ from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cell
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Whole
 
-_EVENTS = 12
-"""Fixations of a picture in a pass of the fit of oculomotor biases."""
-_SCORED = 40
-"""Fixations of a picture on which conditional densities are scored, drawn at random."""
+_EVENTS = 12  # fixations of a picture in a pass of the fit of oculomotor biases
+_SCORED = 40  # fixations of a picture on which conditional densities are scored, drawn at random
 
 _MapsOfPicture = Tensor | Callable[[Events], Tensor]
 """Map of a picture, `(1, rows, columns)`, one for each person, or what gives one for each event."""
-_Pictures = Sequence[Sequence[int]]
-"""Pictures of each group."""
+_Pictures = Sequence[Sequence[int]]  # pictures of each group
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.errors import SemfovError, check
+from semfov.errors import SemfovError
 from semfov.fit.gaze import GazeFit, fitted_density, maps_of, score
 from semfov.fit.viewing import Viewed, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
@@ -20,19 +20,11 @@ from semfov.runs.scene_run import digest_of
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
 
-_Groups = Callable[[], Sequence[Viewed]]
-"""Gives the pictures, by data set and size."""
+_Groups = Callable[[], Sequence[Viewed]]  # gives the pictures, by data set and size
 
 CENTRE = "centre bias"
 ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
 """Rows by the terms of their models, without and with the scanpath."""
-
-
-def _folds(number: int, count: int, fold: int, first: int = 0) -> tuple[list[int], list[int]]:
-    """Pictures to fit on, and every `count`-th, which is held out; `first` numbers the first one in its data set."""
-    check(0 <= fold < count, "fold", f"a number from 0 to {count - 1}", fold)
-    held = [*range((fold - first) % count, number, count)]
-    return [each for each in range(number) if each not in set(held)], held
 
 
 class Fold:
@@ -55,9 +47,10 @@ class Fold:
         """For each group the other pictures and those held out."""
         before: dict[int, int] = {}
         split = []
-        for group in self.groups():
+        for group in self.groups():  # the pictures of one size, of which every `count`-th of the data set is held out
             first = before.get(group.source, 0)
-            split.append(_folds(len(group), self.count, self.number, first))
+            held = [*range((self.number - first) % self.count, len(group), self.count)]
+            split.append(([each for each in range(len(group)) if each not in set(held)], held))
             before[group.source] = first + len(group)
         return split
 

@@ -38,8 +38,7 @@ from semfov.runs.tables import table
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
-_JUDGED = (1, 2, 3, 5, 10, 15)
-"""Numbers of looks after which a map is evaluated."""
+_JUDGED = (1, 2, 3, 5, 10, 15)  # numbers of looks after which a map is evaluated
 _MEASURED = {"objects": "right", "all": "right_everywhere"}
 """Cells of which strategies are compared, with the name of the numbers of right ones."""
 

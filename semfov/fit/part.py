@@ -24,14 +24,11 @@ from semfov.runs.seeds import generator_for
 
 _Config = TypeVar("_Config", bound=FitConfig)
 
-_FEW = 8
-"""Detectors with fewer classes also learn from photographs that contain none of them."""
+_FEW = 8  # detectors with fewer classes also learn from photographs that contain none of them
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
-_MANY = 100
-"""With at least this many photographs, one in five is held out and training takes all its steps."""
-_LONGEST = 15
-"""Maximum number of gaze shifts in the searches and explorations that are compared."""
+_MANY = 100  # with at least this many photographs, one in five is held out and training takes all its steps
+_LONGEST = 15  # maximum number of gaze shifts in the searches and explorations that are compared
 
 
 class PartResult(NamedTuple):

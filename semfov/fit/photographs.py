@@ -33,11 +33,9 @@ _CHECKED = (1, 5)
 """
 _ABSENT = 20
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
-_FALSE_ALARMS = 0.007
-"""Maximum share of absent targets that may be reported as found; it determines the threshold."""
+_FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as found; it determines the threshold
 
-_AREA = 0.2
-"""Classes that cover a larger share of a photograph are not searched for."""
+_AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
 
 
 class _WholeSearch(TargetSearch[WindowLook]):

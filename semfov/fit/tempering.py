@@ -20,8 +20,7 @@ from semfov.io.manifest import Part
 from semfov.runs.progress import track
 from semfov.runs.samples import Samples
 
-_EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
-"""Values of the exponent to compare."""
+_EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)  # values of the exponent to compare
 _SETTINGS = ("columns", "rows", "fixations", "max_target_area", "holdout", "seed")
 """Settings of the fit that the exponent depends on."""
 

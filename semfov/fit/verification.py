@@ -28,12 +28,8 @@ from semfov.metrics.episodes import FloatArray, area_under_roc
 from semfov.runs.settings import Count, Positive, Range, Share
 from semfov.runs.tables import mean_or_dash, share, table
 
-_LEVELS = tuple(number / 100 for number in range(50, 100))
-"""Values from which the threshold `confirm` is chosen."""
-
-_SHIPPED = ("yolox-nano", "yolov3-tiny")
-"""Shipped models whose mean is the centre of the prior for other detectors."""
-
+_LEVELS = tuple(number / 100 for number in range(50, 100))  # values from which the threshold `confirm` is chosen
+_SHIPPED = ("yolox-nano", "yolov3-tiny")  # shipped models whose mean is the centre of the prior for other detectors
 _STRENGTH = 10.0
 """Strength of this prior, chosen on photographs that no result is reported on (docs/decisions/closer_looks.md)."""
 
@@ -41,13 +37,11 @@ _EACH = 3  # places examined after some looks
 _LEAST = 0.03  # least probability of these places
 _RIDGE = 1e-4
 
-_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
-"""Values of the threshold `confirm` in the table, besides the chosen one."""
+_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)  # values of the threshold `confirm` in the table, besides the chosen one
 
 _SearchEnd = tuple[bool | None, int]
 """End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
-_ABSENT = 200
-"""The threshold is chosen on about this many searches for absent classes, at most 20 in a photograph."""
+_ABSENT = 200  # the threshold is chosen on about this many searches for absent classes, at most 20 in a photograph
 
 
 @dataclass(frozen=True)

@@ -191,8 +191,7 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
     return groups
 
 
-_Seen = tuple[FeatureMaps, Sequence[Fixations]]
-"""The maps of a picture, and the fixations in it."""
+_Seen = tuple[FeatureMaps, Sequence[Fixations]]  # the maps of a picture, and the fixations in it
 
 
 def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:

@@ -54,8 +54,7 @@ from semfov.zoom.evidence import GlimpseEvidence, Survey
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance
 
-_JUDGED = (1, 4, 8, 16)
-"""Numbers of looks after which the probability of presence is evaluated."""
+_JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
 
 
 class _Searches(NamedTuple):

@@ -24,12 +24,9 @@ from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge_with_facts
 
-_AFTER = (3, 6, 12, 24)
-"""Numbers of looks after which objects are taken."""
-_EXPECTING = (1, 2, 4, 8, 16, 24)
-"""Numbers of looks after which the number of further objects is taken."""
-_FURTHER = 2
-"""Explorations are this many times as long as they may be for users, to see what further looks show."""
+_AFTER = (3, 6, 12, 24)  # numbers of looks after which objects are taken
+_EXPECTING = (1, 2, 4, 8, 16, 24)  # numbers of looks after which the number of further objects is taken
+_FURTHER = 2  # explorations are this many times as long as they may be for users, to see what further looks show
 _SCALES = tuple(0.05 * 1.25**n for n in range(21))
 _STRENGTHS = tuple(2.0**n for n in range(-2, 9))
 _FAINT = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
@@ -37,12 +34,10 @@ _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
 
 _SPREADS = tuple(0.05 * n for n in range(41))
-_FEW = 40
-"""Below this number of claims the spread is not less than that of a model for which none was fitted."""
+_FEW = 40  # below this number of claims the spread is not less than that of a model for which none was fitted
 _CHECKED = (8, 24)
 """Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""
-_COVERED = 0.8
-"""Share of the pictures in which the annotated number should be within two errors of the expected one."""
+_COVERED = 0.8  # share of the pictures in which the annotated number should be within two errors of the expected one
 
 
 class Exploration(NamedTuple):

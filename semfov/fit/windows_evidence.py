@@ -60,8 +60,7 @@ class ZoomExample(NamedTuple):
         return cls(glances.lattice, annotation.labels, tuple(looks), least)
 
 
-_Cells = tuple[int, int, int, int]
-"""First column and row, and those after the last."""
+_Cells = tuple[int, int, int, int]  # first column and row, and those after the last
 
 
 def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _WindowResult, int, _Cells]]:
@@ -264,8 +263,7 @@ class SurveyExample(NamedTuple):
         return losses
 
 
-_LATER = 2
-"""Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
+_LATER = 2  # closer looks of a mosaic, beside its overview, whose predictions are fitted in one step
 
 
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:

@@ -30,18 +30,13 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance
 from semfov.zoom.slices import ranked, usual_slices
 
-_ENOUGH = 16
-"""Smallest number of held-out photographs, with which a mosaic shows none of them twice."""
-_RECALL_PASSES = (4, 8, 16)
-"""Passes of the detector after which recall is reported."""
+_ENOUGH = 16  # smallest number of held-out photographs, with which a mosaic shows none of them twice
+_RECALL_PASSES = (4, 8, 16)  # passes of the detector after which recall is reported
 _OF_INPUT = 1.15
 """Largest width of a photograph in a mosaic, in widths of the detector's input: as in the fits of shipped models."""
-_FOR_MOSAICS = 360
-"""The number of mosaics grows up to this number of photographs to learn from."""
-_ALONE = 120
-"""Largest number of photographs that are searched by themselves."""
-_LOOK = 0.04
-"""Estimate of the seconds of a pass of the detector."""
+_FOR_MOSAICS = 360  # the number of mosaics grows up to this number of photographs to learn from
+_ALONE = 120  # largest number of photographs that are searched by themselves
+_LOOK = 0.04  # estimate of the seconds of a pass of the detector
 
 
 class WindowsFit(PartFit):

@@ -26,8 +26,7 @@ _ALIASES = ("recommended", "published")
 _MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 """Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
 
-_OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
-"""Settings of the map of all classes."""
+_OF_THE_MAP = ("tempering", "footprint", "memory", "misses")  # settings of the map of all classes
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:

@@ -25,11 +25,8 @@ CREATE TABLE IF NOT EXISTS scenes (
     number INTEGER PRIMARY KEY, sha256 TEXT NOT NULL, seconds TEXT NOT NULL, records TEXT NOT NULL
 )
 """
-_TOGETHER = 1.0
-"""Seconds after which finished scenes are written: each write waits for the disk."""
-
-_WAIT = 60.0
-"""Seconds for which another process may write."""
+_TOGETHER = 1.0  # seconds after which finished scenes are written: each write waits for the disk
+_WAIT = 60.0  # seconds for which another process may write
 
 _DAMAGED = (sqlite3.DatabaseError, UnicodeDecodeError)
 """Errors of a file that is no database, or whose names of columns are none."""

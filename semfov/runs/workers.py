@@ -30,11 +30,8 @@ from semfov.io.files import discard_unfinished
 from semfov.runs.progress import task_bar
 from semfov.threads import available_cores
 
-_REACH = 10.0
-"""Seconds in which a scheduler must answer."""
-
-_RETURN = 300.0
-"""Seconds in which a scheduler that was lost must be there again."""
+_REACH = 10.0  # seconds in which a scheduler must answer
+_RETURN = 300.0  # seconds in which a scheduler that was lost must be there again
 
 _log = logging.getLogger(__name__)
 
@@ -75,8 +72,7 @@ def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Execut
             executor.shutdown(wait=False)
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Numbers of two settings of glibc's malloc (malloc.h)."""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # numbers of two settings of glibc's malloc (malloc.h)
 
 
 def prepare_worker() -> None:
@@ -103,14 +99,9 @@ of the Dask scheduler with this address, or in an executor."""
 _OUTSTANDING = 256
 """Number of tasks that an executor is given at once; the others wait here, so that memory does not grow with them."""
 
-_BATCH = 16
-"""Largest number of tasks that a worker of a cluster is given at once: each exchange takes milliseconds."""
-
-_TURNS = 8
-"""Number of batches that each worker of a cluster has at least, so that the last ones end together."""
-
-_PATIENCE = 5
-"""Number of times that a cluster may be lost before its tasks count as failed."""
+_BATCH = 16  # largest number of tasks that a worker of a cluster is given at once: each exchange takes milliseconds
+_TURNS = 8  # number of batches that each worker of a cluster has at least, so that the last ones end together
+_PATIENCE = 5  # number of times that a cluster may be lost before its tasks count as failed
 
 
 def run_tasks(

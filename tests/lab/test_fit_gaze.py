@@ -19,7 +19,7 @@ from semfov import InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
-from semfov.fit.gaze_folds import CENTRE, FoldStore, _folds
+from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
 from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, summaries
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
@@ -77,7 +77,7 @@ def group():
 
 def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     torch.manual_seed(0)
-    fitted, held = _folds(len(group), 4, 0)
+    ((fitted, held),) = Fold(lambda: [group], 0, 4, GazeFit())._split
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
 
@@ -201,12 +201,18 @@ def test_oculomotor_biases_recover_a_known_saccade_length():
     assert int(model.oculomotor(path, places)[0].argmax()) == 2
 
 
-def test_folds_hold_out_each_picture_once():
-    held = [_folds(11, 3, fold)[1] for fold in range(3)]
-    assert sorted(each for some in held for each in some) == list(range(11))
-    for fold in range(3):
-        fitted, out = _folds(11, 3, fold)
-        assert sorted(fitted + out) == list(range(11))
+def test_folds_hold_out_each_picture_once(group):
+    """Also where the pictures of a data set have two sizes, and there is another data set."""
+    few = replace(group, people=group.people[:11])
+    groups = [few, replace(few, people=few.people[:5]), replace(few, source=1)]
+    splits = [Fold(lambda: groups, number, 3, GazeFit())._split for number in range(3)]
+    for place, each in enumerate(groups):
+        assert sorted(one for split in splits for one in split[place][1]) == list(range(len(each)))
+        for fitted, held in (split[place] for split in splits):
+            assert sorted(fitted + held) == list(range(len(each)))
+    for number, split in enumerate(splits):
+        held = [place + before for (_, some), before in zip(split[:2], (0, 11), strict=True) for place in some]
+        assert held == list(range(number, 16, 3))
 
 
 def test_pictures_are_looked_at_once(tmp_path):

@@ -23,8 +23,7 @@ from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
 from semfov.sensor.lines import constant
 
-_CELLS = 52
-"""Cells along the longer side of a picture in which densities are computed."""
+_CELLS = 52  # cells along the longer side of a picture in which densities are computed
 
 _HALF = torch.float16
 

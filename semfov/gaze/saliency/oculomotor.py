@@ -8,14 +8,12 @@ from semfov.errors import check, check_shape
 
 _LENGTHS = (0.0, 0.015, 0.03, 0.05, 0.075, 0.105, 0.145, 0.2, 0.27, 0.36, 0.5, 0.7, 1.0)
 """Distances, in longer sides of the picture, between which the tables are interpolated."""
-_NEAR = (0.0, 0.02, 0.04, 0.07, 0.11, 0.16, 0.24)
-"""The same for refixation; from the last one on it has no effect."""
+_NEAR = (0.0, 0.02, 0.04, 0.07, 0.11, 0.16, 0.24)  # the same for refixation; from the last one on it has no effect
 _DIRECTIONS = 7
 _TURNS = 3
 _AGES = 4
 _NUMBERS = 12
-_MEMORY = 8
-"""Number of earlier fixations that refixation depends on, the latest ones."""
+_MEMORY = 8  # number of earlier fixations that refixation depends on, the latest ones
 
 
 class OculomotorBias(nn.Module):

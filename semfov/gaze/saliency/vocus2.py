@@ -35,7 +35,6 @@ def _twin_pyramids(
     .. math:: \sigma_c(s) = 2^{s/S} \sigma_c, \quad
         \mathrm{surround} = G(2^{s/S} \sqrt{\sigma_s^2 - \sigma_c^2}) * \mathrm{centre}
     """
-    _check_settings(centre_sigma, surround_sigma, layers, scales)
     wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
     # From one scale to the next the variance grows by this factor.
     growth = 2 ** (2 / scales)
@@ -98,8 +97,7 @@ def vocus2_saliency(
     >>> 10 <= row < 14 and 30 <= column < 34
     True
     """
-    lookup(fusion, get_args(_Fusion), "fusion")
-    lookup(color_space, get_args(_ColorSpace), "color space")
+    _check_settings(centre_sigma, surround_sigma, layers, scales, fusion, color_space)
     # Contrasts are small differences, so half precision is not enough.
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
@@ -151,9 +149,7 @@ class VOCUS2(nn.Module):
         normalise: bool = True,
     ) -> None:
         super().__init__()
-        _check_settings(centre_sigma, surround_sigma, layers, scales)
-        lookup(fusion, get_args(_Fusion), "fusion")
-        lookup(color_space, get_args(_ColorSpace), "color space")
+        _check_settings(centre_sigma, surround_sigma, layers, scales, fusion, color_space)
         self.settings: dict[str, Any] = {"centre_sigma": centre_sigma, "surround_sigma": surround_sigma}
         self.settings |= {"layers": layers, "scales": scales, "fusion": fusion, "color_space": color_space}
         self.normalise = normalise
@@ -174,8 +170,12 @@ class VOCUS2(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
 
 
-def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:
+def _check_settings(
+    centre_sigma: float, surround_sigma: float, layers: int, scales: int, fusion: str, color_space: str
+) -> None:
     check(centre_sigma > 0, "centre_sigma", "a positive number of pixels", centre_sigma)
     check(surround_sigma > centre_sigma, "surround_sigma", f"more than centre_sigma = {centre_sigma}", surround_sigma)
     check(layers >= 1, "layers", "1 or more", layers)
     check(scales >= 1, "scales", "1 or more", scales)
+    lookup(fusion, get_args(_Fusion), "fusion")
+    lookup(color_space, get_args(_ColorSpace), "color space")
