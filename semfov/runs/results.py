@@ -8,7 +8,7 @@ import math
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,26 +44,18 @@ class SceneResults:
 
     def __len__(self) -> int:
         """Number of rows."""
-        with suppress(*_DAMAGED), self._opened() as database:
-            return 0 if database is None else int(database.execute("SELECT COUNT(*) FROM scenes").fetchone()[0])
-        return 0
+        return int(next(self._rows("SELECT COUNT(*) FROM scenes"), (0,))[0])
 
     def finished(self, scenes: int) -> set[int]:
         """Numbers of the finished scenes, whose outcomes are verified but not made."""
-        numbers: set[int] = set()
-        with suppress(*_DAMAGED), self._opened() as database:
-            rows = () if database is None else database.execute("SELECT * FROM scenes")
-            numbers.update(row[0] for row in rows if row[0] < scenes and self._whole(*row))
-        return numbers
+        return {row[0] for row in self._rows("SELECT * FROM scenes WHERE number < ?", scenes) if self._whole(*row)}
 
     def items(self, scenes: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """The numbers and outcomes of finished scenes in their order, one at a time."""
-        with suppress(*_DAMAGED), self._opened() as database:
-            query = "SELECT * FROM scenes WHERE number < ? ORDER BY number"
-            for row in () if database is None else database.execute(query, (scenes,)):
-                result = self._read(*row)
-                if result is not None:
-                    yield row[0], result
+        for row in self._rows("SELECT * FROM scenes WHERE number < ? ORDER BY number", scenes):
+            result = self._read(*row)
+            if result is not None:
+                yield row[0], result
 
     def read(self, scenes: int) -> Iterator[dict[str, Any]]:
         """The outcomes of all scenes in their order, one at a time."""
@@ -103,19 +95,17 @@ class SceneResults:
             database.execute(_TABLE)
             database.executemany("INSERT OR REPLACE INTO scenes VALUES (?, ?, ?, ?)", self._waiting)
 
-    @contextmanager
-    def _opened(self) -> Iterator[sqlite3.Connection | None]:
-        """The database for reading; None where there is none."""
+    def _rows(self, query: str, *given: int) -> Iterator[tuple[Any, ...]]:
+        """The rows of a query, as far as the database is whole."""
         self.flush()
         check_regular(self.path)
         if not self.path.exists():
-            yield None
             return
         # Not read-only: what a process that was killed has half written must be undone first.
-        with closing(sqlite3.connect(self.path, timeout=_WAIT)) as database:
+        with suppress(*_DAMAGED), closing(sqlite3.connect(self.path, timeout=_WAIT)) as database:
             # A damaged text is read with other letters, and is not that of its sum.
             database.text_factory = partial(str, encoding="utf-8", errors="replace")
-            yield database
+            yield from database.execute(query, given)
 
     def _whole(self, index: int, sha256: str, seconds: str, records: str) -> bool:
         """Whether a row is as it was written, for the same scene."""
