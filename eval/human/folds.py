@@ -36,8 +36,8 @@ class StudiedFold(Fold):
         only: int | None = None,
         judges: Groups | None = None,
     ) -> None:
-        super().__init__(groups, number, count, settings, judges)
-        self._given, self._only = maps, only
+        super().__init__(groups, number, count, settings)
+        self._given, self._only, self.judges = maps, only, judges or groups
 
     @property
     def what(self) -> dict[str, object]:

@@ -30,12 +30,10 @@ ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases
 class Fold:
     """Pictures that are held out in one of `count` folds, and those a model is fitted to; looked at when needed."""
 
-    def __init__(
-        self, groups: _Groups, number: int, count: int, settings: GazeFit, judges: _Groups | None = None
-    ) -> None:
+    def __init__(self, groups: _Groups, number: int, count: int, settings: GazeFit) -> None:
         self.groups, self.number, self.count, self.settings = groups, number, count, settings
         self.title = f"fold {number + 1} of {count}"
-        self._judges = judges or groups  # the same pictures, with the fixations that are predicted
+        self.judges = groups  # the same pictures, with the fixations that are predicted
 
     @property
     def what(self) -> dict[str, object]:
@@ -76,7 +74,7 @@ class Fold:
     def scores(self, model: FixationDensity) -> Scores:
         """Scores on the held-out pictures with and without each term, and of the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, (_, some) in zip(self.groups(), self._judges(), self._split, strict=True):
+        for group, seen, (_, some) in zip(self.groups(), self.judges(), self._split, strict=True):
             known = self.maps(model, group, some)
             bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
             flat = [torch.zeros(1, *cells_of(group.size))] * len(some)

@@ -52,16 +52,13 @@ class PartInputs:
             map_steps=config.map_steps or max(300, round(1000 * share)),
         )
         self.components = len(run.scenes.classes) + 1
-        self.absent = 2 if self.components <= _FEW else None
-        """Number of absent classes to learn from in a photograph; None for as many as present ones."""
+        self.absent = 2 if self.components <= _FEW else None  # absent classes in a photograph; None: as many as present
         shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
+        # The searches and explorations that are compared, and the number of shifts and the photographs for that.
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
-        """The protocol of the searches and explorations that are compared."""
         self.compared_at = min(5, shifts)
-        """Gaze shifts after which they are compared."""
         self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
         self.judged: Sequence[int] = self.held_out[: self.config.judged]
-        """The held-out photographs on which searches and explorations are compared."""
         self.results: dict[str, PartResult] = {}
 
     def settings(self, kind: type[_Config], **own: Any) -> _Config:

@@ -59,8 +59,7 @@ class _WholeSearch(TargetSearch[WindowLook]):
         self.candidates = partial(PhotographPlaces, target, glances.lattice, window=model.window)
         self.close_up = lambda box: look_closely(glances, box, model.window).candidates
         self.steps, self.objects, self.model = (whole,), objects, model
-        self.best = float(whole.show[target - 1])
-        """Highest score of the target."""
+        self.best = float(whole.show[target - 1])  # highest score of the target
 
     def look(self, index: int, number: int) -> WindowLook:
         """The look at the whole, with the probability after it."""

@@ -216,21 +216,20 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
         if not word.startswith("--") or option not in option_names:
             usual.append(word)
             continue
-        hint, has_value = hints.get(option[2:]), bool(equals)
+        hint, given = hints.get(option[2:]), value if equals else None
         again = any(each.partition("=")[0] == option for each in usual)
         if again and hint is not bool and option != "--config":
             several = "; where it takes several, as a,b" if hint is str or _is_list(hint) else ""
             raise InputError(f"{option[2:]}: expected once, got it again{several}")
-        if hint is Path and (value if has_value else rest[0] if rest else "none") == "":
+        if hint is Path and (rest[:1] == [""] if given is None else given == ""):
             raise InputError(f"{option[2:]}: expected the name of a file or folder, got an empty one")
-        if hint is bool and not has_value:
-            value = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
-            has_value = True
-        elif _is_list(hint) and not has_value and rest and not rest[0].startswith("--"):
-            value, has_value = rest.pop(0), True
-        if has_value and _is_list(hint) and not value.startswith("["):
-            value = f"[{'' if value in ('none', '') else value}]"
-        usual.append(f"{option}={value}" if has_value else option)
+        if given is None and hint is bool:
+            given = rest.pop(0) if rest and rest[0] in _FLAGS else "true"
+        elif given is None and _is_list(hint) and rest and not rest[0].startswith("--"):
+            given = rest.pop(0)
+        if given is not None and _is_list(hint) and not given.startswith("["):
+            given = f"[{'' if given in ('none', '') else given}]"
+        usual.append(option if given is None else f"{option}={given}")
     return usual
 
 

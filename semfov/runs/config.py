@@ -295,9 +295,6 @@ class RunConfig(LookingConfig):
     Args:
         protocol: the protocol of the episodes.
         policies: the policies, each a preset by name or a mapping of settings (`PolicyConfig`).
-
-    Attributes:
-        task: the task of the policies.
     """
 
     task: ClassVar[Task] = "search"

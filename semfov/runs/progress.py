@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
@@ -93,10 +93,7 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tq
 def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:
     """Iterate over items and show a bar that moves with them (`task_bar`)."""
     listed = list(items)
-    bar = task_bar(len(listed), title, unit)
-    try:
+    with closing(task_bar(len(listed), title, unit)) as bar:
         for item in listed:
             yield item
             bar.update()
-    finally:
-        bar.close()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.scene import Scenes
+from semfov.detection.weights import cache_folder
 from semfov.io.code import class_digest, package_digest
 from semfov.io.pretrained import Pretrained
 from semfov.runs.results import ResultRecord, SceneResults
@@ -68,11 +69,7 @@ class SceneRun(ABC):
 
 def store_folder(chosen: Path | None) -> Path:
     """Folder of the stores: the chosen one, or the user's cache."""
-    if chosen is not None:
-        return chosen
-    from semfov.detection.weights import cache_folder as user_cache
-
-    return user_cache()
+    return cache_folder() if chosen is None else chosen
 
 
 def finish(run: SceneRun, title: str) -> None:

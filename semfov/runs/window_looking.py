@@ -92,13 +92,11 @@ class WindowLooking:
 def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
     """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
     objects = merge(looks, target, score=DETECTION_SCORE)
-    if not len(objects):
-        return torch.zeros(len(annotation.boxes), dtype=torch.bool)
     hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
     return hits.any(0)
 
 
-def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -> Tensor:
+def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
     """Compare objects with the annotated ones, class by class; → `(M,)`."""
     verdicts = torch.zeros(len(objects), dtype=torch.long)
     for label in objects.labels.unique().tolist():
@@ -106,13 +104,12 @@ def right_boxes(objects: Objects, annotation: Annotation, *, iou: float = 0.5) -
         there = annotation.labels == label
         single, crowd = (annotation.boxes[there & kind] for kind in (~annotation.crowd, annotation.crowd))
         boxes = objects.boxes[mine]
-        hits = (match(boxes, single.to(boxes), torch.ones(len(single)).long(), iou=iou) > 0).long()
+        hits = (match(boxes, single.to(boxes), torch.ones(len(single)).long(), iou=0.5) > 0).long()
         if len(crowd):
             low = torch.maximum(boxes[:, None, :2], crowd[:, :2])
             high = torch.minimum(boxes[:, None, 2:], crowd[:, 2:])
-            inside = (high - low).clamp(min=0).prod(-1) / (boxes[:, 2:] - boxes[:, :2]).prod(-1).clamp(min=1e-6)[
-                :, None
-            ]
+            area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
+            inside = (high - low).clamp(min=0).prod(-1) / area
             hits[(hits == 0) & (inside >= 0.5).any(-1)] = -1
         verdicts[mine] = hits
     return verdicts
