@@ -213,8 +213,13 @@ class CocoScenes(Scenes):
         self.ids = [packed.ids[row] for row in self._rows]
         names = [packed.names[row] for row in self._rows]
         self._files = [inside(root, name) for name in names]
+        for path in self._files:
+            check_regular(path, f"image {path}")
+        if missing := [path for path in self._files if not path.exists()]:
+            counts = f"{len(missing)} of {len(names)} are missing"
+            raise DataError(f"image {missing[0]}: no such file ({counts}); check data.root")
         settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
-        self.fingerprint = json_sha256([settings, names, _file_sizes(self._files)])
+        self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
 
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
@@ -341,14 +346,3 @@ def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> di
     some = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
     check_data(any(labels.values()), f"annotations {path}", some, names)
     return labels
-
-
-def _file_sizes(files: list[Path]) -> list[int]:
-    """Sizes of files, checked to be regular ones that are there."""
-    for path in files:
-        check_regular(path, f"image {path}")
-    if missing := [path for path in files if not path.exists()]:
-        raise DataError(
-            f"image {missing[0]}: no such file ({len(missing)} of {len(files)} are missing); check data.root"
-        )
-    return [path.stat().st_size for path in files]

@@ -136,27 +136,29 @@ quiet_decoders = _Quiet()
 
 
 @contextmanager
-def opening(path: Path, what: str) -> Iterator[None]:
-    """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
-    check_regular(path, f"image {path}")
+def opening(path: Path | str, what: str) -> Iterator[None]:
+    """Raise `DataError` for a file, or an open picture by its name, that cannot be read, for any error of a decoder."""
+    name, damage = (f"image {path}", "of an unsupported kind") if isinstance(path, Path) else (path, "closed")
+    if isinstance(path, Path):
+        check_regular(path, name)
     with quiet_decoders:
         try:
             yield
         except FileNotFoundError:
-            raise DataError(f"image {path}: no such file; check its path") from None
+            raise DataError(f"{name}: no such file; check its path") from None
         except PermissionError:
-            raise DataError(f"image {path}: no permission to read it; check the file's mode and owner") from None
+            raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except SemfovError:
             raise
         except Exception as error:  # decoders of damaged files raise errors of many kinds
             if type(error).__name__ == "DecompressionBombError":
                 most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
-                raise DataError(f"image {path}: {most}, got more; convert it to a tiled TIFF") from None
+                raise DataError(f"{name}: {most}, got more; convert it to a tiled TIFF") from None
             if type(error).__name__ == "UnidentifiedImageError":
-                raise DataError(f"image {path}: {_UNKNOWN}") from None
+                raise DataError(f"{name}: {_UNKNOWN}") from None
             reason = " ".join(str(error).split()) or type(error).__name__
-            damage = "truncated, damaged or of an unsupported kind"
-            raise DataError(f"image {path}: {damage}, and cannot be {what} ({reason}); replace it") from None
+            way = "replace it" if isinstance(path, Path) else "open it again or replace it"
+            raise DataError(f"{name}: truncated, damaged or {damage}, and cannot be {what} ({reason}); {way}") from None
 
 
 @contextmanager
@@ -204,15 +206,9 @@ def check_tile(size: int, stored: int, name: str) -> None:
 
 def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
-    with quiet_decoders:
-        try:
-            _check_pixels(image.size, name)
-            array = _pixels(image, name, upright=True, white=white)
-        except DataError:
-            raise
-        except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(f"{name}: truncated, damaged or closed ({reason}); open it again or replace it") from error
+    with opening(name, "decoded"):
+        _check_pixels(image.size, name)
+        array = _pixels(image, name, upright=True, white=white)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection.class_names import keep_classes, named_outputs
+from semfov.detection.class_names import named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, no_features, recorded, stride_of
 from semfov.detection.placement import Placement
@@ -54,10 +54,6 @@ class ModuleDetector(Detector):
         check_shape(canvas, "canvas", None, 3, None, None)
         check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         return canvas.to(next(self.model.parameters()).dtype)
-
-    def _named(self, candidates: Candidates) -> Candidates:
-        """The candidates without scores that do not stand for a class."""
-        return keep_classes(candidates, self._places, self._count)
 
 
 def edge_scale(images: Tensor, edges: tuple[float, float]) -> float:

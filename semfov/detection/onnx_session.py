@@ -49,16 +49,6 @@ _MOST_BATCH = 1024
 """Largest fixed batch size of a model."""
 
 
-def _with_outputs(path: Path, names: Iterable[str]) -> bytes:
-    """The content of a model with further tensors among its outputs; weights in other files stay there."""
-    import onnx
-
-    model = onnx.load(path, load_external_data=False)
-    have = {output.name for output in model.graph.output}
-    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names if name not in have)
-    return model.SerializeToString()
-
-
 class OnnxSession:
     """An inference session of one ONNX file; idle threads do not spin, which would slow down torch's next operation."""
 
@@ -102,7 +92,12 @@ class OnnxSession:
             # onnxruntime's fallback would print messages and try the same again.
             model: str | bytes = fspath(path)
             if further:
-                model = _with_outputs(self.path, further)
+                import onnx
+
+                wider = onnx.load(self.path, load_external_data=False)  # weights in other files stay there
+                have = {output.name for output in wider.graph.output}
+                wider.graph.output.extend(onnx.ValueInfoProto(name=name) for name in further if name not in have)
+                model = wider.SerializeToString()
                 folder = "session.model_external_initializers_file_folder_path"
                 options.add_session_config_entry(folder, fspath(self.path.parent))
             self._session = ort.InferenceSession(model, options, providers=chosen, disable_fallback=1)

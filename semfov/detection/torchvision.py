@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
+from semfov.detection.class_names import keep_classes
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
@@ -92,7 +93,7 @@ class TorchvisionDetector(ModuleDetector):
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
         """The classes of one image without placeholders, with one box for each row."""
-        candidates = self._named(Candidates(boxes, scores[:, self.first :]))
+        candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
         if boxes.ndim == 2:
             return candidates
         places = torch.tensor(self._places, device=boxes.device) + self.first

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from semfov.detection.class_names import keep_classes
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import HEADS
@@ -83,7 +84,8 @@ class TransformersDetector(ModuleDetector):
         outputs = self.model(pixel_values=self.preprocessing(self._pixels(canvas)))
         found = {name: getattr(outputs, name).to(canvas.dtype) for name in ("logits", "pred_boxes")}
         head = HEADS["detr" if self.softmax else "rtdetr"]
-        return self._named(head.decode(found, (canvas.shape[-1], canvas.shape[-2]), self._count))
+        candidates = head.decode(found, (canvas.shape[-1], canvas.shape[-2]), self._count)
+        return keep_classes(candidates, self._places, self._count)
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """The convolutional backbone; a model of another kind has none."""

@@ -5,6 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from semfov.detection.class_names import keep_classes
 from semfov.detection.modules import ModuleDetector, module_digest
 from semfov.detection.onnx_heads import decode_yolov8
 from semfov.detection.scores import Candidates
@@ -53,4 +54,4 @@ class UltralyticsDetector(ModuleDetector):
         expected = f"a network that returns all class scores of each box, (B, {4 + self._count}, N)"
         way = "use a detection model whose head selects no boxes (end2end off)"
         check(len(shape) == 3 and shape[1] == 4 + self._count, "detector", expected, f"{shape}; {way}")
-        return self._named(decode_yolov8(columns.to(canvas.dtype)))
+        return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from semfov.errors import InputError
+from semfov.errors import InputError, check
 
 NETWORKS = {
     "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14": "yolox-nano",
@@ -31,24 +31,18 @@ def learned_for(detector: str, growth: float) -> str:
 
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
     """Raise `InputError` where classes are given and differ from those that the model was fitted for."""
-    if classes is None or tuple(classes) == tuple(fitted):
-        return
-    if len(classes) != len(fitted):
-        raise InputError(f"classes: the {what} was fitted for {len(fitted)} classes, got {len(classes)}")
-    place, (mine, theirs) = next(
-        (i, pair) for i, pair in enumerate(zip(fitted, classes, strict=True), 1) if pair[0] != pair[1]
-    )
-    raise InputError(f"classes: the {what} was fitted with {mine!r} as class {place}, got {theirs!r}")
+    if classes is not None:
+        check(len(classes) == len(fitted), "classes", f"the {len(fitted)} that the {what} was fitted for", len(classes))
+        for place, (mine, theirs) in enumerate(zip(fitted, classes, strict=True), 1):
+            check(mine == theirs, "classes", f"{mine!r} as class {place}, as the {what} was fitted with", repr(theirs))
 
 
 def check_background(fitted: Mapping[str, Any], background: str | None, what: str) -> None:
     """Raise `InputError` where the background policy is not the one that the model was fitted with."""
     policy = fitted.get("background")
-    if background is not None and policy is not None and background != policy:
-        raise InputError(
-            f"background: the {what} was fitted on scores with background policy {policy!r}, got "
-            f"{background!r}; load the detector with background={policy!r}, or fit a model for {background!r}"
-        )
+    way = f"load the detector with background={policy!r}, or fit a model for {background!r}"
+    expected = f"the background policy {policy!r} of the scores that the {what} was fitted on"
+    check(background is None or policy in (None, background), "background", expected, f"{background!r}; {way}")
 
 
 def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
@@ -81,11 +75,9 @@ def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str, *, strict: bool = False) -> None:
     """Warn, or raise if it is strict, where the sensor has other settings than in the fit; empty ones are unknown."""
     others = _others(fitted, sensor, set()) if sensor and fitted else []
-    if others and strict:
-        raise InputError(
-            f"eye: expected the sensor that the {what} was fitted for, got another: {'; '.join(others)}; make the "
-            "sensor with these settings, or fit a model for this one (semfov fit)"
-        )
+    way = "make the sensor with these settings, or fit a model for this one (semfov fit)"
+    same = not (others and strict)
+    check(same, "eye", f"the sensor that the {what} was fitted for", f"another: {'; '.join(others)}; {way}")
     if others:
         warnings.warn(f"the {what} was fitted for another sensor: {'; '.join(others)}", stacklevel=3)
 

@@ -178,7 +178,7 @@ INVALID_IMAGES = {
         lambda folder: Image.open(io.BytesIO((folder / "cut.png").read_bytes())),
         "(image|picture): truncated, damaged or closed",
     ),
-    "closed": (lambda _: closed(), "(image|picture): truncated, damaged or closed .*open it again"),
+    "closed": (lambda _: closed(), "(image|picture): truncated, damaged or closed.*open it again"),
 }
 
 
