@@ -40,16 +40,10 @@ _PHOTOMETRIC_TAG = 0x0106
 _SUBFILE, _PAGES = 254, 64  # tag of a TIFF with its first bit for a reduced copy, and pages that are looked through
 # Moves that turn a picture with this orientation upright. All are their own inverse except 6 and 8, which are inverse
 # to each other.
-_MOVES = {
-    1: "",
-    2: "FLIP_LEFT_RIGHT",
-    3: "ROTATE_180",
-    4: "FLIP_TOP_BOTTOM",
-    5: "TRANSPOSE",
-    6: "ROTATE_270",
-    7: "TRANSVERSE",
-    8: "ROTATE_90",
-}
+_MOVES = (
+    *("", "", "FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM"),
+    *("TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90"),
+)
 _INVERSE = {6: 8, 8: 6}
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
 _SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
@@ -223,7 +217,7 @@ def _orientation(image: Any) -> int:
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
     except Exception:
         return 1
-    return orientation if orientation in _MOVES else 1
+    return int(orientation) if orientation in range(1, len(_MOVES)) else 1
 
 
 def _turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:

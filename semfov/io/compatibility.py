@@ -32,7 +32,9 @@ def learned_for(detector: str, growth: float) -> str:
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
     """Raise `InputError` where classes are given and differ from those that the model was fitted for."""
     if classes is not None:
-        check(len(classes) == len(fitted), "classes", f"the {len(fitted)} that the {what} was fitted for", len(classes))
+        check(
+            len(classes) == len(fitted), "classes", f"{len(fitted)} classes, as the {what} was fitted for", len(classes)
+        )
         for place, (mine, theirs) in enumerate(zip(fitted, classes, strict=True), 1):
             check(mine == theirs, "classes", f"{mine!r} as class {place}, as the {what} was fitted with", repr(theirs))
 

@@ -60,7 +60,18 @@ class Pretrained(StatedModule):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """Load a model that is shipped with the package, by its name, or one that `save` wrote, by its path."""
+        """Load a model that is shipped with the package or one that `save` wrote.
+
+        Args:
+            name_or_path: name of a shipped model, or path of a file.
+
+        Returns:
+            The model, in `eval` mode.
+
+        Raises:
+            InputError: no model of that name is shipped.
+            DataError: the file is missing, damaged or of another kind.
+        """
         path = Path(name_or_path)
         if path.suffix != ".safetensors" and len(path.parts) < 2:
             names = sorted(file.stem for file in cls.shipped.glob("*.safetensors"))

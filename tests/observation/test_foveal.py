@@ -224,8 +224,8 @@ def test_a_matching_detector_is_accepted_and_others_are_not(tmp_path):
     refused(r"fitted for 'toy' \(sha256 abab", load, path, detector=Toy(digest="cd" * 32))
     refused("got 'other'", load, path, detector=Toy(name="other", digest=""))
     refused("background policy 'residual' .*, got 'uniform'", load, path, detector=Toy(background="uniform"))
-    refused("'cat' as class 2, got 'cow'", load, path, detector=Toy(classes=("cup", "cow", "dog")))
-    refused("3 classes, got 2", load, path, detector=Toy(classes=("cup", "cow")))
+    refused("'cat' as class 2, .*, got 'cow'", load, path, detector=Toy(classes=("cup", "cow", "dog")))
+    refused("3 classes, .*, got 2", load, path, detector=Toy(classes=("cup", "cow")))
     with pytest.warns(UserWarning, match=r"input_size is \[320, 320\], the model was fitted with \[416, 416\]"):
         load(path, detector=Toy(input_size=[320, 320]))
 
