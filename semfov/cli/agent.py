@@ -1,7 +1,5 @@
 """The agent and the classes that the options name, with what can be checked before anything is loaded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

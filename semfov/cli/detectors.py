@@ -1,7 +1,5 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
-from __future__ import annotations
-
 from os import fspath
 
 from semfov.belief.map_evidence import MapEvidence

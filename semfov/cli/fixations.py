@@ -1,7 +1,5 @@
 """Subcommand check: says what is suspicious in files of fixations."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from inspect import signature

@@ -1,7 +1,5 @@
 """Subcommand gaze: predicts where people look in pictures, and writes scanpaths, heat maps and a page."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

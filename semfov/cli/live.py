@@ -1,7 +1,5 @@
 """Subcommand live: looks at a video, a camera or a network stream, and writes a video of the looks."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Entry point of the command `semfov`."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """Files of results: JSON, JSON lines, CSV, GeoJSON and COCO, written while pictures are looked at, and their list."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Subcommands that look at pictures: search, find and explore."""
 
-from __future__ import annotations
-
 import io
 import os
 import sys

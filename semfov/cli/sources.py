@@ -1,7 +1,5 @@
 """Pictures that a command names: files, those of folders, or an embedded scene."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from glob import glob

@@ -1,7 +1,5 @@
 """Annotations in COCO's format whose ids results take, and the average precision against them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Photographs in a folder, without annotations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sources of pictures for the agent: photographs, folders, videos, cameras and embedded scenes."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

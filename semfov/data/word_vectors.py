@@ -1,7 +1,5 @@
 """Word vectors from files in GloVe's or word2vec's text format, and the similarity of names by them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Train the target evidence on the looks of whole searches, and compare it with raw scores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Training examples, each with the looks from every cell of a photograph, and episodes over them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import ClassVar, Self

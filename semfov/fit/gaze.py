@@ -1,7 +1,5 @@
 """Fit where people look: a `FixationDensity` by maximum likelihood of fixations, and its scores on other fixations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Scores of models of where people look, on folds of the pictures that they were fitted without."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A model of where people look for a detector: fitted to all pictures, and evaluated on folds of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

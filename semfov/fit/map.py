@@ -1,7 +1,5 @@
 """Train the map of all classes on the looks of whole explorations, and compare it with raw scores."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Fit a foveal observation model to labelled detections, and report on it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """What all parts of a model folder share: how a part is fitted, and the data and the earlier parts that it may use."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, replace

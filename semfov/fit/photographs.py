@@ -1,7 +1,5 @@
 """Fit the evidence for photographs: whether one holds a class, before and after closer looks, and what an object is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

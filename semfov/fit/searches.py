@@ -1,7 +1,5 @@
 """Searches that a verification is fitted to; all searches of a photograph share its looks, each made only once."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence

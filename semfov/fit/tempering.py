@@ -1,7 +1,5 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Fit the verification of targets by closer looks, from searches of photographs with boxes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

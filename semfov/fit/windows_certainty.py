@@ -1,7 +1,5 @@
 """Fit the probability that an object of a large picture is there, on explorations of pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The part of a model folder for large pictures: evidence by magnification, fitted on mosaics of the photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any

@@ -1,7 +1,5 @@
 """Digests of code, which tell whether a stored result was computed by the present code."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Schemas of files of tensors and JSON values: names, shapes, types and ranges, and their checks."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

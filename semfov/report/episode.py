@@ -1,7 +1,5 @@
 """An episode as data for a page: pictures as JPEG, and probabilities quantised to 255 steps of their maximum."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections import Counter

@@ -1,7 +1,5 @@
 """A page of where people look in pictures, with a slider over the fixations of drawn viewers."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from html import escape

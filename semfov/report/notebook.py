@@ -1,7 +1,5 @@
 """What a notebook shows of a record: the photograph with windows and objects, or the page of a scanpath in a frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 

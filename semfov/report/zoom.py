@@ -1,7 +1,5 @@
 """Looks at a picture as data for a page: the picture, and what each look showed, as JPEG."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import pairwise
 from statistics import median

@@ -1,7 +1,5 @@
 """Looks at scenes from every cell of a grid, kept on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

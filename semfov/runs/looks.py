@@ -1,7 +1,5 @@
 """Computes the looks that are stored, bit for bit the same with any number of threads and processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache

@@ -1,7 +1,5 @@
 """Looks at scenes from every cell of a grid, and policies that choose among the cells, made from their settings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import cached_property

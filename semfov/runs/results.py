@@ -1,7 +1,5 @@
 """Outcomes of the scenes of a run, in a database to which each scene is appended, and which is read scene by scene."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

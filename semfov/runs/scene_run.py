@@ -1,7 +1,5 @@
 """The base of runs over many scenes, which several processes share and which continue after an interruption."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

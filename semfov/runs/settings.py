@@ -1,7 +1,5 @@
 """Settings whose types state their ranges, and the checks of these ranges."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

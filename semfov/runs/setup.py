@@ -1,7 +1,5 @@
 """Makes scenes, detector, eye and models from settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, TypeVar
 

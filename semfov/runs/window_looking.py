@@ -1,7 +1,5 @@
 """Looks at windows of large pictures, kept on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The columns and lines of tables, in files of text and in data frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """Fixations in the text files of EyeLink trackers (ASC, as edf2asc writes them)."""
 
-from __future__ import annotations
-
 import re
 from os import PathLike
 from pathlib import Path

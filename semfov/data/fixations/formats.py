@@ -1,7 +1,5 @@
 """JSON files of fixations: those of COCO-Search18, OSIE, and the benchmark of Travi, Ruarte, Bujia and Kamienkowski."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Conversion to and from the fixation trains of pysaliency."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

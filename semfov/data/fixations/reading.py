@@ -1,7 +1,5 @@
 """Reading of fixations from a file of any format of this folder, which its content tells."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from inspect import signature

@@ -1,7 +1,5 @@
 """What is suspicious in fixations: their frame, unit, origin and axes, a letterbox, repeats, blinks and durations."""
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence

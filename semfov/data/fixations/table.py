@@ -1,7 +1,5 @@
 """Fixations as a plain table with a line for each, which any program can write, and tables of eye trackers."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
