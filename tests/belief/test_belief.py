@@ -220,15 +220,11 @@ def test_a_detached_belief_has_the_same_values_and_no_gradients(kind):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_calling_an_observer_equals_weigh_and_update(kind):
+def test_calling_an_observer_equals_weigh_and_update_which_refuses_those_of_another_kind(kind):
     observer = OBSERVERS[kind]()
     called = observer(observer.start(2, GRID, looks().scores), looks(), FIXATIONS, GRID, 2)
     for one, other in zip(tensors_of(called), tensors_of(seen(observer)), strict=True):
         assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize("kind", OBSERVERS)
-def test_an_observer_refuses_beliefs_and_looks_of_another_kind(kind):
     observer = OBSERVERS[kind]()
     own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     for other in (make() for make in OBSERVERS.values()):

@@ -165,7 +165,18 @@ def believed(observer, looks, target):
     return belief
 
 
-def test_probability_of_any_class_is_one_minus_the_probability_of_none(inner, looks):
+def test_the_belief_in_any_of_classes_is_made_of_those_of_the_inner_observer(inner, looks):
+    alone, single = believed(inner, looks, 2), believed(AnyOf(inner, {2: 1.0, 1: 0.0}), looks, None)
+    torch.testing.assert_close(single.probability(2), alone.probability(2))
+    torch.testing.assert_close(single.presence(2), alone.presence(2))
+    torch.testing.assert_close(single.closest, alone.closest)
+    assert class_meant(single, 1) == 2
+    assert AnyOf(inner, {2: 1.0}).thresholds == inner.thresholds
+    peaks = {index: float(believed(inner, looks, index).probability(index).max()) for index in (1, 2, 3)}
+    for low in (1.0, 0.01):
+        weights = {1: low, 2: 1.0, 3: low}
+        best = max(weights, key=lambda index: weights[index] * peaks[index])
+        assert class_meant(believed(AnyOf(inner, weights), looks, None), 1) == best
     several = believed(AnyOf(inner, WEIGHTS), looks, None)
     for what in ("probability", "chance", "presence"):
         missing = 1.0
@@ -173,23 +184,6 @@ def test_probability_of_any_class_is_one_minus_the_probability_of_none(inner, lo
             missing = missing * (1 - weight * getattr(believed(inner, looks, index), what)(index))
         for asked in (1, 2, 3):
             torch.testing.assert_close(getattr(several, what)(asked), 1 - missing)
-
-
-def test_with_one_class_the_belief_equals_that_of_the_inner_observer(inner, looks):
-    alone, single = believed(inner, looks, 2), believed(AnyOf(inner, {2: 1.0, 1: 0.0}), looks, None)
-    torch.testing.assert_close(single.probability(2), alone.probability(2))
-    torch.testing.assert_close(single.presence(2), alone.presence(2))
-    torch.testing.assert_close(single.closest, alone.closest)
-    assert class_meant(single, 1) == 2
-    assert AnyOf(inner, {2: 1.0}).thresholds == inner.thresholds
-
-
-def test_the_likeliest_class_takes_the_weights_into_account(inner, looks):
-    peaks = {index: float(believed(inner, looks, index).probability(index).max()) for index in (1, 2, 3)}
-    for low in (1.0, 0.01):
-        weights = {1: low, 2: 1.0, 3: low}
-        best = max(weights, key=lambda index: weights[index] * peaks[index])
-        assert class_meant(believed(AnyOf(inner, weights), looks, None), 1) == best
 
 
 def test_belief_fades_like_that_of_the_inner_observer(inner, looks):

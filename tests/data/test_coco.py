@@ -138,7 +138,7 @@ def scenes(photographs, make_coco):
     return CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
 
 
-def test_boxes_labels_and_ids(scenes, photographs):
+def test_boxes_labels_and_ids_with_and_without_pixels(scenes, photographs):
     assert scenes.ids == [10, 20, 30]
     assert len(scenes) == 3
     first = scenes[0]
@@ -150,9 +150,6 @@ def test_boxes_labels_and_ids(scenes, photographs):
     assert torch.equal(first.image, read_image(photographs / "10.png"))
     assert scenes[2].boxes.shape == (0, 4)
     assert not scenes.repairs
-
-
-def test_annotation_without_pixels(scenes):
     for index in range(3):
         annotation, scene = scenes.annotation(index), scenes[index]
         assert torch.equal(annotation.boxes, scene.boxes)

@@ -29,15 +29,7 @@ def detections(counts: list[int], classes: int = 3, seed: int = 0) -> Detections
     return Detections(boxes, scores, mask)
 
 
-def test_count_confidence_and_labels():
-    scores = torch.tensor([[[0.5, 0.1, 0.4], [0.1, 0.6, 0.3], [0.0, 0.0, 0.0]]])
-    d = Detections(torch.zeros(1, 3, 4), scores, torch.tensor([[True, True, False]]))
-    assert d.count.tolist() == [2]
-    torch.testing.assert_close(d.confidence, torch.tensor([[0.4, 0.6, 0.0]]))
-    assert d.labels.tolist() == [[2, 1, 0]]
-
-
-def test_stack_pads_to_the_longest():
+def test_batches_are_stacked_indexed_and_counted_and_may_be_empty():
     parts = [detections([2, 1]), detections([4], seed=1), Detections.empty(1, 3)]
     whole = Detections.stack(parts)
     assert whole.count.tolist() == [2, 1, 4, 0]
@@ -45,9 +37,6 @@ def test_stack_pads_to_the_longest():
     assert not whole.boxes[~whole.mask].any()
     torch.testing.assert_close(whole.boxes[2], parts[1].boxes[0])
     torch.testing.assert_close(whole.scores[0, :2], parts[0].scores[0])
-
-
-def test_batches_are_indexed_by_image_and_may_be_empty():
     d = detections([2, 1, 3])
     assert d[1:].count.tolist() == [1, 3]
     assert d[0].count.item() == 2
@@ -58,6 +47,11 @@ def test_batches_are_indexed_by_image_and_may_be_empty():
     assert d.count.tolist() == [0, 0]
     assert d.labels.shape == (2, 0)
     refused("at least one", Detections.stack, [])
+    scores = torch.tensor([[[0.5, 0.1, 0.4], [0.1, 0.6, 0.3], [0.0, 0.0, 0.0]]])
+    d = Detections(torch.zeros(1, 3, 4), scores, torch.tensor([[True, True, False]]))
+    assert d.count.tolist() == [2]
+    torch.testing.assert_close(d.confidence, torch.tensor([[0.4, 0.6, 0.0]]))
+    assert d.labels.tolist() == [[2, 1, 0]]
 
 
 EXACT = {"atol": 1e-12, "rtol": 0}

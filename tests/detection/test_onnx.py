@@ -304,7 +304,7 @@ def test_scores_without_sigmoid_need_the_option_logits(make_onnx):
     torch.testing.assert_close(found.objectness[0], raw[:, 4].sigmoid())
 
 
-def test_scores_of_unused_class_ids_are_dropped(make_onnx):
+def test_classes_are_those_of_coco_by_default_and_unused_ids_are_dropped(make_onnx):
     outputs, _ = yolox()
     path = make_onnx(outputs)
     whole = load_onnx(path, classes=NAMES)
@@ -312,9 +312,6 @@ def test_scores_of_unused_class_ids_are_dropped(make_onnx):
     assert part.classes == ("cat", "cup")
     canvas = torch.ones(1, 3, SIDE, SIDE)
     assert torch.equal(part.propose(canvas).classes, whole.propose(canvas).classes[..., [0, 2]])
-
-
-def test_coco_class_names_are_the_default_for_80_and_91_classes(make_onnx):
     assert load_onnx(make_onnx({"output": random(1, 84, 85) - 0.5})).classes == COCO_CLASSES
     outputs = {"logits": 9 * random(1, 9, 92), "pred_boxes": random(1, 9, 4)}
     detector = load_onnx(make_onnx(outputs))

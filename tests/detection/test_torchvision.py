@@ -179,14 +179,6 @@ def test_candidates_have_all_class_scores_before_any_threshold(small):
             assert found.background is None
 
 
-def test_faster_rcnn_without_a_proposal():
-    model = MODELS["Faster R-CNN"]()
-    model.rpn.score_thresh = 1.1
-    found = TorchvisionDetector(model, classes=NAMES)(torch.rand(2, 3, 64, 64))
-    assert found.boxes.shape == (2, 0, 4)
-    assert found.scores.shape == (2, 0, 4)
-
-
 def test_the_canvas_equals_the_output_of_the_transform(small):
     transform = small.model.transform
     for size in ((37, 91), (300, 20), (64, 64), (100, 101)):
@@ -198,13 +190,6 @@ def test_the_canvas_equals_the_output_of_the_transform(small):
         torch.testing.assert_close(transform.normalize(canvas)[0], expected.tensors[0, :, :rows, :columns])
         corner = torch.tensor([0.0, 0.0, columns, rows], dtype=torch.float64)
         torch.testing.assert_close(placement.boxes_to_image(corner)[2:].tolist(), [float(n) for n in size[::-1]])
-
-
-def test_settings_contain_the_input_size():
-    detector = TorchvisionDetector(MODELS["FCOS"](), classes=NAMES)
-    assert detector.settings()["min_size"] == [64]
-    assert detector.input_size == (96, 96)
-    assert TorchvisionDetector(MODELS["SSD"](), classes=NAMES).input_size == (72, 56)
 
 
 @pytest.fixture(scope="module")
@@ -295,13 +280,22 @@ def test_a_model_in_memory_is_a_detector(kind):
     refused("classes: expected the names of the model's outputs after the first", load_detector, model)
 
 
-def test_models_may_have_the_outputs_of_coco_or_none_for_background():
+def test_models_may_have_other_outputs_and_sizes_and_propose_nothing():
     model = RetinaNet(Backbone(32), 91, anchor_generator=anchors((16,), (32,)), **SMALL)
     assert load_detector(model).classes == COCO_CLASSES
     model = RetinaNet(Backbone(32), 3, anchor_generator=anchors((16,), (32,)), **SMALL)
     detector = TorchvisionDetector(model, classes=NAMES, first=0)
     canvas = torch.rand(1, 3, 64, 64)
     assert torch.equal(detector.propose(canvas).classes[0], detector.outputs(canvas)[0][1])
+    detector = TorchvisionDetector(MODELS["FCOS"](), classes=NAMES)
+    assert detector.settings()["min_size"] == [64]
+    assert detector.input_size == (96, 96)
+    assert TorchvisionDetector(MODELS["SSD"](), classes=NAMES).input_size == (72, 56)
+    model = MODELS["Faster R-CNN"]()
+    model.rpn.score_thresh = 1.1
+    found = TorchvisionDetector(model, classes=NAMES)(torch.rand(2, 3, 64, 64))
+    assert found.boxes.shape == (2, 0, 4)
+    assert found.scores.shape == (2, 0, 4)
 
 
 def test_invalid_options_are_refused():

@@ -97,19 +97,13 @@ def test_values_have_the_dtype_of_the_belief(name):
     torch.testing.assert_close(values.double(), EVERY[name]()(known, visits()), rtol=1e-4, atol=1e-4)
 
 
-def test_a_belief_before_the_first_look(name):
+def test_every_function_takes_beliefs_before_the_first_look_and_of_its_kind_and_needs_no_visits(name):
     """Without `closest`, and with no visited cell."""
     values = EVERY[name]()(DirichletBelief(torch.full((3, 12, 4), 0.5)), torch.zeros(3, 12, dtype=torch.bool))
     assert values.shape == (3, 12)
     assert bool(values.isfinite().all())
-
-
-def test_values_do_not_depend_on_visited_cells(name):
     function = EVERY[name]()
     assert torch.equal(function(beliefs(), visits()), function(beliefs(), ~visits()))
-
-
-def test_a_belief_about_one_target_is_refused_if_all_classes_are_needed(name):
     present, closest = draw(3, 12), small.GRID.cell_distance[[0, 6, 11]].double()
     known, function = target_belief(present, present, closest), EVERY[name]()
     if name in OF_ONE_TARGET:

@@ -151,14 +151,11 @@ def test_a_hard_fixation_has_the_gradient_of_the_soft_one(visited, dtype):
     assert gradients[0].abs().max() > 0.1
 
 
-def test_soft_fixation_gradcheck(visited):
+def test_soft_fixations_have_gradients_and_at_low_temperature_are_cell_centres(visited):
     torch.manual_seed(0)
     centres, noise = GRID.centres.double(), torch.rand(3, CELLS).double()
     logits = torch.randn(3, CELLS, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: soft_fixation(x, visited, centres, noise, hard=False)[0], logits)
-
-
-def test_soft_fixations_at_low_temperature_are_cell_centres(visited):
     torch.manual_seed(0)
     centres, noise = GRID.centres, torch.rand(3, CELLS)
     noise[0, 0], noise[1, 1] = 0.0, 1.0  # ends of the range

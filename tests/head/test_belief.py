@@ -407,16 +407,7 @@ def test_regions_match_the_boxes_of_the_photographs(scenes):
     assert start == len(regions)
 
 
-def test_a_seed_repeats_a_panorama_and_uses_each_photograph_once(scenes):
-    one, same, other = (Panoramas(scenes, rings=((0.0, 5),), width=256, count=3, seed=seed) for seed in (1, 1, 2))
-    assert torch.equal(one[2].image, same[2].image)
-    assert one.fingerprint == same.fingerprint != other.fingerprint
-    assert one.digest(2) == same.digest(2) != one.digest(1)
-    assert one.patches(0) != other.patches(0)
-    assert sorted(patch.scene for patch in one.patches(0)) == [0, 1, 2, 3, 4]
-
-
-def test_no_two_photographs_overlap(scenes):
+def test_photographs_of_a_panorama_do_not_overlap_are_used_once_and_their_boxes_lie_in_it(scenes):
     from semfov.sensor.sphere import Camera, Regions
 
     patches = Panoramas(scenes, width=256, count=1).patches(0)
@@ -425,9 +416,6 @@ def test_no_two_photographs_overlap(scenes):
     for number in range(len(patches)):
         others = torch.cat([held[number, :number], held[number, number + 1 :]])
         assert not others.any()
-
-
-def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
     panoramas = Panoramas(scenes, width=1024, count=1)
     annotation = panoramas.annotation(0)
     assert annotation.size == (1024, 512)
@@ -435,6 +423,12 @@ def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
     assert (annotation.boxes[:, 0] >= 0).all()
     assert (annotation.boxes[:, 0] <= 1024).all()
     assert panoramas.targets(0) == sorted(set(annotation.labels.tolist()))
+    one, same, other = (Panoramas(scenes, rings=((0.0, 5),), width=256, count=3, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one[2].image, same[2].image)
+    assert one.fingerprint == same.fingerprint != other.fingerprint
+    assert one.digest(2) == same.digest(2) != one.digest(1)
+    assert one.patches(0) != other.patches(0)
+    assert sorted(patch.scene for patch in one.patches(0)) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def test_maps_are_read_where_the_picture_lies_on_the_canvas(model):
     torch.testing.assert_close(read, rows[:, None].expand(26, 52))
 
 
-def test_without_map_and_biases_the_centre_bias_is_left(model, maps):
+def test_terms_add_up_and_may_be_left_out_and_a_new_model_has_no_oculomotor_biases(model, maps):
     density = model(maps, (39, 52), without=["map"])
     expected = torch.nn.functional.interpolate(model.centre[None, None], (39, 52), mode="bilinear")[0, 0]
     expected = (model.centre_weight * expected).flatten().log_softmax(0).view(39, 52)
@@ -99,9 +99,6 @@ def test_without_map_and_biases_the_centre_bias_is_left(model, maps):
     flat = model(maps, (39, 52), without=["map", "centre bias"])
     torch.testing.assert_close(flat, torch.full_like(flat, -math.log(39 * 52)))
     refused("without", model, maps, (39, 52), without=["centre"])
-
-
-def test_terms_add_up_and_a_new_model_has_no_oculomotor_biases(model, maps):
     path = 40 * rand(2, 3, 2).double()
     terms = model.terms(maps, (39, 52), path)
     assert list(terms) == ["map", "centre bias", "oculomotor biases"]
@@ -224,14 +221,6 @@ def test_mean_and_max_equal_a_brute_force(height: int, width: int, columns: int,
         np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
 
 
-def test_gradients_and_compilation() -> None:
-    saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
-    for reduction in ("mean", "max"):
-        assert torch.autograd.gradcheck(lambda x, how=reduction: cell_saliency(x, 3, 2, how), saliency)
-        compiled = torch.compile(cell_saliency, fullgraph=True, backend="eager")
-        torch.testing.assert_close(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
-
-
 def test_bad_input(model):
     refused("saliency", cell_saliency, torch.zeros((4, 4)), 2, 2, "mean")
     refused("saliency", cell_saliency, torch.zeros((1, 1, 4, 4)), 2, 2, "mean")
@@ -242,13 +231,18 @@ def test_bad_input(model):
     refused("layers", other.load_state_dict, model.state_dict())
 
 
-def test_cells_are_those_of_the_grid_and_maps_of_integers_are_refused():
+def test_cells_are_those_of_the_grid_with_gradients_and_in_one_graph_and_maps_of_integers_are_refused():
     saliency = torch.zeros(1, 47, 61)
     saliency[0, 33, 50] = 1.0
     expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
     for reduction in ("mean", "max"):
         assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
     refused("saliency", cell_saliency, torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)
+    saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
+    for reduction in ("mean", "max"):
+        assert torch.autograd.gradcheck(lambda x, how=reduction: cell_saliency(x, 3, 2, how), saliency)
+        compiled = torch.compile(cell_saliency, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
 
 
 PLACE = Placement((80, 60), (0.5, 0.5), (2.0, 4.0))
