@@ -144,7 +144,7 @@ def test_symbol_of_the_page_exists(symbol):
     pytest.fail(f"{symbol} does not exist")
 
 
-def test_every_equation_of_the_paper_is_listed_with_its_code_or_the_reason_for_none():
+def test_every_equation_and_figure_of_the_paper_is_listed_with_its_code_or_the_reason_for_none():
     rows = rows_of("The paper's equations")
     assert [int(number) for number, *_ in rows] == list(range(1, len(EQUATIONS) + 1))
     assert [None if label == "without a label" else label.strip("`") for _, label, *_ in rows] == EQUATIONS
@@ -154,9 +154,6 @@ def test_every_equation_of_the_paper_is_listed_with_its_code_or_the_reason_for_n
     cited = {int(number) for group in re.findall(r"\((\d+(?:, \d+)*)\) \|", PAGE) for number in group.split(", ")}
     assert len(cited) > 10
     assert max(cited) <= len(EQUATIONS)
-
-
-def test_every_figure_of_the_paper_is_listed_with_its_command_or_the_reason_for_none():
     rows = rows_of("The paper's figures")
     commands = {label.strip("`"): command for label, _, command in rows}
     assert list(commands) == DRAWN

@@ -52,7 +52,7 @@ def agent_with(observer, policy=None):
 
 
 @pytest.mark.parametrize("name", observers())
-def test_after_a_long_gap_a_frame_is_as_the_first(name):
+def test_beliefs_fade_by_the_rate_and_after_a_long_gap_a_frame_is_as_the_first(name):
     """A camera that comes back after hours has told nothing that still counts."""
     agent, image = agent_with(observers()[name]), scene(100, 80)
     live = agent.live("green", seed=5, how="fovea", start=3)
@@ -60,6 +60,19 @@ def test_after_a_long_gap_a_frame_is_as_the_first(name):
     after = live.step(image, passed=1e9)
     fresh = agent.live("green", seed=5, how="fovea", start=after.cell).step(image)
     torch.testing.assert_close(after.probability, fresh.probability, rtol=1e-4, atol=1e-6)
+    observer, grid = observers()[name], Grid(8, 6, SIZE)
+    eye, like = agent_with(observer).eye, torch.zeros(1)
+    fixation = grid.centres[[20]]
+    seen = eye(scene(100, 80), fixation)
+    look = observer.weigh(seen, fixation, grid, 2)
+    belief = observer.update(observer.start(1, grid, like), look)
+    visited = torch.zeros(1, 48, dtype=torch.bool)
+    for before, after in zip(tensors(belief), tensors(observer.fade(belief, look, 1.0, visited)), strict=True):
+        assert torch.equal(before, after)
+    # The remaining evidence hardly changes the belief after the next look.
+    fresh = observer.update(observer.start(1, grid, like), look)
+    again = observer.update(observer.fade(belief, look, 1e-7, visited), look)
+    torch.testing.assert_close(again.probability(2), fresh.probability(2), atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", observers())
@@ -95,23 +108,6 @@ def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration
         assert moment.cell == cell
         assert torch.equal(moment.belief.class_probabilities()[0], map_)
         assert torch.equal(moment.probability, 1 - map_[:, 0])
-
-
-@pytest.mark.parametrize("name", observers())
-def test_beliefs_do_not_fade_at_rate_zero_and_vanish_at_a_high_rate(name):
-    observer, grid = observers()[name], Grid(8, 6, SIZE)
-    eye, like = agent_with(observer).eye, torch.zeros(1)
-    fixation = grid.centres[[20]]
-    seen = eye(scene(100, 80), fixation)
-    look = observer.weigh(seen, fixation, grid, 2)
-    belief = observer.update(observer.start(1, grid, like), look)
-    visited = torch.zeros(1, 48, dtype=torch.bool)
-    for before, after in zip(tensors(belief), tensors(observer.fade(belief, look, 1.0, visited)), strict=True):
-        assert torch.equal(before, after)
-    # The remaining evidence hardly changes the belief after the next look.
-    fresh = observer.update(observer.start(1, grid, like), look)
-    again = observer.update(observer.fade(belief, look, 1e-7, visited), look)
-    torch.testing.assert_close(again.probability(2), fresh.probability(2), atol=1e-4, rtol=1e-4)
 
 
 def test_dirichlet_parameters_return_to_the_prior_exponentially():

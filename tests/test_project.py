@@ -85,14 +85,11 @@ def test_the_oldest_versions_are_the_lower_bounds():
     )
 
 
-def test_checks_before_a_commit_are_part_of_make_test():
+def test_commands_of_workflows_exist_and_checks_before_a_commit_are_part_of_make_test():
     hooks = [hook for repo in read(".pre-commit-config.yaml")["repos"] for hook in repo["hooks"]]
     targets = [hook["entry"].removeprefix("make ") for hook in hooks]
     assert {"lint", "types"} <= set(targets) <= RECIPES.keys()
     assert {"lint", "types"} <= set(RECIPES["test"].split())
-
-
-def test_the_commands_of_the_workflows_exist():
     jobs = {
         name: job
         for path in ("test", "docs", "release")

@@ -85,7 +85,7 @@ def looked(observer, four, rows, target):
 
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_a_batch_of_episodes_equals_each_of_them_alone(kind, four):
+def test_episodes_and_looks_of_a_batch_equal_each_of_them_alone(kind, four):
     """Bit for bit, after two looks of each, for targets of their own."""
     observer = OBSERVERS[kind]()
 
@@ -99,12 +99,6 @@ def test_a_batch_of_episodes_equals_each_of_them_alone(kind, four):
     batch = watched(range(4))
     for row in range(4):
         assert equal(batch[row : row + 1], watched([row]))
-
-
-@pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("kind", OBSERVERS)
-def test_looks_weighed_in_a_batch_equal_looks_weighed_alone(kind, four):
-    """Bit for bit, so that looks can be weighed once, selected and used by many episodes, which may be selected too."""
     observer = OBSERVERS[kind]()
     together = looked(observer, four, slice(None), 2)
     alone = [looked(observer, four, slice(row, row + 1), 2) for row in range(4)]
@@ -190,7 +184,7 @@ def test_probability_of_a_target_equals_a_loop():
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_map_is_applied_to_every_tensor_of_every_kind(kind):
+def test_map_is_applied_to_every_tensor_of_every_kind_and_a_detached_belief_has_no_gradients(kind):
     belief = seen(OBSERVERS[kind]())
     met = []
 
@@ -204,10 +198,6 @@ def test_map_is_applied_to_every_tensor_of_every_kind(kind):
     for before, after in zip(tensors_of(belief), tensors_of(other), strict=True):
         assert after is not before
         assert torch.equal(after, before)
-
-
-@pytest.mark.parametrize("kind", OBSERVERS)
-def test_a_detached_belief_has_the_same_values_and_no_gradients(kind):
     observer = OBSERVERS[kind]()
     boxes, mask = looks().boxes, looks().mask
     scores = looks().scores.requires_grad_()

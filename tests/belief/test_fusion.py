@@ -61,13 +61,26 @@ def test_the_rule_of_semba_divides_only_the_second_term(likelihood, data):
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_rules_ignore_scale_and_order_of_classes(rule):
+def test_rules_ignore_scale_and_order_of_classes_have_gradients_and_refuse_other_likelihoods(rule):
     torch.manual_seed(1)
     beta, likelihood = torch.rand(7, 4).double() + 0.1, torch.rand(7, 4).double()
     after = rule(beta, likelihood)
     torch.testing.assert_close(rule(beta, likelihood * 1e-30), after)
     for order in itertools.permutations(range(4)):
         torch.testing.assert_close(rule(beta[:, order], likelihood[:, order]), after[:, order])
+    torch.manual_seed(2)
+    beta = (torch.rand(3, 4, dtype=torch.float64) + 0.2).requires_grad_()
+    likelihood = (torch.rand(3, 4, dtype=torch.float64) + 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(rule, (beta, likelihood))
+    beta, likelihood = torch.rand(5, 4) + 0.1, torch.rand(5, 4)
+    compiled = torch.compile(rule, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(beta, likelihood), rule(beta, likelihood))
+    with pytest.raises(InputError, match=r"^likelihood: expected a tensor of shape \(..., 3\), got \(4, 2\)$"):
+        rule(torch.ones(4, 3), torch.ones(4, 2))
+    beta, likelihood = np.ones(3), np.array([0.5, 0.2, 0.3])
+    with pytest.raises(InputError, match=r"^beta: expected a tensor, got a NumPy array; give torch\.as_tensor\(beta\)"):
+        rule(beta, torch.from_numpy(likelihood))
+    refused(r"^likelihood: expected a tensor, got a NumPy array", rule, torch.from_numpy(beta), likelihood)
 
 
 @given(st.lists(score_lists.filter(lambda values: min(values) > 1e-3), min_size=1, max_size=5), st.data())
@@ -107,17 +120,6 @@ def test_unusable_likelihoods_are_refused(rule, bad, word):
     refused(rf"^likelihood: .*, got {word}$", rule, torch.ones(2, 2), torch.tensor([[1.0, 2.0], bad]))
 
 
-@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_rules_have_gradients_and_are_one_graph(rule):
-    torch.manual_seed(2)
-    beta = (torch.rand(3, 4, dtype=torch.float64) + 0.2).requires_grad_()
-    likelihood = (torch.rand(3, 4, dtype=torch.float64) + 0.1).requires_grad_()
-    assert torch.autograd.gradcheck(rule, (beta, likelihood))
-    beta, likelihood = torch.rand(5, 4) + 0.1, torch.rand(5, 4)
-    compiled = torch.compile(rule, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(beta, likelihood), rule(beta, likelihood))
-
-
 def test_extreme_likelihoods_stay_finite():
     likelihood = torch.tensor([1e-38, 1.0, 3e38])
     for rule in fusion.RULES.values():
@@ -126,16 +128,6 @@ def test_extreme_likelihoods_stay_finite():
             beta = rule(beta, fusion._scale_likelihood(likelihood))
         assert torch.isfinite(beta).all()
         assert (beta > 0).all()
-
-
-@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_likelihoods_of_other_classes_or_of_numpy_are_refused(rule):
-    with pytest.raises(InputError, match=r"^likelihood: expected a tensor of shape \(..., 3\), got \(4, 2\)$"):
-        rule(torch.ones(4, 3), torch.ones(4, 2))
-    beta, likelihood = np.ones(3), np.array([0.5, 0.2, 0.3])
-    with pytest.raises(InputError, match=r"^beta: expected a tensor, got a NumPy array; give torch\.as_tensor\(beta\)"):
-        rule(beta, torch.from_numpy(likelihood))
-    refused(r"^likelihood: expected a tensor, got a NumPy array", rule, torch.from_numpy(beta), likelihood)
 
 
 def fuse_by_loop(beta, likelihood, footprint, rule):
@@ -149,7 +141,7 @@ def fuse_by_loop(beta, likelihood, footprint, rule):
 
 
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
-def test_fuse_equals_the_loop(name, dtype):
+def test_fuse_equals_the_loop_and_weights_of_the_footprint_are_exponents_of_the_likelihood(name, dtype):
     torch.manual_seed(0)
     beta = torch.rand(3, 6, 5, dtype=dtype) + 0.2
     likelihood = torch.rand(3, 7, 5, dtype=dtype)
@@ -158,6 +150,17 @@ def test_fuse_equals_the_loop(name, dtype):
     got = fuse(beta, likelihood, footprint, name)
     torch.testing.assert_close(got, fuse_by_loop(beta, likelihood, footprint, getattr(fusion, name)))
     assert torch.equal(beta, before)
+    beta, likelihood, footprint = (tensor[0] for tensor in stacked_maps(soft=True))
+    expected = beta.clone()
+    for image, detection, cell in footprint.nonzero().tolist():
+        said = (likelihood[image, detection] / likelihood[image, detection].max()) ** footprint[image, detection, cell]
+        expected[image, cell] = getattr(fusion, name)(expected[image, cell], said)
+    got = fuse(beta, likelihood, footprint.to(dtype), name)
+    torch.testing.assert_close(got, expected)
+    rows = torch.func.vmap(lambda b, l, f: fuse(b[None], l[None], f[None], name)[0])(
+        beta, likelihood, footprint.to(dtype)
+    )
+    torch.testing.assert_close(rows, expected)
 
 
 def test_fuse_changes_nothing_if_detections_cover_no_cell():
@@ -206,22 +209,6 @@ def test_likelihoods_of_raw_scores_and_of_a_model_at_the_distance_of_each_box():
     torch.testing.assert_close(raw[0, 2], torch.full((3,), 1 / 3))
     tempered = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid, tempering=0.25)
     torch.testing.assert_close(tempered, raw.double().pow(0.25).float())
-
-
-@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
-def test_weights_of_the_footprint_are_exponents_of_the_likelihood(name, dtype):
-    """Row by row: λ to the power of its weight, scaled to a largest value of 1."""
-    beta, likelihood, footprint = (tensor[0] for tensor in stacked_maps(soft=True))
-    expected = beta.clone()
-    for image, detection, cell in footprint.nonzero().tolist():
-        said = (likelihood[image, detection] / likelihood[image, detection].max()) ** footprint[image, detection, cell]
-        expected[image, cell] = getattr(fusion, name)(expected[image, cell], said)
-    got = fuse(beta, likelihood, footprint.to(dtype), name)
-    torch.testing.assert_close(got, expected)
-    rows = torch.func.vmap(lambda b, l, f: fuse(b[None], l[None], f[None], name)[0])(
-        beta, likelihood, footprint.to(dtype)
-    )
-    torch.testing.assert_close(rows, expected)
 
 
 @pytest.mark.parametrize("batched", [0, 1, 2])

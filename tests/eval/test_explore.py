@@ -126,7 +126,7 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     torch.testing.assert_close(people, log.exp().unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1))
 
 
-def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
+def test_stored_saliency_depends_neither_on_the_detector_nor_on_the_code_of_beliefs_and_policies(finished, tmp_path):
     """The input size and the threshold of the detector do not change the foveated image."""
     alone = replace(finished, policies=("vocus2-raw",))
     small = replace(alone, detector=DetectorConfig(input_size=224, threshold=0.2), cache=tmp_path, out=tmp_path)
@@ -134,9 +134,6 @@ def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
     assert other.store.key != run.store.key
     assert other.saliency_stores["vocus2"].key == run.saliency_stores["vocus2"].key
     assert torch.equal(other.saliency("vocus2", 0), run.saliency("vocus2", 0))
-
-
-def test_stored_saliency_does_not_depend_on_the_code_of_beliefs_and_policies():
     code = {path.stem for path in _closure(saliency_store._SOURCES, lambda name: name.startswith("semfov."))}
     assert {"vocus2", "itti", "grid"} <= code
     assert not {"fusion", "belief", "config", "candidates", "choice"} & code

@@ -394,14 +394,10 @@ def test_blocks_of_cells_change_no_bit(observation, samples, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_a_batch_may_have_any_number_of_dimensions(name, observation):
+def test_a_batch_may_have_any_number_of_dimensions_and_each_image_its_own_distances(name, observation):
     acquisition, beta = ACQUISITIONS[name](observation, TALL), beliefs(TALL, batch=4)
     together = values_of(acquisition, beta.view(2, 2, 10, 5)).flatten(0, 1)
     torch.testing.assert_close(torch.stack([values_of(acquisition, row) for row in beta]), together)
-
-
-@pytest.mark.parametrize("name", ACQUISITIONS)
-def test_every_image_of_a_batch_has_its_own_distances(name, observation):
     sizes = torch.tensor([[64.0, 30.0], [30.0, 90.0]])
     beta = beliefs(WIDE, batch=2)
     both = values_of(ACQUISITIONS[name](observation, Grid(4, 2, sizes)), beta)

@@ -325,7 +325,7 @@ class Sharp:
 
 
 @pytest.mark.parametrize("kind", [EntropyLimit, CorrectLocalisation])
-def test_with_a_fovea_of_one_cell_they_fixate_the_most_probable_place(kind):
+def test_with_a_fovea_of_one_cell_they_fixate_the_most_probable_place_and_by_a_uniform_prior_the_centre(kind):
     """Published: for a searcher who sees only the fixated cell, the most probable place is the best fixation."""
     beta = torch.rand(20, 12, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
     belief = DirichletBelief(beta)
@@ -341,11 +341,6 @@ def test_with_a_fovea_of_one_cell_they_fixate_the_most_probable_place(kind):
     if kind is CorrectLocalisation:
         ranks = TargetPosterior(1)(belief, visited).masked_fill(visited, -inf).argsort(-1, descending=True)
         assert bool(((cells[0] == ranks[:, 0]) | (cells[0] == ranks[:, 1])).all())
-
-
-@pytest.mark.parametrize("kind", [EntropyLimit, CorrectLocalisation])
-def test_with_a_uniform_prior_the_first_fixation_is_at_the_centre(kind):
-    """Published: first fixations of the ideal searcher are central, where most of the display is seen best."""
     grid, belief = Grid(5, 5, (100, 100)), DirichletBelief(torch.ones(1, 25, 3, dtype=torch.float64))
     assert int(kind(1, make_model(), grid)(belief, nothing_visited(belief)).argmax()) == 12
 

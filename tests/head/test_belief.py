@@ -238,13 +238,24 @@ def world(request):
     return Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
 
 
-def test_points_are_converted_to_the_scene_and_back(world):
+def test_points_and_boxes_are_converted_to_the_scene_and_back(world):
     points = torch.rand(40, 2) * 40
     for row in world.poses(60.0):
         there = world.to_scene(points, row[0])
         back, inside = world.to_view(there, row[0])
         torch.testing.assert_close(back, points, atol=2e-3, rtol=0)
         assert inside.all()
+    boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
+    pose = world.poses(60.0)[1][1]
+    places = world.places(boxes, pose)
+    for number, (x1, y1, x2, y2) in enumerate(boxes.tolist()):
+        inside = torch.tensor([[x1 + 0.5, y1 + 0.5], [x2 - 1.5, y2 - 1.5], [(x1 + x2) / 2, (y1 + y2) / 2]])
+        outside = torch.tensor([[x1 - 2, y1], [x1, y1 - 2]])
+        assert places.contain(world.to_scene(inside, pose))[number].all()
+        assert not places.contain(world.to_scene(outside, pose))[number].any()
+    back, _ = world.to_view(places.samples(2).flatten(0, 1), pose)
+    corners = back.view(2, 4, 2)[:, [0, 3]].flatten(1) + 0.5
+    torch.testing.assert_close(corners, boxes, atol=5e-2, rtol=0)
 
 
 def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
@@ -257,20 +268,6 @@ def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
     else:
         latitude = torch.rad2deg(torch.asin(-world.centres[:, 1]))
         assert seen[latitude.abs() < 60].all()
-
-
-def test_boxes_are_converted_to_places_and_back(world):
-    boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
-    pose = world.poses(60.0)[1][1]
-    places = world.places(boxes, pose)
-    for number, (x1, y1, x2, y2) in enumerate(boxes.tolist()):
-        inside = torch.tensor([[x1 + 0.5, y1 + 0.5], [x2 - 1.5, y2 - 1.5], [(x1 + x2) / 2, (y1 + y2) / 2]])
-        outside = torch.tensor([[x1 - 2, y1], [x1, y1 - 2]])
-        assert places.contain(world.to_scene(inside, pose))[number].all()
-        assert not places.contain(world.to_scene(outside, pose))[number].any()
-    back, _ = world.to_view(places.samples(2).flatten(0, 1), pose)
-    corners = back.view(2, 4, 2)[:, [0, 3]].flatten(1) + 0.5
-    torch.testing.assert_close(corners, boxes, atol=5e-2, rtol=0)
 
 
 def test_cells_contain_their_centres_and_panoramas_are_twice_as_wide_as_high(world):

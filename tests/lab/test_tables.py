@@ -261,26 +261,19 @@ def test_error_of_the_area_is_that_of_delong():
     assert float(got.error) == pytest.approx(expected, rel=0.08)
 
 
-def test_differences_are_paired():
+def test_differences_are_paired_samples_without_a_figure_do_not_count_and_the_seed_decides_them():
     """Two figures that differ by a constant differ without an error."""
     drawn = Bootstrap.of(lambda index: torch.stack([CASES[index].mean(), CASES[index].mean() + 3]), GROUPS)
     apart = drawn.less(0)
     assert apart.value.tolist() == [0, 3]
     assert apart.error.tolist() == pytest.approx([0, 0], abs=1e-12)
     assert drawn.error[0] > 1
-
-
-def test_samples_without_a_figure_do_not_count():
-    """The mean of the even cases is NaN in samples that hold none."""
     values = torch.tensor([1.0, torch.nan, 5.0], dtype=torch.float64)
     drawn = Bootstrap.of(lambda index: values[index].nanmean(), range(3), samples=500)
     left = drawn.samples[~drawn.samples.isnan()]
     assert 0 < len(left) < 500
     assert float(drawn.error) == pytest.approx(float(left.std()))
     assert drawn.interval().tolist() == left.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
-
-
-def test_the_seed_decides_the_samples_of_given_cases():
     draws = [Bootstrap.of(mean_of(CASES), GROUPS, seed=seed).samples for seed in (0, 0, 1)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])

@@ -31,21 +31,18 @@ def test_standard_error():
     np.testing.assert_allclose(standard_error(np.array([[1.0, 2.0], [4.0, 2.0]])), [1.5, 0])
 
 
-def test_random_search_equals_simulation():
-    generator = np.random.default_rng(0)
-    hits = np.array([min(np.flatnonzero(np.isin(generator.permutation(19), range(3)))) + 1 for _ in range(20_000)])
-    simulated = [(hits <= n).mean() for n in range(20)]
-    np.testing.assert_allclose(random_search(3, 19, cells=20), simulated, atol=0.015)
-    assert random_search(3, 25, cells=20)[-1] == 1
-
-
-def test_curves_by_hand():
+def test_curves_by_hand_and_random_search_equals_simulation():
     found = np.array([[1, -1, 2], [0, 0, 5]])
     curves = cumulative_performance(found, 3)
     np.testing.assert_allclose(curves, [[0, 1 / 3, 2 / 3, 2 / 3], [2 / 3] * 4])
     # By default there are 100 cells, and the search starts in one of them.
     np.testing.assert_allclose(random_search(1, 2), [0, 1 / 99, 2 / 99])
     np.testing.assert_allclose(random_search(0, 4, cells=5), 0)
+    generator = np.random.default_rng(0)
+    hits = np.array([min(np.flatnonzero(np.isin(generator.permutation(19), range(3)))) + 1 for _ in range(20_000)])
+    simulated = [(hits <= n).mean() for n in range(20)]
+    np.testing.assert_allclose(random_search(3, 19, cells=20), simulated, atol=0.015)
+    assert random_search(3, 25, cells=20)[-1] == 1
 
 
 def test_a_cell_is_right_if_an_object_of_its_single_most_probable_class_overlaps_it():
@@ -235,7 +232,7 @@ def test_sums_of_few_and_of_certain_but_wrong_predictions():
     refused("outcome", AddedSums.of, torch.rand(3), torch.ones(2).bool())
 
 
-def test_settings_at_their_limits():
+def test_calibration_with_settings_at_their_limits_of_few_and_of_certain_but_wrong_predictions():
     p, labels = torch.tensor([[0.9, 0.1], [0.4, 0.6], [0.7, 0.3]]), torch.tensor([0, 0, 1])
     # All in one bin: the mean confidence against the share that is right.
     assert calibration(p, labels, bins=1).ece == pytest.approx(abs((0.9 + 0.6 + 0.7) / 3 - 1 / 3))
@@ -245,9 +242,6 @@ def test_settings_at_their_limits():
     refused("bins: expected at least 1, got 0", calibration, p, labels, bins=0)
     refused("probabilities: expected a tensor of shape", calibration, torch.rand(3), labels)
     assert calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).count == 0
-
-
-def test_calibration_of_few_and_of_certain_but_wrong_predictions():
     assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)
     assert math.isnan(calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).ece)
     refused("labels", calibration, torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))

@@ -79,7 +79,7 @@ def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
 
 
-def test_extreme_scores_neither_overflow_nor_vanish_and_identity_returns_them(dtype):
+def test_expected_scores_match_the_means_of_equation_16_and_extremes_neither_overflow_nor_vanish(dtype):
     alpha = torch.full((4, 3, 4), 0.2)
     alpha += 500 * torch.eye(4)[:, None]
     model = FovealObservationModel(alpha, EDGES, CLASSES)
@@ -91,10 +91,6 @@ def test_extreme_scores_neither_overflow_nor_vanish_and_identity_returns_them(dt
     model = FovealObservationModel.identity(CLASSES, EDGES).to(dtype)
     scores, distance = looks(dtype=dtype)
     torch.testing.assert_close(model.calibrate(scores, distance), dirichlet.floor(scores, 1e-6))
-
-
-def test_expected_scores_match_the_means_of_equation_16():
-    """eq:expected_operator, its first factor: α_kd / Σ_j α_kdj."""
     model, alpha = FovealObservationModel(table(), EDGES, CLASSES), table().tolist()
     means = [[[a / sum(row) for a in row] for row in levels] for levels in alpha]
     torch.testing.assert_close(model.expected_scores(), torch.tensor(means, dtype=torch.float64))

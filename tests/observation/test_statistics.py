@@ -157,7 +157,7 @@ def draw_looks(looks, seed=0):
         yield torch.rand(12) < 0.4, torch.rand(4, 12) < 0.3, torch.randint(1, 4, (4,)), torch.randint(0, 3, (12,))
 
 
-def test_counts_equal_a_loop():
+def test_counts_equal_a_loop_and_may_be_merged():
     counts, missed, total = MissCounts(4, 3), torch.zeros(4, 3), torch.zeros(4, 3)
     for detected, objects, labels, level in draw_looks(5):
         counts.update(detected, objects, labels, level)
@@ -168,9 +168,6 @@ def test_counts_equal_a_loop():
                 missed[label, level[cell]] += not detected[cell]
     assert counts.total.tolist() == total.long().tolist()
     assert counts.missed.tolist() == missed.long().tolist()
-
-
-def test_merged_counts_equal_the_counts_of_all_looks():
     parts = [MissCounts(4, 3).update(*look) for look in draw_looks(6)]
     whole = MissCounts(4, 3)
     for look in draw_looks(6):

@@ -224,12 +224,25 @@ def test_every_record_is_written_as_tables_and_as_json(make, tmp_path):
 
 
 @pytest.mark.parametrize("make", RECORDS)
-def test_a_look_is_taken_by_its_number(make):
+def test_looks_are_taken_by_number_and_shown_and_drawn_on_a_given_picture(make):
     record = make()
     assert [record[number] for number in range(len(record))] == list(record)
     assert record[-1] is record.looks[-1]
     with pytest.raises(IndexError):
         record[len(record)]
+    record = make()
+    width, height = record.size
+    red = torch.linspace(0, 1, width).expand(height, width)
+    picture = torch.stack([red, red, red])
+    for look, view in zip(record, record.look_views(open_large(picture)), strict=True):
+        assert view.boxes.shape == look.detections.boxes[0].shape
+        x1, _, x2, _ = look.region
+        inside = record.around is None or x2 <= width
+        if inside:
+            assert float(view.pixels.mean()) == pytest.approx(((x1 + x2 - 1) / 2) / (width - 1), abs=0.03)
+    record = make()
+    assert isinstance(record.plot(image=torch.rand(3, 60, 80)), Figure)
+    refused("image: expected the photograph", record.plot)
 
 
 @pytest.mark.parametrize(
@@ -272,21 +285,6 @@ def test_the_clock_of_an_episode_adds_up_the_times_of_a_fovea():
     assert [look.seconds for look in scanpath()] == [0.5, 0.75, 0.875]
     assert [look.seconds for look in head_path()] == [0.2, 0.5, 1.25]
     assert [look.seconds for look in replace(zoom_path(), seconds=(0.1, 0.2, 0.4))] == [0.1, 0.2, 0.4]
-
-
-@pytest.mark.parametrize("make", RECORDS)
-def test_what_looks_showed_is_of_the_picture(make):
-    """A picture whose red grows along x: the mean of a look's red is that of its region."""
-    record = make()
-    width, height = record.size
-    red = torch.linspace(0, 1, width).expand(height, width)
-    picture = torch.stack([red, red, red])
-    for look, view in zip(record, record.look_views(open_large(picture)), strict=True):
-        assert view.boxes.shape == look.detections.boxes[0].shape
-        x1, _, x2, _ = look.region
-        inside = record.around is None or x2 <= width
-        if inside:
-            assert float(view.pixels.mean()) == pytest.approx(((x1 + x2 - 1) / 2) / (width - 1), abs=0.03)
 
 
 @pytest.mark.parametrize("make", [scanpath, zoom_path, head_path])
@@ -409,13 +407,6 @@ def test_every_record_draws_itself_on_its_picture(make, tmp_path):
         assert shown.count(f'stroke="{TARGET}"') == int((~sure).sum())
         assert page.count('class="object confirmed"') == int(sure.sum())
         assert page.count('class="object"') == int((~sure).sum())
-
-
-@pytest.mark.parametrize("make", RECORDS)
-def test_a_record_without_its_picture_is_drawn_on_a_given_one(make):
-    record = make()
-    assert isinstance(record.plot(image=torch.rand(3, 60, 80)), Figure)
-    refused("image: expected the photograph", record.plot)
 
 
 @pytest.mark.parametrize("make", RECORDS)

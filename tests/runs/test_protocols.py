@@ -178,16 +178,13 @@ def test_controls_change_only_the_cue_or_the_goal(scenes):
     assert all(episode.start not in episode.goal for episode in moved)
 
 
-def test_an_episode_does_not_depend_on_other_scenes(scenes):
+def test_starts_depend_on_the_seed_not_on_other_scenes_and_repeat_evenly(scenes):
     alone = Annotated(scenes.boxes[1:], scenes.labels[1:])
     alone.__class__ = type("Second", (Annotated,), {"ids": property(lambda self: [101])})
     protocol = ProtocolConfig(starts=5)
     first, second = episodes_of(scenes, 1, 5, 5, protocol), episodes_of(alone, 0, 5, 5, protocol)
     assert [e.start for e in first] == [e.start for e in second]
     assert torch.equal(tie_noise(scenes, first[3], 25, protocol), tie_noise(alone, second[3], 25, protocol))
-
-
-def test_starts_depend_on_the_seed_and_repeat_evenly(scenes):
     starts = [[e.start for e in episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10, seed=seed))] for seed in (0, 1)]
     assert starts[0] != starts[1]
     episodes = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=48))

@@ -49,15 +49,12 @@ def test_fixations_and_widths_are_uniformly_distributed():
     assert (together - torch.eye(3)).abs().max() < 0.04
 
 
-def test_same_on_batch():
+def test_views_are_the_same_on_a_batch_and_of_equal_parameters_or_seeds():
     image = draw(1, 3, 24, 32, dtype=torch.float32).expand(4, -1, -1, -1)
     augment = RandomFoveation((3.0, 30.0), same_on_batch=True, p=1.0)
     view = augment(image)
     assert len(augment._params["gaze"].unique(dim=0)) == len(augment._params["sigma"].unique()) == 1
     torch.testing.assert_close(view, view[:1].expand_as(view))
-
-
-def test_equal_parameters_or_seeds_give_equal_views():
     image = draw(4, 3, 24, 32, dtype=torch.float32)
     augment = RandomFoveation((3.0, 30.0))
     torch.manual_seed(3)

@@ -107,16 +107,13 @@ def test_constant_image_stays_constant(size, gaze, fovea, spacing):
     close(sensor(image, torch.tensor(gaze)), image, 1e-9)
 
 
-def test_fewer_receptors_than_pixels():
+def test_there_are_fewer_receptors_than_pixels_and_a_fixation_on_one_has_a_gradient():
     sensor = LogPolar(60.0)
     rings, wedges = sensor.retina.receptors((640, 480))
     assert sensor.cortical(draw(1, 1, 480, 640), torch.tensor([9.0, 9.0])).shape[-2:] == (rings, wedges)
     assert wedges == pytest.approx(2 * math.pi * 60, abs=2)
     assert rings == pytest.approx(60 * math.log(1 + 800 / 60), abs=3)
     assert rings * wedges < 640 * 480 / 5
-
-
-def test_a_fixation_on_a_pixel_has_a_gradient():
     gaze = torch.tensor([4.0, 3.0], requires_grad=True)
     LogPolar(3.0)(draw(1, 1, 9, 9, dtype=torch.float32), gaze).square().sum().backward()
     assert torch.isfinite(gaze.grad).all()

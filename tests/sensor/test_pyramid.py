@@ -76,17 +76,13 @@ def test_kornia_is_called_only_where_it_can_be_used(monkeypatch, requires_grad):
 
 
 @pytest.mark.usefixtures("kornia_everywhere")
-def test_gradients_by_kornia():
+def test_gradients_graphs_strided_images_empty_batches_and_vmap_by_kornia():
     assert torch.autograd.gradcheck(lambda x: levels_of(x, 2), draw(1, 2, 6, 5).requires_grad_())
     image = draw(1, 2, 8, 12).requires_grad_()
     gaze = (4 * draw(1, 3, 2)).requires_grad_()
     sigma = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
     sensor = lambda image, gaze, sigma: foveate(image, gaze, sigma=sigma, levels=2)  # noqa: E731
     assert torch.autograd.gradcheck(sensor, (image, gaze, sigma), fast_mode=True)
-
-
-@pytest.mark.usefixtures("kornia_everywhere")
-def test_compiles_to_one_graph_by_kornia():
     image, gaze = draw(1, 2, 40, 36).requires_grad_(), 20 * draw(1, 3, 2)
     torch.compiler.reset()
 
@@ -95,10 +91,6 @@ def test_compiles_to_one_graph_by_kornia():
 
     compiled = torch.compile(sensor, fullgraph=True, backend="eager")
     close(compiled(image, gaze), sensor(image, gaze), 1e-12)
-
-
-@pytest.mark.usefixtures("kornia_everywhere")
-def test_strided_images_empty_batches_and_vmap_by_kornia():
     image = draw(2, 3, 20, 24)
     expected = levels_of(image, 2)
     for same in (image.contiguous(memory_format=torch.channels_last), image.mT.contiguous().mT):

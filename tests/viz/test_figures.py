@@ -148,7 +148,7 @@ def test_the_best_place_of_an_undecided_search_is_told_apart_from_other_closer_l
     assert not [box for box in early.patches if box.get_linestyle() == "--"]
 
 
-def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
+def test_belief_shows_the_posterior_of_the_search_and_a_strip_every_fixation_on_one_scale(scanpath, image):
     searched = replace(scanpath, posterior=torch.rand(3, 12))
     shown = np.asarray(draw(plot_belief(searched)).axes[0].images[0].get_array())
     np.testing.assert_allclose(shown, searched.posterior[-1].reshape(3, 4))
@@ -159,9 +159,6 @@ def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
         refused(named, plot_belief, scanpath, *arguments)
     for path, target in ((scanpath, 3), (replace(scanpath, target=None), None)):
         refused("target", plot_belief, path, target=target)
-
-
-def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
     figure = draw(plot_belief(scanpath, None, image=image, columns=2))
     belief = scanpath.probabilities[..., 2]
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title()]

@@ -258,7 +258,7 @@ sizes = st.tuples(st.integers(200, 9000), st.integers(200, 9000))
 
 
 @given(sizes)
-def test_windows_tile_the_picture(size):
+def test_windows_tile_the_picture_and_a_single_fixation_equals_its_row_among_all(size):
     lattice = Lattice.over(size, (416, 416))
     wide, high = lattice.pitch
     assert lattice.columns * wide >= size[0] - 0.1 > (lattice.columns - 1) * wide - 0.2
@@ -269,10 +269,6 @@ def test_windows_tile_the_picture(size):
     whole = lattice.boxes(torch.tensor([0, 0, 0]))
     assert whole[2] >= size[0] - 0.5
     assert whole[3] >= size[1] - 0.5
-
-
-@given(sizes)
-def test_a_single_fixation_equals_its_row_among_all(size):
     lattice = Lattice.over(size, (416, 320))
     some = lattice.actions[:: max(len(lattice) // 20, 1)]
     fixations = [lattice.fixation(*action) for action in some.tolist()]

@@ -47,16 +47,12 @@ def example(rule):
     return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
 
 
-def test_rates_depend_on_the_class_of_the_hints(survey):
+def test_rates_depend_on_the_class_of_the_hints_and_on_how_much_the_surroundings_hold(survey):
     """Rates depend on which class a hint is of, not only on how strong it is."""
     look = gist()
     other = Gist(0, (0, 0), 1, look.scores.roll(1, -1), look.size, look.found.roll(1, -1))
     assert torch.equal(look.scores.amax(-1), other.scores.amax(-1))
     assert not torch.allclose(survey.rates(look), survey.rates(other))
-
-
-def test_rates_depend_on_how_much_the_surroundings_hold(survey):
-    """Hints and finds eight cells away matter, although no hint is stronger than one in the cell itself."""
     look = gist(1, (0, 0))
     look.scores[0, 0] = 1.0
     scores, found = look.scores.clone(), look.found.clone()

@@ -35,15 +35,12 @@ def test_goal_cells_are_those_that_the_box_overlaps(seed):
     assert torch.equal(covered, expected)
 
 
-def test_scanpaths_in_cells_merge_repeated_fixations_and_end_at_the_target():
+def test_scanpaths_in_cells_merge_repeated_fixations_and_end_at_the_target_of_box_or_flag():
     path = search([[10, 10], [30, 30], [200, 200], [100, 100], [300, 10]])
     assert in_cells(path, GRID).tolist() == [[0, 0], [5, 5], [2, 2]]
     away = search([[10, 10], [200, 200]])
     assert in_cells(away, GRID).tolist() == [[0, 0], [5, 5]]
     assert goal_rectangle(search([[0, 0]], (40.0, 40.0, 80.0, 120.0)), GRID) == (1, 1, 1, 2)
-
-
-def test_a_search_is_found_by_the_flag_of_the_file_or_else_by_the_target_box():
     on = [[0, 0], [100, 100], [0, 0]]
     assert shift_found(search(on), 10) == 1
     assert shift_found(search(on, found=True), 10) == 2

@@ -82,7 +82,7 @@ def test_errors_say_which_values_and_how_many_points_are_wrong():
     refused(r"got 2 of 3 outside it", nss, np.ones(SHAPE), [17, 3, 0], [0, 3, 12])
 
 
-def test_densities_have_a_floor_and_double_precision():
+def test_densities_have_a_floor_and_all_metrics_double_precision():
     values = np.zeros(SHAPE)
     values[0, 0] = 1
     assert log_likelihood(log_density(values), [5], [5])[0] == -np.inf
@@ -93,6 +93,13 @@ def test_densities_have_a_floor_and_double_precision():
     density = log_density(maps, floor=0.2)
     np.testing.assert_allclose(np.exp(density).sum((-1, -2)), 1, rtol=1e-12)
     np.testing.assert_array_equal(density, log_density(maps.double(), floor=0.2))
+    maps = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6))
+    assert nss(maps, [3], [4]) == nss(maps.double(), [3], [4])
+    # 1025.5 cannot be represented in half precision.
+    wide = np.arange(2000.0)[None]
+    assert log_likelihood(wide, np.array([1025], np.float16), np.array([0], np.float16)) == log_likelihood(
+        wide, [1025], [0]
+    )
 
 
 def test_a_uniform_map_is_at_chance_and_does_not_affect_other_maps():
@@ -106,16 +113,6 @@ def test_a_uniform_map_is_at_chance_and_does_not_affect_other_maps():
     got = nss(maps, [[3], [4]], [[5], [6]])
     assert got[0, 0] == 0
     assert got[1, 0] == pytest.approx((maps[1, 6, 4] - maps[1].mean()) / maps[1].std())
-
-
-def test_metrics_are_computed_in_double_precision():
-    maps = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6))
-    assert nss(maps, [3], [4]) == nss(maps.double(), [3], [4])
-    # 1025.5 cannot be represented in half precision.
-    wide = np.arange(2000.0)[None]
-    assert log_likelihood(wide, np.array([1025], np.float16), np.array([0], np.float16)) == log_likelihood(
-        wide, [1025], [0]
-    )
 
 
 def test_one_fixation_and_one_other_pixel_are_enough():
