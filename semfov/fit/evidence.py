@@ -31,13 +31,7 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, area_under_roc, cumulative_performance
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.protocols import (
-    choose_classes,
-    choose_searches,
-    episodes_of,
-    run_episodes,
-    search_steps,
-)
+from semfov.runs.protocols import choose_classes, choose_searches, episodes_of, run_episodes, search_steps
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import mean_or_dash, share, table

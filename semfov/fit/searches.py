@@ -69,22 +69,15 @@ class SearchedPhotograph:
         targets: tuple[DrawnSearch, ...],
         store: DetectionStore | None = None,
     ) -> None:
-        self.eye, self.scenes, self.index, self.number, self.grid, self.targets = (
-            eye, scenes, index, number, grid, targets,
-        )  # fmt: skip
+        self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
+        self.grid, self.targets = grid, targets
         self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(eye, lambda: scenes[index].image[None], grid), store, lambda: scenes.digest(index)
         )
 
 
 def open_photographs(
-    eye: Eye,
-    scenes: Scenes,
-    chosen: Sequence[int],
-    config: Any,
-    *,
-    store: DetectionStore | None = None,
-    spare: int = 0,
+    eye: Eye, scenes: Scenes, chosen: Sequence[int], config: Any, *, store: DetectionStore | None = None, spare: int = 0
 ) -> list[SearchedPhotograph]:
     """Draw classes to search for in photographs, by a `VerificationConfig`."""
     photographs, seed, area = list[SearchedPhotograph](), config.seed, config.max_target_area

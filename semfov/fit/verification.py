@@ -272,10 +272,8 @@ def verification_report(
     figures["area"] = _area(torch.tensor([each.presence for each in searches]), there)
     assert model.thresholds is not None
     chosen = model.thresholds.confirm
-    decisions = [
-        ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
-    ]
-    decisions.append(["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])])
+    head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
+    decisions = [head, ["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])]]
     for confirm in sorted({*_THRESHOLDS, chosen}):
         mark = " (chosen)" if confirm == chosen else ""
         ended = [each.found(confirm) for each in searches]

@@ -25,14 +25,7 @@ from semfov.fit.searches import TargetSearch
 from semfov.fit.training import descend, training_of
 from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
 from semfov.fit.windows_certainty import certainty_again
-from semfov.fit.windows_evidence import (
-    SurveyExample,
-    ZoomExample,
-    fit_presence,
-    fit_rates,
-    fit_survey,
-    pair_windows,
-)
+from semfov.fit.windows_evidence import SurveyExample, ZoomExample, fit_presence, fit_rates, fit_survey, pair_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
