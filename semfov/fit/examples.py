@@ -14,7 +14,7 @@ from semfov.belief.observers.gathering import EvidenceLook, Gatherer
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
-from semfov.gaze.choice import Chosen, Greedy
+from semfov.gaze.choice import Greedy
 
 
 class _Exploratory(Greedy):
@@ -24,7 +24,9 @@ class _Exploratory(Greedy):
         super().__init__(noise)
         self.astray = astray
 
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the best cell, or with the probability `astray` any cell not visited."""
         drawn = self.noise(shift, episodes)[:, :1] < self.astray
         return super().__call__(shift, episodes, torch.where(drawn, 0.0, values.detach()), visited, centres)

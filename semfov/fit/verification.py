@@ -267,9 +267,9 @@ def verification_report(
         nll = float(F.binary_cross_entropy_with_logits(logit, there.to(logit)))
         own = {"nll": nll, "ece": float(calibration_error(logit.sigmoid(), there)), "area": _area(logit, there)}
         figures |= {f"{name}_{what}": value for what, value in own.items()}
-        chances.append([where, *map(_figure_text, own.values())])
+        chances.append([where, *("-" if value is None else f"{value:.3f}" for value in own.values())])
     there = torch.tensor([each.present for each in searches])
-    figures["area"] = _area(torch.tensor([each.presence for each in searches]), there)
+    figures["area"] = area = _area(torch.tensor([each.presence for each in searches]), there)
     assert model.thresholds is not None
     chosen = model.thresholds.confirm
     head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
@@ -289,7 +289,7 @@ def verification_report(
             "",
             "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
             "the evidence decide. Area under the ROC of the final probability: "
-            f"{_figure_text(figures['area'])}.",
+            f"{'-' if area is None else f'{area:.3f}'}.",
             "",
             *table(decisions),
             "",
@@ -299,10 +299,6 @@ def verification_report(
 
 def _area(score: Tensor, there: Tensor) -> float | None:
     return area_under_roc(score, there) if there.any() and not there.all() else None
-
-
-def _figure_text(figure: float | None) -> str:
-    return "-" if figure is None else f"{figure:.3f}"
 
 
 def _row(present: Sequence[bool], ended: Sequence[_SearchEnd]) -> list[str]:

@@ -11,9 +11,6 @@ from semfov.errors import check, check_shape, values_known
 _Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
 
-Chosen = tuple[Tensor, Tensor]
-"""The next fixation `(A, 2)` of each episode, and its cell `(A,)`."""
-
 
 class Choice(ABC):
     """Base of all ways to choose the next fixation.
@@ -29,7 +26,9 @@ class Choice(ABC):
     """
 
     @abstractmethod
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Choose the next fixation `(A, 2)` of each episode from values `(A, X·Y)`, and its cell `(A,)`."""
 
 
@@ -48,7 +47,9 @@ class Greedy(Choice):
     def __init__(self, noise: _Noise) -> None:
         self.noise = noise
 
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the centre of the best cell and the cell; cell 0 where all were visited."""
         cell = select_fixation(values, visited, self.noise(shift, episodes)).clamp(min=0)
         return centres[cell], cell
@@ -78,7 +79,9 @@ class Softmax(Choice):
         self.noise = noise
         self.inverse_temperature = inverse_temperature
 
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the centre of the drawn cell and the cell; any cell where all were visited."""
         logits = self.inverse_temperature * values.detach()
         return soft_fixation(logits, visited, centres, self.noise(shift, episodes))
@@ -110,7 +113,9 @@ class Relaxed(Choice):
         self.temperature = temperature
         self.hard = hard
 
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the drawn fixation and its cell."""
         drawn = self.noise(shift, episodes)
         fixation, cell = soft_fixation(values, visited, centres, drawn, temperature=self.temperature, hard=self.hard)
@@ -131,7 +136,9 @@ class Given(Choice):
     def __init__(self, cells: Tensor) -> None:
         self.cells = cells
 
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the centre of the next cell of the scanpath and the cell; the last cell again at the end."""
         cell = self.cells[episodes, min(shift + 1, self.cells.shape[1] - 1)]
         return centres[cell], cell

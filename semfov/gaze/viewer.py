@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.gaze.choice import Choice, Chosen
+from semfov.gaze.choice import Choice
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity
 
@@ -44,7 +44,9 @@ class Viewer(Choice):
         self.path = grid.centres.to(model.read)[start][:, None]
 
     @torch.no_grad()
-    def __call__(self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor) -> Chosen:
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the centre of the drawn cell and the cell; any cell where all were visited."""
         size = int(self.grid.size[1]), int(self.grid.size[0])
         rows, free = episodes.to(self.path.device), ~visited.to(self.path.device)
