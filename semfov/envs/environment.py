@@ -284,7 +284,6 @@ def _scenery_or_open(
 
 
 def _first(arrays: Arrays) -> Arrays:
-    """The first entry of each array."""
     one = {name: _first(value) if isinstance(value, dict) else value[0] for name, value in arrays.items()}
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in one.items()}
 

@@ -115,7 +115,6 @@ class Scenery(_Surroundings):
                 return episodes[random.integers(len(episodes))]
 
     def _open(self, scene: int) -> StoredLooks:
-        """Stored looks from every cell of a scene."""
         cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
@@ -237,7 +236,6 @@ class ZoomScenery(_Surroundings):
         return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
 
     def targets(self, scene: int) -> list[int]:
-        """Classes that a picture may be searched for."""
         if self.annotated:
             return super().targets(scene)
         if self._chosen is None:
@@ -251,7 +249,6 @@ class ZoomScenery(_Surroundings):
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
-        """Draw a picture and a target."""
         for _ in range(1000):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
             if task != "search":

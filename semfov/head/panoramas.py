@@ -108,7 +108,6 @@ class Panoramas(ComposedScenes):
         return self._scene(index, "panorama", canvas)
 
     def _put(self, canvas: Tensor, patch: _Patch) -> None:
-        """Project a photograph onto the panorama."""
         camera = Camera(torch.tensor(patch.pose), _SLOT)
         x1, y1, x2, y2 = patch.box
         # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.

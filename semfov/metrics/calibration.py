@@ -124,7 +124,6 @@ class BinarySums:
 
     @property
     def count(self) -> int:
-        """Number of predictions."""
         return int(self.bins[0].sum())
 
     @property

@@ -254,7 +254,6 @@ class Record(Conversion):
         return Path(self.source).name if self.source else f"{width} × {height} px"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
         from semfov.report.notebook import record_html
 
         return record_html(self)

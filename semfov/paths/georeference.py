@@ -56,7 +56,6 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
 
 
 def _is_referenced(source: str) -> bool:
-    """Whether a TIFF has a georeference."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     check_regular(source)

@@ -79,7 +79,6 @@ class Outcome(ABC):
         return tuple(self._looks())
 
     def __iter__(self) -> Iterator[RecordedLook]:
-        """The looks in their order."""
         return iter(self.looks)
 
     def __len__(self) -> int:

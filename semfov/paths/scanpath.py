@@ -262,7 +262,6 @@ class Scanpath(_CellRecord):
         return episode_data(self, image, views, name=name or self._picture_name, **options)
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the page in a frame."""
         from semfov.report.notebook import scanpath_html
 
         return scanpath_html(self)

@@ -28,7 +28,6 @@ class Stimulus:
 
     @classmethod
     def of(cls, eye: Eye, image: Tensor) -> Self:
-        """Make the stimulus of an image for an eye."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():

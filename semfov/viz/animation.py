@@ -35,11 +35,9 @@ class Film:
     title: str = ""
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.frames)
 
     def __repr__(self) -> str:
-        """One line on the content."""
         height, width = self.frames[0].shape[:2]
         return f"Film: {self.title}, {len(self)} frames of {width} × {height} px"
 
@@ -56,7 +54,6 @@ class Film:
         return [path, _save_mp4(ffmpeg, self.frames, path.with_suffix(".mp4"), self.seconds, self.hold)]
 
     def _repr_html_(self) -> str:
-        """The film as a GIF inside the notebook's file."""
         from html import escape
 
         file = io.BytesIO()

@@ -94,7 +94,6 @@ def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
-    """Draw the borders of the cells."""
     from matplotlib.collections import LineCollection
 
     width, height = grid.extent.tolist()

@@ -86,7 +86,6 @@ def _draw_objects(
 
 
 def _draw_legend(axes: Axes, entries: Sequence[_LegendEntry]) -> None:
-    """Draw a legend below the picture."""
     from matplotlib.lines import Line2D
 
     if not entries:
@@ -313,7 +312,6 @@ def _draw_view(axes: Axes, record: Record, number: int, view: LookView, most: in
 
 
 def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
-    """The given views, or those of the scanpath."""
     check_foveal(scanpath)
     views = scanpath.views() if views is None else views
     check(len(views) == len(scanpath), "views", f"{len(scanpath)} views, one for each fixation", len(views))
@@ -422,7 +420,6 @@ class LookFigure:
         self.changing: list[Artist] = []
 
     def show(self, number: int, view: LookView) -> Figure:
-        """Show a look."""
         record, (path_axes, view_axes, *others) = self.record, self.axes
         look, (width, height) = record.looks[number], view.size
         for artist in self.changing:

@@ -250,7 +250,6 @@ class ZoomBelief:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all looks."""
         shape = self.lattice.rows, self.lattice.columns
         self._rate = np.zeros((self.lattice.levels, *shape), np.float32)
         # The level that the rates of a cell are from. Rates are predicted when they are asked for.
@@ -293,7 +292,6 @@ class ZoomBelief:
             self._mark(_extent(differs))
 
     def add(self, glance: Glance) -> None:
-        """Update the belief with the result of a look."""
         if glance.gist is None:
             self.discount(glance.window)
             return

@@ -57,7 +57,6 @@ class Certainty:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
-        """Read a certainty from the numbers of a file."""
         if len(numbers) == 2:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
         count = len(FACTS) + 6

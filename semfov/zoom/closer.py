@@ -98,7 +98,6 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         return CandidatePlace(boxes[number], score, probability)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Leave out the detections of both boxes."""
         super().dismiss(candidate, box)
         # It is the last look of the path.
         self._number, self._next = self._next, self._next + 1
@@ -160,7 +159,6 @@ class PhotographPlaces(CandidateBoxes):
         return (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Leave out the places of both boxes."""
         super().dismiss(candidate, box)
         if self.seen(candidate):
             self._next, self._number = self._next - 1, self._look.number - 1

@@ -49,7 +49,6 @@ class SearchFacts:
             self.add(glance)
 
     def add(self, glance: Glance) -> None:
-        """Add the facts of a look."""
         target, detections = self.belief.target, glance.detections
         score, named, found, box = float(glance.show[target - 1]), 0.0, 0.0, None
         closest = score if glance.window.level == self.belief.lattice.levels - 1 else 0.0
@@ -173,7 +172,6 @@ class WindowDecisions:
 
     @property
     def looks(self) -> list[CloseUp]:
-        """The closer looks, in order."""
         return [] if self.verifier is None else self.verifier.looks
 
     def look(self) -> CloseUp:

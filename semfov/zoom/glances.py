@@ -35,7 +35,6 @@ class Window:
 
     @staticmethod
     def overview(lattice: Lattice) -> "Window":
-        """The window with the whole picture."""
         return Window.on(lattice, (0, 0, 0))
 
     @staticmethod

@@ -171,7 +171,6 @@ def _pair(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
 
 
 def _densities(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
-    """Two maps as densities."""
     pair = _pair(first, second)
     for each in pair:
         good = bool((each >= 0).all() and np.isfinite(each).all() and (each.sum(-1) > 0).all())
