@@ -39,8 +39,7 @@ _LOOKING = "search", "find", "explore", "live"
 
 def _options_of(name: str) -> type[Any]:
     """The options of a subcommand, imported when they are asked for: help and mistakes need no tensors."""
-    options: type[Any] = resolve_name(f"semfov.{_SUBCOMMANDS[name][1]}")
-    return options
+    return resolve_name(f"semfov.{_SUBCOMMANDS[name][1]}")
 
 
 def _run(name: str, options: Any) -> int | None:

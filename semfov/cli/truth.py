@@ -48,8 +48,7 @@ class Truth:
                 f"annotations {self.path}: expected {name} to have {wanted[0]} × {wanted[1]} px, got {size[0]} × "
                 f"{size[1]}; its boxes are in another frame"
             )
-        identity: int | str = found[-1]["id"]
-        return identity
+        return found[-1]["id"]
 
     def categories(self, classes: Collection[str]) -> list[dict[str, Any]]:
         """The categories of the file that are among some classes."""

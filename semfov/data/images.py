@@ -310,5 +310,4 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
     if image.dtype != torch.uint8:
         check_pixels(image, "image")
         image = image.clamp(0, 1).mul(255).round()
-    pixels: NDArray[np.uint8] = image.permute(1, 2, 0).to("cpu", torch.uint8).contiguous().numpy()
-    return pixels
+    return image.permute(1, 2, 0).to("cpu", torch.uint8).contiguous().numpy()

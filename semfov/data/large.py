@@ -167,8 +167,7 @@ class _TiffPicture(LargePicture):
         make, most = _INFLATERS.get(int(page.compression)), 2 * size + 2**16
         fits = make is None or len(data) <= _INFLATED or len(make().decompress(data, most)) < most
         check_data(fits, f"image {self.path}", f"tiles of {size:,} bytes", "one that inflates to more; replace it")
-        tile: NDArray[Any] = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
-        return tile
+        return page.decode(data, number, jpegtables=page.jpegtables)[0][0]
 
     def _bytes(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """Grey or RGB bytes, in which 0 is black."""

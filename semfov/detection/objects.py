@@ -281,8 +281,7 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
     """Area `(P,)` that the boxes of each pair share, given edges `(N,)` of the boxes and indices `(P,)` of both."""
     wide = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
     high = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
-    shared: _Column = np.maximum(wide, 0) * np.maximum(high, 0)
-    return shared
+    return np.maximum(wide, 0) * np.maximum(high, 0)
 
 
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:

@@ -127,5 +127,4 @@ def _overlaps(boxes: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]
     shared = (np.minimum(x2, right) - np.maximum(x1, left)).clip(0)
     shared *= (np.minimum(y2, bottom) - np.maximum(y1, top)).clip(0)
     together = (x2 - x1) * (y2 - y1) + (right - left) * (bottom - top) - shared
-    above: NDArray[np.bool_] = shared > iou * together
-    return above
+    return shared > iou * together

@@ -44,8 +44,7 @@ class TargetSearch(ABC, Generic[LookType]):
 
     def look(self, index: int, number: int) -> LookType:
         """Return the look of this index; `number` looks of both kinds were made up to it."""
-        look: LookType = self.steps[index]
-        return look
+        return self.steps[index]
 
     @abstractmethod
     def right(self, box: Tensor) -> bool:

@@ -88,8 +88,7 @@ class Settings:
 
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Convert settings to JSON values: paths become text, tuples become lists."""
-    values: dict[str, Any] = json.loads(json.dumps(settings, default=str))
-    return values
+    return json.loads(json.dumps(settings, default=str))
 
 
 _type_hints = cache(get_type_hints)

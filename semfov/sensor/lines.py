@@ -45,8 +45,7 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
         # Tensors that are made while a graph is traced are of a kind of their own.
         if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:
             return function(*settings)
-        result: _Constant = remember(*settings)
-        return result
+        return remember(*settings)
 
     return call
 
