@@ -137,11 +137,7 @@ class Detector(StatedModule, ABC):
         )
 
     def detect(
-        self,
-        canvas: Tensor,
-        placement: Placement | None = None,
-        *,
-        back: Callable[[Tensor], Tensor] | None = None,
+        self, canvas: Tensor, placement: Placement | None = None, *, back: Callable[[Tensor], Tensor] | None = None
     ) -> Detections:
         """Detect objects on a canvas.
 

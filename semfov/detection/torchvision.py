@@ -112,13 +112,7 @@ class TorchvisionDetector(ModuleDetector):
 
     @classmethod
     def load(
-        cls,
-        name: str,
-        *,
-        weights: Any = "DEFAULT",
-        classes: Sequence[str] | None = None,
-        first: int = 1,
-        **model: Any,
+        cls, name: str, *, weights: Any = "DEFAULT", classes: Sequence[str] | None = None, first: int = 1, **model: Any
     ) -> "TorchvisionDetector":
         """Load a torchvision detection model by its name."""
         from torchvision import models

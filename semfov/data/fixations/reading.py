@@ -15,11 +15,7 @@ from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import read_text
 
 _Reader = Callable[..., list[Fixations]]
-DATA_SETS: dict[_Reader, str] = {
-    read_cocosearch: "COCO-Search18",
-    read_osie: "OSIE",
-    read_ruarte: "Ruarte and others",
-}
+DATA_SETS: dict[_Reader, str] = {read_cocosearch: "COCO-Search18", read_osie: "OSIE", read_ruarte: "Ruarte and others"}
 """Readers of JSON, with the data set whose form they read."""
 _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 """How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""

@@ -172,13 +172,7 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     write_text(Path(path), text.getvalue())
 
 
-def _record(
-    where: str,
-    group: Sequence[_Line],
-    size: _Size | None,
-    units: _Units,
-    origin: _Origin,
-) -> Fixations:
+def _record(where: str, group: Sequence[_Line], size: _Size | None, units: _Units, origin: _Origin) -> Fixations:
     place, line = group[0]
     check_data(line["picture"] != "", f"{where}: {place}, picture", "the name of a picture", "nothing")
     for name in (*(() if size is not None else _SIZE), "x1", "y1", "x2", "y2", "found"):
