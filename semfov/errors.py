@@ -2,7 +2,8 @@
 
 import math
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
@@ -57,6 +58,18 @@ def check_data(condition: bool, where: object, expected: str, got: object) -> No
     """Raise `DataError` with a message in the house's form, for what is wrong in a file, unless a condition holds."""
     if not condition:
         raise DataError(f"{where}: expected {expected}, got {got}")
+
+
+@contextmanager
+def needing(
+    package: str, what: object, install: str | None = None, error: type[SemfovError] = InputError
+) -> Iterator[None]:
+    """A block that imports a package which need not be there; the error tells how it is installed."""
+    try:
+        yield
+    except ImportError:
+        way = f"pip install {install or package}"
+        raise error(f"{what}: expected the package {package}, which is not installed; {way}") from None
 
 
 def values_known(*tensors: Tensor) -> bool:

@@ -32,7 +32,7 @@ from semfov.data.images import (
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture
-from semfov.errors import DataError, check, check_data, lookup
+from semfov.errors import DataError, check, check_data, lookup, needing
 from semfov.io.files import check_regular
 
 _Box = tuple[int, int, int, int]
@@ -60,10 +60,8 @@ class _TiffPicture(LargePicture):
     def __init__(
         self, path: str | PathLike[str], *, white: White | None = None, bands: int | Sequence[int] | None = None
     ) -> None:
-        try:
+        with needing("tifffile", path, error=DataError):
             import tifffile
-        except ImportError:
-            raise DataError(f"{path}: expected tifffile for reading TIFFs; pip install tifffile") from None
         self.path, self._lock = Path(path), Lock()
         with opening(self.path, "opened"):
             self.file = tifffile.TiffFile(path)
@@ -227,10 +225,8 @@ class _RasterPicture(LargePicture):
     def __init__(
         self, path: str | PathLike[str], *, white: White | None = None, bands: int | Sequence[int] | None = None
     ) -> None:
-        try:
+        with needing("rasterio", path, '"semfov[geo]"', DataError):
             self._settings = raster_settings()
-        except ImportError:
-            raise DataError(f'{path}: expected rasterio for reading it; pip install "semfov[geo]"') from None
         self.path, self._lock = Path(path), Lock()  # GDAL's datasets are for one thread at a time
         with opening(self.path, "opened"), self._settings:
             self._file: Any = open_raster(self.path)

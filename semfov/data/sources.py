@@ -18,7 +18,7 @@ from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.errors import DataError, InputError, check, check_data, printable
+from semfov.errors import DataError, InputError, check, check_data, needing, printable
 from semfov.io.files import reading
 
 PHOTOGRAPHS = (
@@ -127,12 +127,8 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     if isinstance(source, Path) and source.is_dir():
         files = picture_files(source, frames=True)[:most]
         return Stream(name, None, (Picture(file.name, read_image(file, white=white)) for file in files))
-    try:
+    with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
-    except ImportError:
-        raise DataError(
-            f"{name}: expected OpenCV for videos, cameras and streams; pip install opencv-python-headless"
-        ) from None
     if isinstance(source, Path):
         _check_there(source, "source")
         with reading(source), source.open("rb") as file:

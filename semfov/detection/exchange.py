@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, needing
 
 if TYPE_CHECKING:
     import supervision
@@ -21,14 +21,10 @@ def named_detections(
     boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, Any]
 ) -> supervision.Detections:
     """`supervision.Detections` of boxes, with classes from 0, their names unless None, and further data."""
-    try:
-        from supervision import Detections
-    except ImportError:
-        raise InputError(
-            "supervision: expected the package supervision, which is not installed; pip install supervision"
-        ) from None
     numbers = (labels - 1).numpy()
     names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
+    with needing("supervision", "supervision"):
+        from supervision import Detections
     return Detections(boxes.numpy(), None, scores.numpy(), numbers, data={**data, **names})
 
 

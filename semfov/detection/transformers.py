@@ -14,7 +14,7 @@ from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import Candidates
-from semfov.errors import DataError, InputError, check
+from semfov.errors import DataError, InputError, check, needing
 from semfov.io.schema import excerpt
 
 _SOFTMAX = ("detr", "table-transformer", "yolos")
@@ -112,12 +112,8 @@ class TransformersDetector(ModuleDetector):
         """Load an object detection model from Hugging Face's hub, with the settings of its image processor."""
         repository = name.removeprefix("hf:")
         check(bool(repository), "detector", "hf:owner/name", repr(name))
-        try:
+        with needing("transformers", "detector"):
             from transformers import AutoImageProcessor, AutoModelForObjectDetection
-        except ImportError:
-            raise InputError(
-                "detector: expected the package transformers, which is not installed; pip install transformers"
-            ) from None
         try:
             model = AutoModelForObjectDetection.from_pretrained(
                 repository, revision=revision, use_safetensors=True, trust_remote_code=False

@@ -18,7 +18,7 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import category_ids, coco_results, named_detections
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
 from semfov.paths.georeference import georeference
@@ -130,12 +130,8 @@ class Conversion(Outcome):
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
         """The table of `looks` (`rows`) or `objects` (`object_rows`) as a pandas data frame."""
         rows, columns = self._table(table)
-        try:
+        with needing("pandas", "to_frame"):
             import pandas
-        except ImportError:
-            raise InputError(
-                "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
-            ) from None
         return pandas.DataFrame(rows, columns=columns)
 
     def to_csv(self, path: str | PathLike[str] | None = None, table: _Table = "looks") -> str:

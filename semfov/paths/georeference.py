@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semfov.data.gdal import open_raster, raster_settings
 from semfov.data.images import quiet_decoders
 from semfov.data.windowed import RASTERS
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, needing
 from semfov.io.files import check_regular
 
 
@@ -19,14 +19,10 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     kind = Path(source).suffix.lower()
     if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None
-    try:
+    with needing("rasterio", f"source: {source}", '"semfov[geo]"'):
         import rasterio.transform
         from rasterio.warp import transform
-    except ImportError:
-        raise InputError(
-            f"source: expected rasterio for the georeference of {source}, which is not installed; "
-            'pip install "semfov[geo]"'
-        ) from None
+
     try:
         with quiet_decoders, raster_settings():
             picture = open_raster(source)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.errors import DataError
+from semfov.errors import DataError, needing
 from semfov.io.files import replacing
 from semfov.paths import Moment
 from semfov.paths.stimulus import in_bytes
@@ -92,10 +92,8 @@ def video_suffix() -> str:
 @contextmanager
 def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
     """Write frames to a video, whole or not at all."""
-    try:
+    with needing("OpenCV", path, "opencv-python-headless", DataError):
         import cv2
-    except ImportError:
-        raise DataError(f"{path}: videos need OpenCV: pip install opencv-python-headless") from None
     codec = VIDEO_CODECS[path.suffix.lower()]
     with replacing(path) as temporary:
         # OpenCV chooses the container by the suffix.

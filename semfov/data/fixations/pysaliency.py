@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from semfov.data.fixations.record import Fixations
-from semfov.errors import InputError, check
+from semfov.errors import check, needing
 
 
 def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> Any:
@@ -29,12 +29,8 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
 
         trains = to_pysaliency(fixations, ["1001.jpg", "1002.jpg"])
     """
-    try:
+    with needing("pysaliency", "to_pysaliency"):
         from pysaliency import FixationTrains
-    except ImportError:
-        raise InputError(
-            "to_pysaliency: expected the package pysaliency, which cannot be imported; pip install pysaliency"
-        ) from None
     number = {name: index for index, name in enumerate(pictures)}
     unknown = [each.picture for each in fixations if each.picture not in number]
     check(not unknown, "pictures", "all pictures of the fixations", f"none named {unknown[:1]}")
