@@ -41,8 +41,7 @@ from semfov.presets import published_arguments, raw_arguments, recommended_argum
 from semfov.strategy import Strategy
 from semfov.zoom import GlimpseEvidence, WindowEye
 
-_Targets = str | int | Sequence[str | int] | None
-"""A class by name or index, several of them, or None for all classes."""
+_Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
 
 
 class ActivePerception(nn.Module):

@@ -13,11 +13,8 @@ from semfov.paths import Moment
 
 __all__ = ["LivePerception"]
 
-_FOVEA_RATE = 0.1
-"""Default rate at which the belief of a fovea fades, per frame."""
-
-_WINDOW_RATE = 0.03
-"""Default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames."""
+_FOVEA_RATE = 0.1  # default rate at which the belief of a fovea fades, per frame
+_WINDOW_RATE = 0.03  # default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames
 
 
 class LivePerception:

@@ -12,8 +12,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-_MANY_ELEMENTS = 1 << 22
-"""Number of elements of a tensor from which on several threads are used."""
+_MANY_ELEMENTS = 1 << 22  # number of elements of a tensor from which on several threads are used
 
 _Arguments = ParamSpec("_Arguments")
 _Returned = TypeVar("_Returned")

@@ -29,17 +29,10 @@ from semfov.paths import Ending, HeadPath, RecordedLook
 from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
 
-_SIGMA = 100.0
-"""Width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels."""
-
-_PASSES = 40
-"""Default of the largest number of looks."""
-
-_DURATION = 30.0
-"""Default time limit of a scene in seconds."""
-
-_CONFIRM = 0.7
-"""Probability of the target in the fixated cell at which a search ends as found."""
+_SIGMA = 100.0  # width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels
+_PASSES = 40  # default of the largest number of looks
+_DURATION = 30.0  # default time limit of a scene in seconds
+_CONFIRM = 0.7  # probability of the target in the fixated cell at which a search ends as found
 
 
 class HeadAgent(nn.Module):

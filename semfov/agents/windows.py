@@ -37,8 +37,7 @@ from semfov.zoom.slices import ranked, usual_slices
 LIKELY = 0.5
 """Default for the least probability of the objects that a record counts."""
 
-_NEW_OBJECTS = 0.01
-"""Default for the least number of new objects that a look must be expected to find."""
+_NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
 
 _Picture = LargePicture | ImageLike
 

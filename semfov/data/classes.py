@@ -102,8 +102,7 @@ _ALIASES = {
     "tvmonitor": "tv",
 }
 _SPELT = {"".join(new.split()): [old for old in _ALIASES if _ALIASES[old] == new] for new in _ALIASES.values()}
-_MOST_NAMED = 12
-"""Largest number of classes that a message names."""
+_MOST_NAMED = 12  # largest number of classes that a message names
 
 _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "scissor"}
 

@@ -21,9 +21,7 @@ from semfov.io.files import check_regular, inside, json_sha256, read_json, sha25
 from semfov.io.schema import excerpt, is_number, is_plain
 
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
-
-_BEYOND = 0.2
-"""Share of boxes that leave their pictures from which on they may be corners."""
+_BEYOND = 0.2  # share of boxes that leave their pictures from which on they may be corners
 
 
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
@@ -42,8 +40,7 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     return coco, sha256(path)
 
 
-_Field = tuple[Callable[[Any], object], str]
-"""Whether a value of an entry fits, and what it is expected to be."""
+_Field = tuple[Callable[[Any], object], str]  # whether a value of an entry fits, and what it is expected to be
 
 _ID: _Field = (
     lambda value: isinstance(value, int | str) and not isinstance(value, bool) and is_plain(str(value)),

@@ -17,17 +17,13 @@ from semfov.errors import check
 
 _Box = tuple[int, int, int, int]
 
-_STRIP = 1 << 23
-"""Pixels that are read at once for a copy."""
+_STRIP = 1 << 23  # pixels that are read at once for a copy
 
 _FIRST = 4
 """Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
 
-_LARGEST = 1 << 25
-"""Most pixels of a copy, so that all copies together take at most 134 MB."""
-
-_OVERSAMPLING = 1.5
-"""Pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works."""
+_LARGEST = 1 << 25  # most pixels of a copy, so that all copies together take at most 134 MB
+_OVERSAMPLING = 1.5  # pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works
 
 
 def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
@@ -71,8 +67,7 @@ ChosenBands = int | Sequence[int] | None
 BY_WINDOWS = (".tif", ".tiff", *RASTERS)
 """Ends of the names of files that may be read by windows, and whose bands can be chosen."""
 
-_LARGE = 1 << 24
-"""Pictures with more pixels have copies."""
+_LARGE = 1 << 24  # pictures with more pixels have copies
 
 
 class LargePicture(ABC):

@@ -20,11 +20,8 @@ a an the some any this that these those it its you your i my me we us one ones s
 object objects item items kind kinds sort type of to in on at for from with by as into onto and or is are be was can
 could would will may might must do does which what where who when how
 """
-_IGNORED = frozenset(_COMMON.split())
-"""Words of a description that are ignored because most descriptions have them."""
-
-_TEMPERATURE = 0.08
-"""Temperature of `spread`, chosen on synonyms of COCO's classes (docs/words.md)."""
+_IGNORED = frozenset(_COMMON.split())  # words of a description that are ignored because most descriptions have them
+_TEMPERATURE = 0.08  # temperature of `spread`, chosen on synonyms of COCO's classes (docs/words.md)
 
 
 class WordVectors:

@@ -6,8 +6,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.objects import unlike
 
-_BORDER = 2.0
-"""Boxes that come this near to a border of their crop, in the detector's pixels, are cut by it."""
+_BORDER = 2.0  # boxes that come this near to a border of their crop, in the detector's pixels, are cut by it
 
 
 def merge_crops(

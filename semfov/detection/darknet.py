@@ -257,8 +257,7 @@ def _activation(section: Section, default: str) -> str:
     return name
 
 
-_EPSILON = 1e-5
-"""Constant ε that batch norm adds to the variance."""
+_EPSILON = 1e-5  # constant ε that batch norm adds to the variance
 
 
 class Darknet(nn.Module):

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     import supervision
 
 
-_SCORES = "scores"
-"""Name of the full score vectors in a library that can store further data with its boxes."""
+_SCORES = "scores"  # name of the full score vectors in a library that can store further data with its boxes
 
 
 def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:

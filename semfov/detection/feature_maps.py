@@ -14,8 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.errors import InputError, lookup
 
-_LEAST_STRIDE = 8
-"""Smallest stride of the maps that are named; finer ones hold edges and colours."""
+_LEAST_STRIDE = 8  # smallest stride of the maps that are named; finer ones hold edges and colours
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ _OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".
 """Ends of the names of models in formats that are not read."""
 
 _SELECTING = [each.name for each in fields(Selection)]
-_COMMON = ["background", "device", *_SELECTING]
-"""Options of all detectors."""
+_COMMON = ["background", "device", *_SELECTING]  # options of all detectors
 
 _WRAPPERS: dict[str, Callable[..., Detector]] = {
     "torchvision.models.detection.": TorchvisionDetector,

@@ -24,9 +24,7 @@ FAINTEST = 0.05
 
 _FAR = 1e9  # pixels of an edge, beyond which areas of single precision overflow
 _PRINTED = 20  # largest number of objects in the text form
-
-_BORDER = 2 / 416
-"""Boxes that come this near to a border of their window, in longer sides of the window, are cut by it."""
+_BORDER = 2 / 416  # boxes that come this near to a border of their window, in longer sides of the window, are cut by it
 
 
 @dataclass(frozen=True, repr=False)

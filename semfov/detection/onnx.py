@@ -28,8 +28,7 @@ from semfov.io.schema import excerpt
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
-_MOST_BOXES = 2**20
-"""Largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px."""
+_MOST_BOXES = 2**20  # largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px
 
 
 class OnnxDetector(Detector):

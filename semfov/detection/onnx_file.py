@@ -14,10 +14,8 @@ from semfov.errors import DataError, check
 from semfov.io.files import read_text, sha256, write_bytes
 from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, check_content, is_plain
 
-_MOST_BYTES = 2**20
-"""Largest number of bytes of a settings file."""
-_MOST_PIXELS = 89_478_485
-"""Largest number of pixels of a canvas, the same as for pictures that are read."""
+_MOST_BYTES = 2**20  # largest number of bytes of a settings file
+_MOST_PIXELS = 89_478_485  # largest number of pixels of a canvas, the same as for pictures that are read
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
 
 METADATA_KEY = "semfov"

@@ -147,14 +147,10 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
     return next((form for form, fits in forms.items() if fits), None)
 
 
-_FRACTIONS = 2.0
-"""Coordinates up to here, of all boxes of a canvas, are no pixels."""
-_ENOUGH = 100_000
-"""Number of boxes whose places are looked at."""
-_MANY = 20
-"""Number of boxes from which on all of them do not begin in the upper left corner."""
-_MOST_MISPLACED = 0.5
-"""Share of the boxes of a pass that may lie elsewhere."""
+_FRACTIONS = 2.0  # coordinates up to here, of all boxes of a canvas, are no pixels
+_ENOUGH = 100_000  # number of boxes whose places are looked at
+_MANY = 20  # number of boxes from which on all of them do not begin in the upper left corner
+_MOST_MISPLACED = 0.5  # share of the boxes of a pass that may lie elsewhere
 
 _LETTERBOX = Preprocessing()
 _YOLOX = Preprocessing(channels="bgr", scale=255.0, corner=True)

@@ -26,27 +26,18 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
 }
 
-_MOST_ELEMENTS = 2**28
-"""Largest number of elements of a tensor in a model; 1 GiB as float32."""
-_MOST_METADATA = 2**20
-"""Largest number of characters of a model's metadata."""
-_USUAL_SIDE = 640
-"""Side of a picture with which open sizes are tried out."""
-_WITH_GRAPHS = {"Loop", "Scan", "If"}
-"""Operations with graphs of their own, whose steps are not counted."""
-
-_MOST_MEMORY = 2**29
-"""Bytes for the tensors of models whose sizes depend on values, all together."""
-_MOST_SECONDS = 10.0
-"""Longest pass of such a model for one image."""
-_MOST_REASON = 400
-"""Largest number of characters of onnxruntime's reasons that a message has."""
+_MOST_ELEMENTS = 2**28  # largest number of elements of a tensor in a model; 1 GiB as float32
+_MOST_METADATA = 2**20  # largest number of characters of a model's metadata
+_USUAL_SIDE = 640  # side of a picture with which open sizes are tried out
+_WITH_GRAPHS = {"Loop", "Scan", "If"}  # operations with graphs of their own, whose steps are not counted
+_MOST_MEMORY = 2**29  # bytes for the tensors of models whose sizes depend on values, all together
+_MOST_SECONDS = 10.0  # longest pass of such a model for one image
+_MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 
 _Provider = str | tuple[str, Mapping[str, Any]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
-_MOST_BATCH = 1024
-"""Largest fixed batch size of a model."""
+_MOST_BATCH = 1024  # largest fixed batch size of a model
 
 
 class OnnxSession:

@@ -29,8 +29,7 @@ _VERSION = 1
 """Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
 
 _OPSET = 17
-_IR_VERSION = 8
-"""IR version from the time of opset 17; some runtimes that could run the model refuse newer versions."""
+_IR_VERSION = 8  # IR version from the time of opset 17; some runtimes that could run the model refuse newer versions
 
 _OUTPUTS = ("boxes", "objectness", "classes")
 

@@ -16,8 +16,7 @@ from typing import Any
 from semfov.errors import DataError, check_data
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
-_OLD = 24 * 3600.0
-"""Seconds after which a part of a file is taken for one whose writer was killed."""
+_OLD = 24 * 3600.0  # seconds after which a part of a file is taken for one whose writer was killed
 
 _unfinished: set[Path] = set()
 

@@ -14,8 +14,7 @@ from semfov.errors import DataError, InputError, check
 
 _Size = int | str
 """A number, a name such as `K` that stands for the same number in the whole file, or a sum such as `K+1` or `N-1`."""
-_Sizes = dict[str, int]
-"""The numbers that names of sizes stand for, as far as they are known."""
+_Sizes = dict[str, int]  # the numbers that names of sizes stand for, as far as they are known
 
 _FLOATS = (torch.float32, torch.float64)
 

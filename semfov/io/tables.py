@@ -4,8 +4,7 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 
-_FORMULAS = ("=", "+", "-", "@")
-"""First characters of a formula in spreadsheets."""
+_FORMULAS = ("=", "+", "-", "@")  # first characters of a formula in spreadsheets
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -19,9 +19,7 @@ from semfov.viz.semantic import cell_entropy
 
 Data = dict[str, Any]
 
-_DRAWN = 500
-"""Largest number of objects that are drawn in the picture and listed."""
-
+_DRAWN = 500  # largest number of objects that are drawn in the picture and listed
 _MOST, _SCORES = 10, 5  # detections of a look, and classes of each, that are told
 
 

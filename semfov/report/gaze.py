@@ -18,8 +18,7 @@ from semfov.report.page import colour_steps, filled, page_path
 from semfov.viz.style import COLOURS, overlay_colours
 
 _WIDTH, _QUALITY = 960, 80
-_MOST_STEPS = 12
-"""Largest number of fixations of the slider."""
+_MOST_STEPS = 12  # largest number of fixations of the slider
 
 
 def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
@@ -64,8 +63,7 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
     return filled("gaze", data, contents)
 
 
-_MASSES = (0.8, 0.5, 0.25)
-"""Shares of all fixations that the smallest regions inside the contours hold."""
+_MASSES = (0.8, 0.5, 0.25)  # shares of all fixations that the smallest regions inside the contours hold
 
 
 def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:

@@ -8,21 +8,14 @@ from semfov.report.episode import episode_data, jpeg_uri
 from semfov.report.page import page_html
 from semfov.viz.style import FOUND, GAZE, TARGET
 
-_MOST_CHARACTERS = 3_000_000
-"""Largest number of bytes that a scanpath adds to a notebook's file."""
-
-_HEIGHT = 760
-"""Height of the frame in pixels; the page scrolls in it."""
+_MOST_CHARACTERS = 3_000_000  # largest number of bytes that a scanpath adds to a notebook's file
+_HEIGHT = 760  # height of the frame in pixels; the page scrolls in it
 
 _FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
 """Widths in pixels and JPEG qualities of the pictures; the first pair that fits is taken."""
 
-_MAPS = _MOST_CHARACTERS // 4
-"""Largest number of bytes of the probability maps."""
-
-_WIDTH = 640
-"""Width of the drawing in pixels of the screen."""
-
+_MAPS = _MOST_CHARACTERS // 4  # largest number of bytes of the probability maps
+_WIDTH = 640  # width of the drawing in pixels of the screen
 _MOST = 500  # largest number of objects that are drawn; the most confident ones are
 _QUALITY = 75  # of the photograph, a JPEG
 

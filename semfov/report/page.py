@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 _FOLDER = Path(__file__).parent
 
-_OPACITY = 0.82
-"""Opacity over the photograph of colours that do not stand for probabilities."""
+_OPACITY = 0.82  # opacity over the photograph of colours that do not stand for probabilities
 
 
 def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: str = "") -> Path:
@@ -174,8 +173,7 @@ _ABOUT = {
 """Entries at the head of an episode, by their keys in its data."""
 
 
-_NAMED = 25
-"""Largest number of objects whose names are shown at first; more would cover the picture."""
+_NAMED = 25  # largest number of objects whose names are shown at first; more would cover the picture
 
 
 def _looks_html(data: Data, place: str, *, headed: bool = True) -> str:

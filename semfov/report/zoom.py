@@ -15,8 +15,7 @@ from semfov.paths.look import CONFIDENT, LookView, read_region
 from semfov.report.episode import Data, jpeg_uri, object_data, tagged
 from semfov.viz.drawing import photograph_of
 
-_MOST_DETECTIONS = 15
-"""Largest number of detections of a look that are drawn and listed."""
+_MOST_DETECTIONS = 15  # largest number of detections of a look that are drawn and listed
 
 
 def zoom_data(

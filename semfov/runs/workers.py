@@ -177,8 +177,7 @@ class _Job(NamedTuple):
 
 
 _turn = threading.Lock()
-_ready: list[tuple[Callable[..., Any], tuple[object, ...], Any]] = []
-"""What this process has made, behind what made it."""
+_ready: list[tuple[Callable[..., Any], tuple[object, ...], Any]] = []  # what this process has made, behind what made it
 
 
 def _results(

@@ -58,10 +58,8 @@ def empty(like: Tensor, *shape: int) -> Tensor:
     return torch.from_numpy(np.empty_like(new.numpy())) if large else new
 
 
-_Part = tuple[tuple[int, int, int], tuple[int, int, int], int]
-"""Size, strides and begin of rows of planes."""
-_Product = tuple[Tensor, _Part, _Part]
-"""A matrix, what it multiplies, and where the product is written."""
+_Part = tuple[tuple[int, int, int], tuple[int, int, int], int]  # size, strides and begin of rows of planes
+_Product = tuple[Tensor, _Part, _Part]  # a matrix, what it multiplies, and where the product is written
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,7 @@ from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import gaussian_pyramid
 
-_Levels = tuple[Tensor, ...]
-"""A Gaussian pyramid, finest level first."""
-
+_Levels = tuple[Tensor, ...]  # a Gaussian pyramid, finest level first
 _TALLEST = 30  # levels of a pyramid; an image with sides of 2^30 pixels is a single pixel then
 _MOST = 2**26  # receptors
 _FARTHEST = 1e15  # pixels from the image to a fixation

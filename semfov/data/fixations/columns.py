@@ -17,8 +17,7 @@ _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 _BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
 """What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
 
-_DECIMAL = re.compile(r"[+-]*(?=.*\d)\d*,[\deE-]*")
-"""A number with a decimal comma."""
+_DECIMAL = re.compile(r"[+-]*(?=.*\d)\d*,[\deE-]*")  # a number with a decimal comma
 
 _REMEDIES = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save it as CSV, or give pandas.read_excel(file)"),

@@ -29,14 +29,12 @@ _SIZE = ("width", "height")
 _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
-_LARGEST = 1e6
-"""Largest coordinate and side in pixels."""
+_LARGEST = 1e6  # largest coordinate and side in pixels
 
 _Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 """`(width, height)` of all frames, or of each by the name of its picture."""
 
-_Line = tuple[str, Mapping[str, str]]
-"""The place of a line in words, and its fields by our names of the columns."""
+_Line = tuple[str, Mapping[str, str]]  # the place of a line in words, and its fields by our names of the columns
 
 
 class FrameError(DataError):
