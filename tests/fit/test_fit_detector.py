@@ -241,7 +241,9 @@ def test_a_changed_file_is_refused(home, tmp_path, name):
     (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
     unusable(f"{name}: damaged or changed", ModelFolder, folder)
     (folder / name).unlink()
-    unusable(r"no such file.*semfov fit", ModelFolder, folder)
+    listed = r"manifest\.json: no such file; expected a folder of models that semfov fit wrote"
+    told = listed if name.endswith("json") else rf"{name}, which manifest\.json lists: no such file"
+    unusable(told, ModelFolder, folder)
 
 
 def rewrite_manifest(folder, **parts):
