@@ -61,11 +61,15 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | No
     """Look at every frame, print detections and belief until Ctrl-C, and return the path of the video, if any."""
     if path is not None:
         path = path if path.suffix and not path.is_dir() else path / f"live{video_suffix()}"
-    count, began, ends = 0, 0.0, deque[float](maxlen=20)
+    first, count, began, ends = "", 0, 0.0, deque[float](maxlen=20)
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add:
         try:
             for picture in stream.frames:
+                here = f"{picture.image.shape[-1]} × {picture.image.shape[-2]}"
+                first = first or here
+                remedy = "`semfov search`, `find` and `explore` take pictures of any size, each by itself"
+                check(here == first, picture.name, f"{first} px, the size of the first frame", f"{here}; {remedy}")
                 moment = live.step(picture.image, picture.passed)
                 count += 1
                 if count == 1 and live.criterion is not None:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from semfov import ActivePerception, Detections, Grid
 from semfov.belief import DirichletBelief
@@ -96,6 +97,14 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert "red.avi: exploring" in printed.out
     assert "p(object) up to 0." in printed.out
     assert "written:" not in printed.out
+
+
+def test_a_picture_of_another_size_than_the_first_is_named(run, tmp_path):
+    for name, size in (("a.png", (60, 40)), ("b.png", (60, 40)), ("c.png", (40, 60))):
+        Image.new("RGB", size).save(tmp_path / name)
+    code, printed = run("live", tmp_path, "--target", "red")
+    assert code == 1
+    assert "error: c.png: expected 60 × 40 px, the size of the first frame, got 40 × 60; `semfov search`" in printed.err
 
 
 def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):
