@@ -110,10 +110,10 @@ def _looks_text(record: Record) -> str:
         lines.append(f"  value: {record.value_in_words}")
     for number, close_up in enumerate(record.closer, 1):
         taken = record.decision is not None and close_up.presence == record.decision.probability
-        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} anywhere{', which the decision takes' * taken}"
+        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} in the picture{', as decided' * taken}"
         lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
     if record.closer:
-        lines.append("  anywhere: the probability that the picture holds it, by that closer look alone")
+        lines.append("  in the picture: by all looks so far, so also where that closer look shows nothing of it")
     return "\n".join(lines)
 
 

@@ -218,7 +218,7 @@ class ZoomPath(Record):
         if round(sum(means)) >= len(chances):
             mean, variance, of = sum(means), sum(variances), "that this detector can show"
         left = [self.classes[label] for label in labels if label not in claimed]
-        without = f", without {' and '.join(left)}" if left else ""
+        without = f"; for {' and '.join(left)} no number is given" if left else ""
         return f" (about {mean:.0f} ± {variance**0.5:.0f} {of}{without})"
 
     def _looks(self) -> Iterator[RecordedLook]:

@@ -36,22 +36,31 @@ def record_html(record: Record) -> str:
         at = f'x="{x1 + 3 * unit:.0f}" y="{y1 + 11 * unit:.0f}"'
         style = f'font-size="{11 * unit:.0f}" fill="{GAZE}" stroke="#fff" stroke-width="{3 * unit:.1f}"'
         shapes.append(f'<text {at} {style} paint-order="stroke">{look.number}</text>')
-    for row in record.object_rows()[:_MOST]:
-        colour, sure = (FOUND, ", confirmed") if row["confirmed"] else (TARGET, "")
-        title = f"<title>{escape(row['class'])} {row['score']:.2f}{sure}</title>"
-        for turn in (0, width) if row["x2"] > width else (0,):
-            box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
-            shapes.append(_rect(box, colour, (2 if sure else 1.2) * unit, title))
+    marks = [
+        ([row[side] for side in ("x1", "y1", "x2", "y2")], f"{row['class']} {row['score']:.2f}", row["confirmed"], "")
+        for row in record.object_rows()[:_MOST]
+    ]
+    best = record.best_place
+    if best is not None:
+        dashes = f' stroke-dasharray="{8 * unit:.1f} {5 * unit:.1f}"'
+        marks.append((best[0].tolist(), f"best place {best[1]:.2f}", True, dashes))
+    for (x1, y1, x2, y2), name, sure, dashes in marks:
+        title = f"<title>{escape(name)}{', confirmed' * (sure and not dashes)}</title>"
+        colour, line = (FOUND, 2 * unit) if sure else (TARGET, 1.2 * unit)
+        for turn in (0, width) if x2 > width else (0,):
+            shapes.append(_rect((x1 - turn, y1, x2 - turn, y2), colour, line, title, dashes))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     green = ", and confirmed ones green" if record.confirmable else ""
-    key = f"Objects from {record.threshold_in_words} are orange{green}."
-    return f"<div>{escape(record.summary())}<br>{drawing}<br>{key if len(record.objects) else ''}</div>"
+    key = f"Objects from {record.threshold_in_words} are orange{green}. " if len(record.objects) else ""
+    key += "The best place, not sure enough, is dashed." if best is not None else ""
+    return f"<div>{escape(record.summary())}<br>{drawing}<br>{key}</div>"
 
 
-def _rect(box: Sequence[float], colour: str, line: float, inside: str = "") -> str:
+def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", dashes: str = "") -> str:
     x1, y1, x2, y2 = box
     side = f'x="{x1:.1f}" y="{y1:.1f}" width="{x2 - x1:.1f}" height="{y2 - y1:.1f}"'
-    return f'<rect {side} fill="none" stroke="{colour}" stroke-width="{line:.1f}" pointer-events="all">{inside}</rect>'
+    stroke = f'stroke="{colour}" stroke-width="{line:.1f}"{dashes}'
+    return f'<rect {side} fill="none" {stroke} pointer-events="all">{inside}</rect>'
 
 
 def scanpath_html(scanpath: Scanpath) -> str:

@@ -88,7 +88,7 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert (box.tolist(), probability) == (RIGHT, 0.3)
     assert path.to_dict()["summary"].endswith(" Best place: box 50,40–70,55, probability 0.30.")
     told = _looks_text(path).splitlines()
-    assert [line.endswith(", which the decision takes") for line in told if "closer look " in line][:2] == [False, True]
+    assert [line.endswith(", as decided") for line in told if "closer look " in line][:2] == [False, True]
     for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
         assert replace(path, decision=other).best_place_in_words() == ""
     assert replace(path, closer=(), detections=(look(), look())).best_place_in_words() == ""
@@ -205,8 +205,8 @@ def test_a_number_is_claimed_class_by_class():
     error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
     assert path.expected_error["cup"] == pytest.approx(error**0.5)
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
-    said = "2 × cup, 0 × cat from probability or score 0.5 (about 2 ± 1 that this detector can show, without cat)"
-    assert path.objects_in_words() == said
+    number = "(about 2 ± 1 that this detector can show; for cat no number is given)"
+    assert path.objects_in_words() == f"2 × cup, 0 × cat from probability or score 0.5 {number}"
     every = replace(path, targets=())
     # Of all classes only those are counted of which something is listed.
     assert every.classes_in_words() == "2 × cup (about 2 ± 1 that this detector can show)"

@@ -212,6 +212,9 @@ def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_p
     assert f" {place.capitalize()}." in data["decision"]
     assert data["best"] == path.best_place[0].tolist()
     assert len(Elements(page_html("t", [data])).of("best")) == 1
+    (dashed,) = re.findall(r"<rect [^>]*stroke-dasharray[^>]*><title>([^<]*)</title>", path._repr_html_())
+    assert dashed == f"best place {path.best_place[1]:.2f}"
+    assert "dash" not in zoom_path._repr_html_()
     assert not Elements(page_html("t", [zoom_data(zoom_path, large_picture, name="field.png")])).of("best")
 
 
