@@ -130,7 +130,7 @@ def read(path: Path, equivalent: Mapping[str, Sequence[str]]) -> Iterator[Mutant
 def score(counts: Mapping[str, int]) -> str:
     """Share of killed mutants among those that were run and not set aside, in percent."""
     run = counts["killed"] + counts["survived"] + counts["untested"]
-    return f"{counts['killed'] / run:.1%}" if run else "–"
+    return f"{100 * counts['killed'] / run:.1f} %" if run else "–"
 
 
 def listed() -> dict[str, list[str]]:

@@ -44,7 +44,7 @@ class _Parts(dict[str, list[float]]):
         """Table rows with the mean and the share of each part."""
         means = {part: mean(times) for part, times in self.items()}
         whole = sum(means.values())
-        shares = [[kind, part, number(each), f"{each / whole:.0%}"] for part, each in means.items()]
+        shares = [[kind, part, number(each), f"{100 * each / whole:.0f} %"] for part, each in means.items()]
         return [*shares, [kind, "all", number(whole), f"{1e3 / whole:.2g} a second"]]
 
 

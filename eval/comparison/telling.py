@@ -18,7 +18,7 @@ from semfov.runs.tables import plus_minus, table
 _SHARES = (0.01, 0.02, 0.05)
 """False alarm rates at which the tables give the hit rate."""
 
-TELLING = ["area under ROC", *(f"hits at {share:.0%}" for share in _SHARES)]
+TELLING = ["area under ROC", *(f"hits at {100 * share:.0f} %" for share in _SHARES)]
 """Column headings of `Telling.rows`."""
 
 CALIBRATED = ["ECE", "ECE if calibrated"]

@@ -133,7 +133,7 @@ def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Ou
     """Draw viewers, and say what was predicted."""
     paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
     places = "; ".join(
-        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {peak['share']:.0%}"
+        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
         for number, peak in enumerate(prediction.peaks(), 1)
     )
     terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())

@@ -405,14 +405,14 @@ class GazePrediction:
         reach = _REACH * max(self.size)
         known = "" if self.seen is None else f", after {self.seen} fixation{plural} seen by the fovea"
         return (
-            f"{first['share']:.0%} of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
+            f"{100 * first['share']:.0f} % of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
             f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{known}"
         )
 
     def __repr__(self) -> str:
         """The description, and the places where most fixations are expected."""
         lines = [
-            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {peak['share']:.0%}"
+            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {100 * peak['share']:.0f} %"
             for number, peak in enumerate(self.peaks(), 1)
         ]
         return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])

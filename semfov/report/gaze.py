@@ -89,7 +89,7 @@ def _facts(prediction: GazePrediction) -> str:
     """What is known of a picture without the script: entropy, terms, and places in order."""
     bits = ", ".join(f"{name} {value:.2f}" for name, value in prediction.parts.items())
     rows = "".join(
-        f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{peak['share']:.1%}</td></tr>"
+        f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{100 * peak['share']:.1f} %</td></tr>"
         for place, peak in enumerate(prediction.peaks(), 1)
     )
     return (

@@ -23,7 +23,7 @@ class WholeBar:
         self.title, self.stages = title, stages
         self._total = sum(sum(tasks.values()) for tasks in stages.values()) or 1.0
         self._at, self._tasks = 0.0, dict[str, float]()
-        form = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}{postfix}"
+        form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {remaining}{postfix}"
         self._bar = tqdm(total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
         self._closed = threading.Event()
         threading.Thread(target=self._tick, daemon=True).start()

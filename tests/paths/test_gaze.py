@@ -72,7 +72,7 @@ def test_places_are_the_peaks_in_order(gaze):
     broad = replace(gaze, terms={"map": log[None]})
     assert [round(each["x"]) for each in broad.peaks(2)] == [80, 20]
     assert broad.peaks(1) == broad.peaks(2)[:1]
-    assert broad.describe().startswith(f"{broad.peaks(2)[0]['share']:.0%} of fixations")
+    assert broad.describe().startswith(f"{100 * broad.peaks(2)[0]['share']:.0f} % of fixations")
 
 
 def test_scanpaths_last_as_long_as_people_view(gaze):

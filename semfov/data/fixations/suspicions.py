@@ -53,9 +53,9 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     points, sides = _joined(records)
     looks = _looks_like(records)
     found = [] if looks is None else [f"points look like {looks}"]
-    outside = _outside(points, sides)
-    if looks is None and outside.mean() > _MOST_OUTSIDE:
-        found.append(f"{outside.mean():.0%} of the fixations lie outside their frame (check its size and the origin)")
+    outside = _outside(points, sides).mean()
+    if looks is None and outside > _MOST_OUTSIDE:
+        found.append(f"{100 * outside:.0f} % of the fixations lie outside their frame (check its size and the origin)")
     if looks is None:
         found += _letterbox(points, sides)
     if sizes is not None:
@@ -104,7 +104,7 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
     for axis, (name, places) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
         bars, others = (low[axis], high[axis]), (low[1 - axis], high[1 - axis])
         if min(bars) > _BAR and max(bars) < 0.4 and abs(bars[0] - bars[1]) < _LEVEL and max(others) < _LEVEL:
-            width = f"{min(bars):.0%} of the frame at the {name}"
+            width = f"{100 * min(bars):.0f} % of the frame at the {name}"
             return [f"no {places} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
 
@@ -141,8 +141,8 @@ def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
 def _repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
     found = []
     steps = np.concatenate([(each.points[1:] == each.points[:-1]).all(1) for each in records])
-    if len(steps) >= _MANY and steps.mean() > _MOST_REPEATED:
-        found.append(f"{steps.mean():.0%} of the fixations repeat the point before (are these samples of the tracker?)")
+    if len(steps) >= _MANY and (same := steps.mean()) > _MOST_REPEATED:
+        found.append(f"{100 * same:.0f} % of the fixations repeat the point before (are these samples of the tracker?)")
     twice = Counter((each.picture, each.subject, each.target, each.points.tobytes()) for each in records)
     again = [who for who, count in twice.items() if count > 1 and len(who[3]) > 16]
     if again:
@@ -175,7 +175,7 @@ def _durations(records: Sequence[Fixations]) -> list[str]:
     elif middle < _SHORT:
         found.append(f"durations of {middle:g} ms in the median are those of samples, not of fixations")
     elif (short := (values < _SHORT).mean()) > _MOST_SHORT:
-        found.append(f"{short:.0%} of the fixations take less than {_SHORT:g} ms")
+        found.append(f"{100 * short:.0f} % of the fixations take less than {_SHORT:g} ms")
     if (long := int((values > _LONG).sum())) > 0:
         found.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
     return found
@@ -214,8 +214,8 @@ def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, sta
     if count:
         first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())
         warnings.warn(
-            f"{source}: {count} of {total} fixations ({count / total:.0%}) lie far outside their frame, such as those "
-            f"of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check its size and the unit",
+            f"{source}: {count} of {total} fixations ({100 * count / total:.0f} %) lie far outside their frame, such "
+            f"as those of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check size and unit",
             stacklevel=stacklevel,
         )
     return fixations

@@ -213,7 +213,7 @@ def test_fixations_far_outside_their_frame_are_reported_with_their_share(tmp_pat
     write_table(tmp_path / "a.csv", [near])
     assert len(read_table(tmp_path / "a.csv")) == 1
     write_table(tmp_path / "b.csv", [near, far])
-    with pytest.warns(UserWarning, match=r"b\.csv: 1 of 4 fixations \(25%\) lie far outside their frame.* of 2 in"):
+    with pytest.warns(UserWarning, match=r"b\.csv: 1 of 4 fixations \(25 %\) lie far outside their frame.* of 2 in"):
         assert len(read_table(tmp_path / "b.csv")) == 2
 
 
