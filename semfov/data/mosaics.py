@@ -87,14 +87,12 @@ class Mosaics(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        boxes, labels, crowd = [], [], []
-        for tile in self.tiles(index):
-            part, (x1, y1, x2, y2) = self.scenes.annotation(tile.scene), tile.box
+        parts, boxes = [(self.scenes.annotation(tile.scene), tile.box) for tile in self.tiles(index)], []
+        for part, (x1, y1, x2, y2) in parts:
             scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)
             boxes.append(part.boxes * scale + part.boxes.new_tensor([x1, y1] * 2))
-            labels.append(part.labels)
-            crowd.append(part.crowd)
-        return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
+        labels, crowd = torch.cat([part.labels for part, _ in parts]), torch.cat([part.crowd for part, _ in parts])
+        return Annotation(torch.cat(boxes), labels, crowd, self.size)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""

@@ -128,13 +128,12 @@ class Detections:
             One batch with all images.
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
-        longest = max(d.mask.shape[-1] for d in images)
-        missing = [longest - d.mask.shape[-1] for d in images]
-        return cls(
-            torch.cat([pad(d.boxes, (0, 0, 0, extra)) for d, extra in zip(images, missing, strict=True)]),
-            torch.cat([pad(d.scores, (0, 0, 0, extra)) for d, extra in zip(images, missing, strict=True)]),
-            torch.cat([pad(d.mask, (0, extra)) for d, extra in zip(images, missing, strict=True)]),
+        longest = max(each.mask.shape[-1] for each in images)
+        columns = zip(*((each.boxes, each.scores, each.mask[..., None]) for each in images), strict=True)
+        boxes, scores, mask = (
+            torch.cat([pad(each, (0, 0, 0, longest - each.shape[-2])) for each in column]) for column in columns
         )
+        return cls(boxes, scores, mask[..., 0])
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Boxes, score vectors, classes from 1, and scores of the single image."""

@@ -210,14 +210,8 @@ def load_onnx(
         path = with_input_size(file, _sides(input_size))
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
     stored = read_settings(file, session.metadata)
-    options = {
-        "head": head,
-        "classes": classes,
-        "input_size": input_size,
-        "stride": stride,
-        "logits": logits,
-        "name": published_name,
-    }
+    options = {"head": head, "classes": classes, "input_size": input_size, "stride": stride, "logits": logits}
+    options["name"] = published_name
     chosen = stored | {key: value for key, value in options.items() if value is not None}
     size = _canvas_size(session, chosen.get("input_size"))
     outputs = session.probe(size)
@@ -225,8 +219,7 @@ def load_onnx(
     if "head" not in chosen:
         # A pass tells apart heads whose shapes are alike.
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
-        coco = len(COCO_CLASSES) if published_name else None
-        count = coco if names is None else len(names)
+        count = len(COCO_CLASSES if names is None else names) if names or published_name else None
         grey = torch.full((1, 3, size[1], size[0]), 0.5)
         signature = Signature(session.image, shapes, size, session.producer, count, session.metadata)
         chosen["head"] = signature.head(lambda: session(grey))

@@ -162,6 +162,7 @@ _NANODET = Preprocessing(
 STRIDES = (8, 16, 32, 64)
 _OTHER_TASKS = ("segment", "pose", "obb", "classify")
 """Tasks in Ultralytics' metadata whose outputs are other ones than those of detection."""
+_SCORES = "all class scores of each box"
 _DETR_LOGITS = ("logits", "pred_logits")
 
 
@@ -226,10 +227,7 @@ def _fitting(signature: Signature) -> Iterator[str]:
         elif channels == (92 if classes is None else classes + 1):
             yield "detr"
     elif {"labels", "boxes", "scores"} <= set(shapes):
-        raise InputError(
-            f"outputs {', '.join(names)}: expected all class scores of each box, got one class; export the model "
-            f"without its top-k"
-        )
+        check(False, f"outputs {', '.join(names)}", _SCORES, "one class; export the model without its top-k")
     elif "boxes" in shapes and shapes.keys() & {"classes", "scores"}:
         yield "candidates"
     elif len(shapes) > 1:
@@ -282,10 +280,8 @@ def _single(signature: Signature, name: str, rows: int, columns: int) -> Iterato
         if classes == 2 and not selects:
             yield "rtdetr"
     elif columns == 7 and classes != 3 and not anchors:
-        raise InputError(
-            f"output {name} (1, {rows}, {columns}): expected all class scores of each box, got boxes without them; "
-            f"export the model without NMS"
-        )
+        got = "boxes without them; export the model without NMS"
+        check(False, f"output {name} (1, {rows}, {columns})", _SCORES, got)
     elif classes is not None and scores(4) and not across:
         yield "rtdetr"
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
-from semfov.errors import DataError, InputError, check, check_data
+from semfov.errors import DataError, check, check_data
 from semfov.io.files import check_regular, inside, reading
 from semfov.io.schema import excerpt
 
@@ -67,19 +67,20 @@ class OnnxSession:
         options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
         self.open_ended = check_file(self.path) if open_ended is None else open_ended
-        self._settings: dict[str, Any] = {
+        # What makes a session of the same model with the same settings.
+        shared: dict[str, Any] = {
             "threads": self.threads,
             "device": device,
             "providers": self.providers,
             "spinning": spinning,
-            "open_ended": self.open_ended,
-            "further": tuple(further),
         }
+        self._again = partial(OnnxSession, self.path, **shared, open_ended=self.open_ended)
+        self._further = tuple(further)
         if self.open_ended:
             _limit_memory()
             options.add_session_config_entry("session.use_env_allocators", "1")
+        chosen = _providers(torch.device(device), self.providers)
         try:
-            chosen = _providers(torch.device(device), self.providers)
             # onnxruntime's fallback would print messages and try the same again.
             model: str | bytes = fspath(path)
             if further:
@@ -92,8 +93,6 @@ class OnnxSession:
                 folder = "session.model_external_initializers_file_folder_path"
                 options.add_session_config_entry(folder, fspath(self.path.parent))
             self._session = ort.InferenceSession(model, options, providers=chosen, disable_fallback=1)
-        except InputError:
-            raise
         except Exception as error:  # onnxruntime's own exceptions share no base class
             raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
         try:
@@ -167,11 +166,11 @@ class OnnxSession:
             timer.cancel()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return partial(OnnxSession, self.path, **self._settings), ()
+        return partial(self._again, further=self._further), ()
 
     def widened(self, further: Sequence[str]) -> "OnnxSession":
         """A session of the same model, with the same settings, that also returns tensors inside it."""
-        return OnnxSession(self.path, **{**self._settings, "further": further})
+        return self._again(further=further)
 
     def probe(self, size: tuple[int, int]) -> dict[str, Tensor]:
         """Outputs in their shapes for one canvas: zeros where the model states all, else the outputs of a run."""

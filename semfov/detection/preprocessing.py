@@ -8,9 +8,19 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
-from semfov.io.schema import is_number
+from semfov.io.schema import Array, Flag, Number
 
 _ChannelOrder = Literal["rgb", "bgr"]
+
+
+_KINDS = {
+    "scale": Number(above=0),
+    "mean": Array(Number(), 3),
+    "std": Array(Number(above=0), 3),
+    "stretch": Flag(),
+    "corner": Flag(),
+    "fill": Number(0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -27,19 +37,10 @@ class Preprocessing:
 
     def __post_init__(self) -> None:
         lookup(str(self.channels), get_args(_ChannelOrder), "channel order")
+        for name, kind in _KINDS.items():
+            kind.check(f"preprocessing.{name}", getattr(self, name), {})
         for name in ("mean", "std"):
-            values = getattr(self, name)
-            three = isinstance(values, list | tuple) and len(values) == 3 and all(map(is_number, values))
-            check(three, f"preprocessing.{name}", "three numbers", values)
-            object.__setattr__(self, name, tuple(map(float, values)))
-        for name in ("scale", "fill"):
-            check(is_number(getattr(self, name)), f"preprocessing.{name}", "a number", getattr(self, name))
-        for name in ("stretch", "corner"):
-            value = getattr(self, name)
-            check(isinstance(value, bool), f"preprocessing.{name}", "true or false", value)
-        check(all(value > 0 for value in self.std), "preprocessing.std", "positive numbers", self.std)
-        check(self.scale > 0, "preprocessing.scale", "a positive number", self.scale)
-        check(0 <= self.fill <= 1, "preprocessing.fill", "a number in [0, 1]", self.fill)
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
 
     def __call__(self, canvas: Tensor) -> Tensor:
         """Convert a canvas `(B, 3, H, W)` to the input of the network, a new tensor of the same shape."""

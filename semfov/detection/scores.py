@@ -114,10 +114,7 @@ def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Te
     check_shape(classes, "classes", None)
     if policy == "own":
         if candidates.background is None:
-            raise InputError(
-                "background: the policy 'own' expects a head with a background score, got a head without one; "
-                "use the policy 'residual'"
-            )
+            raise InputError("background: expected a head with a score for the policy 'own', got none; use 'residual'")
         background = candidates.background
     elif policy == "residual":
         background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)

@@ -271,6 +271,6 @@ def test_inconsistent_arguments_are_refused_by_name(monkeypatch):
     refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 3, 3), torch.zeros(1, 2, dtype=torch.bool))
     refused(".", Detections, torch.zeros(1, 2, 4), torch.zeros(1, 2, 3), torch.zeros(1, 2))
     refused("'residual'", score_vectors, candidates([0.5]), "residul")
-    refused("expects a head with a background score", score_vectors, candidates([0.5]), "own")
+    refused("expected a head with a score for the policy 'own'", score_vectors, candidates([0.5]), "own")
     monkeypatch.setitem(sys.modules, "supervision", None)
     refused("pip install supervision", some().to_supervision)
