@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
@@ -155,7 +156,8 @@ class CandidateCells(CandidatePlaces[Step]):
         self._step, self._fixation, self.detections = look, look.shift, look.detections
         self.target = class_meant(look.belief, self._target)
         self.presence = float(look.belief.presence(self._target))
-        footprint = self.grid.footprint(look.detections.boxes, "soft")[0]
+        # Computed when a place is chosen for the first time.
+        footprint = cache(partial(self.grid.footprint, look.detections.boxes, "soft"))
         self._looks.append((self._frame, (look.detections, footprint)))
         # Largest probability of a cell that was not fixated, given that no fixated cell holds the target.
         self._left = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
@@ -177,7 +179,7 @@ class CandidateCells(CandidatePlaces[Step]):
             for frame, (seen, _) in self._looks
         ]
         scores = torch.cat(faded) * ~self._again(boxes) if self._examined else torch.cat(faded)
-        evidence = scores[:, None] * torch.cat([footprint for _, (_, footprint) in self._looks])
+        evidence = scores[:, None] * torch.cat([footprint()[0] for _, (_, footprint) in self._looks])
         value = cells * evidence.amax(0)
         cell = int(value.argmax())
         if float(value[cell]) <= 0 or float(cells[cell]) < least:
