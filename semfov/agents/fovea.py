@@ -42,10 +42,7 @@ from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, in_bytes, reduced_copy
 from semfov.strategy import Strategy
 
-_WORTH = 0.1
-"""Default least gain of a look in an exploration by a learned map: the expected increase in the number of correctly
-classified cells for which the exploration continues."""
-
+_WORTH = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
 _MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
 

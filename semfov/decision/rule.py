@@ -19,11 +19,8 @@ Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 """Outcomes by their number in `decide`; the first is that of searches that run out of gaze shifts."""
 
-_NEARLY = 0.9
-"""A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
-
-_ABSENT = 0.5
-"""A search that ends without a find decides that the target is absent below this probability of the picture."""
+_NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
+_ABSENT = 0.5  # probability of the picture below which the target of a search without a find is absent
 
 
 @dataclass(frozen=True)

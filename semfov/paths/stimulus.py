@@ -11,7 +11,8 @@ from semfov.data.windowed import LargePicture, resized
 from semfov.detection.placement import Placement, resize
 from semfov.errors import check, check_shape
 from semfov.eye import Eye
-from semfov.sensor import Sensor, sensor_of
+from semfov.sensor import Sensor
+from semfov.sensor.named import sensor_of
 
 LONGEST = 1280
 """Longer side of a kept photograph, in pixels; larger photographs are reduced to it."""

@@ -7,7 +7,7 @@ from semfov.sensor.foveation import Foveation, foveate
 from semfov.sensor.glimpse import glimpse
 from semfov.sensor.log_polar import LogPolar, from_log_polar, log_polar
 from semfov.sensor.multi_scale import MultiScaleFovea
-from semfov.sensor.named import SENSORS, named_sensor, sensor_of
+from semfov.sensor.named import SENSORS, named_sensor
 from semfov.sensor.perspective import perspective
 from semfov.sensor.pyramid import gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
 
@@ -31,7 +31,6 @@ __all__ = [
     "perspective",
     "pyrdown",
     "pyrup",
-    "sensor_of",
 ]
 
 

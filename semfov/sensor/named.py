@@ -72,20 +72,7 @@ def named_sensor(name: str, **settings: Any) -> Sensor:
 
 
 def sensor_of(settings: Mapping[str, Any]) -> Sensor:
-    """Make one of the library's sensors from its settings.
-
-    Args:
-        settings: settings as `Sensor.settings()` lists them.
-
-    Returns:
-        The sensor.
-
-    Raises:
-        InputError: they are the settings of another kind of sensor.
-
-    >>> sensor_of(Foveation(20.0, growth=1.0).settings())
-    Foveation(sigma=20, levels=5, growth=1, convention='kornia')
-    """
+    """One of the library's sensors from its settings (`Sensor.settings`)."""
     kinds = dict.fromkeys(named.make for named in SENSORS.values())
     for kind in kinds:
         if settings.get("kind", Foveation.kind) == kind.kind and all(name in settings for name in kind.names):

@@ -15,8 +15,8 @@ from semfov.cli.main import main as command
 from semfov.model_folder import ModelFolder
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.sensor import SENSORS, LogPolar, Sensor, named_sensor, sensor_of
-from semfov.sensor.named import SensorName, _NamedSensor
+from semfov.sensor import SENSORS, LogPolar, Sensor, named_sensor
+from semfov.sensor.named import SensorName, _NamedSensor, sensor_of
 from tests.colours import write_home
 from tests.refusals import refused
 from tests.small import once, run_settings
