@@ -21,8 +21,7 @@ _Returned = TypeVar("_Returned")
 def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments, _Returned]:
     """Decorate a function of tensors, so that one thread of the CPU works on small ones.
 
-    PyTorch divides an operation on more than 32,768 elements among its threads, and waits for the last one. If another
-    program uses a core, that thread waits for its turn, at each of the many operations of a fixation.
+    PyTorch waits for the last of its threads at each of the many operations, however busy the cores are.
     """
 
     @wraps(function)
@@ -61,8 +60,7 @@ def available_cores() -> int:
 def beside(work: Callable[[], object] | None, *, idle: bool) -> Iterator[None]:
     """Have a second thread do some work while the block computes, if the block leaves a core `idle`, or PyTorch does.
 
-    The work is a convenience: it is left out where the cores are shared among processes that one command started, and
-    what fails in it is left to whoever needs its result.
+    It is left out where processes of one command share the cores, and what fails in it is left to who needs its result.
     """
     shared = multiprocessing.parent_process() is not None
     if work is None or shared or not (idle or torch.get_num_threads() < available_cores()):

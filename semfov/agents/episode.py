@@ -60,13 +60,8 @@ class Episode(ABC, Generic[_Record]):
     """A search or an exploration under way: it looks when it is asked to, and tells its decision and its record.
 
     `run` looks until the decision or a limit, which makes the record of a picture. In a stream each look is given its
-    frame, and `moment` tells what is known after it.
-
-    Attributes:
-        passes: number of passes of the detector so far.
-        ending: reason for the end; None while it goes on.
-        criterion: what a search needs for the decision `found`, in words, after the first look; None where nothing is
-            decided.
+    frame, and `moment` tells what is known after it. `ending` is the reason for the end, and `criterion` what a search
+    needs for the decision `found`, in words, after the first look.
     """
 
     def __init__(

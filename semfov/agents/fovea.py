@@ -124,18 +124,11 @@ class FoveaAgent:
 class FoveaEpisode(Episode[Scanpath]):
     r"""Looks of a fovea, with one gaze shift or one closer look for each pass of the detector.
 
-    With a model of verification the target is found by closer looks alone: a look is then either one of the fovea, or a
-    closer look at a place that seems to hold the target (`semfov.decision.Verifier`).
-
-    In a stream the gaze continues from its last position. Each frame multiplies the evidence of earlier frames by
-    :math:`e^{-r}`, with the rate r, so that the map returns to the prior without new evidence and can follow a scene
-    that moves. Fixated cells are free again after :math:`\ln 2 / r` frames (`semfov.episode.Forgetting`,
-    `Observer.fade`). With rate 0, frames of a still picture give the looks, the closer looks and the decision of a
-    search of the picture up to its end.
-
-    Attributes:
-        ends: function from a step to the number of its outcome (`semfov.decision.OUTCOMES`), 0 to go on.
-        to_goal: whether the search ends on given cells, without a decision.
+    With a model of verification the target is found by closer looks alone (`semfov.decision.Verifier`). In a stream the
+    gaze continues from its last position, and each frame multiplies the evidence of earlier frames by :math:`e^{-r}`,
+    with the rate r (`semfov.episode.Forgetting`). With rate 0, frames of a still picture give the looks and the
+    decision of a search of the picture up to its end. `ends` tells the outcome of a step (`semfov.decision.OUTCOMES`),
+    0 to go on; a search `to_goal` ends on given cells, without a decision.
     """
 
     def __init__(

@@ -235,19 +235,13 @@ class _Look(NamedTuple):
 class WindowEpisode(Episode[ZoomPath]):
     r"""Looks at windows: of a picture, of the frames of a stream, or where it is told to.
 
-    In a search, places that seem to hold the target are looked at closely, and the target is `found` when it is
-    probable enough at such a place (`semfov.decision.Verifier`). The search goes on as long as no place is. Without
-    closer looks it is `found` when the picture holds it with a probability of at least `confirm` and a detection shows
-    it (`semfov.decision.settle`). When the value of every look that is left is below `give_up`, or all closer looks
-    were made, the target is `absent` if its probability is below one half, and the search is `undecided` otherwise. It
-    is also `undecided` when the passes are used up. Without evidence slices are looked at in the order of the
-    overview's scores, and nothing is `absent`.
+    A search decides by closer looks (`semfov.decision.Verifier`), or without them by the probability of the picture and
+    a detection that shows the target (`semfov.decision.settle`). Without evidence slices are looked at in the order of
+    the overview's scores, and nothing is `absent`.
 
-    In a stream a look counts for :math:`\ln 2 / r` frames, with the rate r, or until the next look at the same window;
-    its window is then worth a look again (`semfov.zoom.episode.look_by_look`). The whole frame is looked at as often.
-    Objects are merged from the looks that count, and what a later look has shown as closely replaces what earlier ones
-    did. With rate 0 nothing is forgotten or replaced: frames of a still picture give the looks, the closer looks and
-    the objects of a search or an exploration of the picture up to its end.
+    In a stream a look counts for :math:`\ln 2 / r` frames, with the rate r, or until the next look at the same window
+    (`semfov.zoom.episode.look_by_look`), and what a later look has shown as closely replaces what earlier ones did.
+    With rate 0 frames of a still picture give the looks and the objects of an episode of the picture up to its end.
     """
 
     usual_passes = 24

@@ -138,10 +138,9 @@ class CandidatePlaces(ABC, Generic[LookType]):
 class CandidateCells(CandidatePlaces[Step]):
     """Cells that seem to hold the target of one search: those with the largest product of probability and evidence.
 
-    Detections that overlap a box that was examined by half, and the cells that it covers, are left out. A place is due
-    when a fixated cell is nearly as probable as the most probable one (`place_known`), or when no other look follows.
-    In a scene that changes, evidence of earlier frames counts less, and places that were examined are listed again when
-    half of the evidence is left (`semfov.episode.Forgetting`).
+    Examined boxes and the cells that they cover are left out. A place is due when a fixated cell is nearly as probable
+    as any (`place_known`), or when no other look follows. In a scene that changes, evidence of earlier frames counts
+    less, and examined places are listed again when half of the evidence is left (`semfov.episode.Forgetting`).
     """
 
     def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:

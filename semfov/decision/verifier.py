@@ -33,25 +33,19 @@ class _Verdict(NamedTuple):
 class Verifier(Generic[LookType]):
     r"""Decides one search, with closer looks at the places that seem to hold the target; close_up `(4,)`.
 
-    After each look the verifier names the place that is to be looked at closely (`candidate`): the most evident one, if
-    it is probable enough. The search ends at once if the target is there with a probability halfway between `confirm`
-    and 1, or more; after `MOST_CLOSER` closer looks, with one of at least `confirm`. In a photograph that is looked at
-    by windows no place ends it (`by_worth`), as the next one may be surer. Otherwise it goes on, until no look is worth
-    a pass, or `most` closer looks were made. Then it has found the target at the best of the examined places, if that
-    is probable enough. If not, the target is absent or the search undecided, by the probability that the picture holds
-    it (`verified`).
+    After each look the verifier names the place that is to be looked at closely (`candidate`), the most evident one, if
+    it is probable enough. The search ends at once with a place that is sure, after `MOST_CLOSER` closer looks with one
+    that is probable enough, and with the best one when no look is worth a pass, or `most` closer looks were made
+    (`verified`). In a photograph that is looked at by windows no place ends it (`by_worth`), as the next may be surer.
 
-    The candidates are cells of a grid (`CandidateCells`) or boxes in a large picture
-    (`semfov.zoom.closer.CandidateBoxes`). Closer looks may follow a look at once (`look_closely`), or take frames of
-    their own in a stream (`look`). The probabilities of a closer look then fade towards the belief. With the rate r of
-    the candidates' `Forgetting`, after a frames
+    Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream (`look`). Their
+    probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a frames
 
     .. math:: \operatorname{logit} P_a = e^{-ra} \operatorname{logit} P_0 + (1 - e^{-ra}) \operatorname{logit} B
 
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
-    place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
-    place may be examined again. After twice as many frames the verdict is forgotten. If r is not 0 the scene may move,
-    and the boxes of the verdicts follow the detections of each look.
+    place never rises above :math:`P_0`. After :math:`\ln 2 / r` frames the place may be examined again, and after twice
+    as many the verdict is forgotten. If r is not 0, the boxes of the verdicts follow the detections of each look.
     """
 
     def __init__(
@@ -123,10 +117,7 @@ class Verifier(Generic[LookType]):
         return examined
 
     def __call__(self: "Verifier[Step]", step: Step) -> Tensor:
-        """Decide whether a search ends with a step, after the closer looks. Call it once for every step, in order.
-
-        Shapes: → `(1,)`.
-        """
+        """Decide whether a search ends with a step `(1,)`, after the closer looks, once for every step in order."""
         self.see(step)
         self.look_closely()
         return torch.full_like(step.cell, self.outcome())
