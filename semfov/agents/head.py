@@ -81,15 +81,7 @@ class HeadAgent(nn.Module):
         return cls(parts["eye"], *models).eval().requires_grad_(False)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
-        """The views and fixations that are possible in a scene.
-
-        Args:
-            scene: the scene (`semfov.head.open_scene`).
-            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
-
-        Returns:
-            Views with the scene's fields of view and the agent's fovea.
-        """
+        """The views and fixations that are possible in a scene (`semfov.head.open_scene`), with the agent's fovea."""
         return Views(open_scene(scene, color), fovea=_SIGMA / self.eye.reference)
 
     def search(
@@ -200,19 +192,7 @@ class HeadAgent(nn.Module):
         ).run()  # fmt: skip
 
     def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
-        """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
-
-        Args:
-            scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
-            options: arguments of `find_all`, except for the target.
-
-        Returns:
-            The record of the exploration.
-
-        Raises:
-            InputError: an argument is out of range.
-            DataError: a file cannot be read, or the camera gives no frame from the right direction.
-        """
+        """Explore a scene: `find_all` without a target, with its other arguments and errors."""
         return self.find_all(scene, None, **options)
 
 
