@@ -225,7 +225,15 @@ class Eye(StatedModule):
         return replace(detections, boxes=detections.boxes * unit + window[:2].repeat(2))
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
-        """Open an image and look from fixations (`open`, `look`)."""
+        """Open an image and look from fixations.
+
+        Args:
+            image: a picture of any common kind (`semfov.as_image`), or a tensor `(1, 3, H, W)`.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+
+        Returns:
+            The detections, a batch of F, boxes in pixels of the image.
+        """
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:

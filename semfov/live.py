@@ -22,14 +22,18 @@ class LivePerception:
 
     With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
     detector's input where the agent has no evidence for photographs, or where a first cell is given.
-    `ActivePerception.live` makes it.
 
     Args:
         fovea: the part of an agent that looks by a fovea.
         windows: the part of the agent that looks at windows.
         target: class 1..K to search for; None explores.
         targets: classes 1..K whose objects are all to be found, which windows do; empty for `target`.
-        **settings: the other arguments of `ActivePerception.live`.
+        how: the kind of look, `fovea`, `windows` or `auto`.
+        rate: rate at which evidence fades, per frame; None takes 0.1 for a fovea and 0.03 for windows.
+        start: first cell of a fovea; None draws one at random.
+        seed: seed of the generator that draws the start and breaks ties.
+        white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
+        **settings: `confirm`, `give_up`, `closer` and `color`, as for `ActivePerception.live`.
 
     Attributes:
         how: the kind of look; `auto` before the first frame.

@@ -15,6 +15,7 @@ from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
+from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneObserver
@@ -22,9 +23,11 @@ from semfov.head.camera import SceneLike, open_scene
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
+from semfov.io.compatibility import learned_for
+from semfov.io.pretrained import shipped_model
 from semfov.paths import Ending, HeadPath, RecordedLook
 from semfov.paths.stimulus import reduced_copy
-from semfov.presets import recommended_arguments
+from semfov.sensor.foveation import Foveation
 
 _SIGMA = 100.0  # width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels
 _PASSES = 40  # default of the largest number of looks
@@ -74,14 +77,23 @@ class HeadAgent(nn.Module):
             InputError: no models are shipped for a detector of this name.
             DataError: the weights cannot be obtained, or are damaged.
         """
-        parts = recommended_arguments(name, _SIGMA, 2.0, (10, 10), **options)
-        models = [parts[task][0].model for task in ("search", "explore")]
+        eye = Eye(Foveation(_SIGMA, growth=2.0), load_detector(name, **options))
+        shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
+        models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
         for model in models:
-            model.check_compatible(parts["eye"].settings())
-        return cls(parts["eye"], *models).eval().requires_grad_(False)
+            model.check_compatible(eye.settings())
+        return cls(eye, *models).eval().requires_grad_(False)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
-        """The views and fixations that are possible in a scene (`semfov.head.open_scene`), with the agent's fovea."""
+        """The views and fixations that are possible in a scene.
+
+        Args:
+            scene: the scene (`semfov.head.open_scene`).
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
+
+        Returns:
+            Views with the scene's fields of view and the agent's fovea.
+        """
         return Views(open_scene(scene, color), fovea=_SIGMA / self.eye.reference)
 
     def search(
@@ -192,7 +204,19 @@ class HeadAgent(nn.Module):
         ).run()  # fmt: skip
 
     def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
-        """Explore a scene: `find_all` without a target, with its other arguments and errors."""
+        """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
+
+        Args:
+            scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
+            options: arguments of `find_all`, except for the target.
+
+        Returns:
+            The record of the exploration.
+
+        Raises:
+            InputError: an argument is out of range.
+            DataError: a file cannot be read, or the camera gives no frame from the right direction.
+        """
         return self.find_all(scene, None, **options)
 
 

@@ -190,11 +190,32 @@ class ZoomAgent(nn.Module):
         return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
 
     def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
-        """Find all objects of all classes: `find_all` without a target, with its other arguments and errors."""
+        """Find all objects of all classes.
+
+        Args:
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+            options: arguments of `find_all`, except for the target.
+
+        Returns:
+            The looks and the objects.
+
+        Raises:
+            InputError: an argument does not fit.
+            DataError: the file cannot be read.
+        """
         return self.find_all(picture, None, **options)
 
     def episode(self, target: int | None = None, targets: tuple[int, ...] = (), **settings: Any) -> "WindowEpisode":
-        """An episode of class 1..K, of all objects of several, or of all; settings as for `WindowEpisode`."""
+        """The episode of a search or an exploration, which looks when it is asked to.
+
+        Args:
+            target: class 1..K to search for; None finds all objects.
+            targets: classes 1..K whose objects are all to be found; none: of all classes.
+            **settings: further arguments of `WindowEpisode`.
+
+        Returns:
+            The episode, to be opened with looks at a picture, or given frames.
+        """
         # The evidence computes on the CPU, where the looks are that it reads.
         evidence = None if self.evidence is None else on_cpu(self.evidence)
         return WindowEpisode(self.classes, evidence, target, targets, eye=self.eye, **settings)

@@ -135,7 +135,14 @@ class StoredLooks(Looks):
         self._classes = [] if targets is None else targets.unique().tolist()
 
     def of(self, episodes: Tensor | slice) -> Self:
-        """The same looks for some of the episodes, by their numbers; what observers have weighed is shared."""
+        """The same looks for some of the episodes.
+
+        Args:
+            episodes: their numbers.
+
+        Returns:
+            The looks; what observers have weighed is shared.
+        """
         looks = copy(self)
         looks.targets = None if self.targets is None else self.targets[episodes]
         return looks
@@ -149,18 +156,40 @@ class StoredLooks(Looks):
         return Sight(look, lambda: self.detections[cell], watch.seconds)
 
     def first_row(self, observer: Observer, targets: Tensor | None) -> Tensor:
-        """Row of `weighed` with the look from cell 0, for each target `(A,)`; `()` if looks do not depend on it."""
+        """Row of `weighed` with the look from cell 0, for each target.
+
+        Args:
+            observer: the observer.
+            targets: `(A,)`, classes 1..K, or None.
+
+        Returns:
+            `(A,)` row numbers, or `()` if the looks do not depend on the target.
+        """
         if not observer.by_target or targets is None:
             return torch.zeros((), dtype=torch.int64)
         # One row for each target and cell.
         return torch.searchsorted(targets.new_tensor(self._classes), targets) * len(self.grid)
 
     def rows(self, observer: Observer) -> int:
-        """Number of rows of `weighed`."""
+        """Number of rows of `weighed`.
+
+        Args:
+            observer: the observer.
+
+        Returns:
+            The number of looks.
+        """
         return len(self.grid) * (len(self._classes) if observer.by_target and self._classes else 1)
 
     def weighed(self, observer: Observer) -> Look:
-        """Evidence of the looks from all cells, X·Y; if the observer is `by_target`, of one target after another."""
+        """Evidence of the looks from all cells, computed on the first call.
+
+        Args:
+            observer: the observer that weighs them.
+
+        Returns:
+            A batch of X·Y looks; if the observer is `by_target`, X·Y looks for each target, one target after another.
+        """
         if observer not in self._weighed:
             centres = self.grid.centres.to(self.like)
             targets = self._classes if observer.by_target else [None]

@@ -42,7 +42,17 @@ class Forgetting:
         object.__setattr__(self, "span", math.log(2) / self.rate if self.rate else math.inf)
 
     def visited(self, age: Tensor) -> Tensor:
-        """Cells `(A, X·Y)` that inhibition of return keeps the gaze from, by the looks since (inf: never)."""
+        """Cells that inhibition of return keeps the gaze from.
+
+        Args:
+            age: `(A, X·Y)`, number of looks since each cell was fixated; infinity for never.
+
+        Returns:
+            `(A, X·Y)` boolean.
+
+        >>> Forgetting(0.5).visited(torch.tensor([[0.0, 1.0, 2.0, torch.inf]]))
+        tensor([[ True,  True, False, False]])
+        """
         recent = (age <= self.span) & age.isfinite()
         oldest = age == age.amax(-1, keepdim=True)
         return recent & ~(recent.all(-1, keepdim=True) & oldest)

@@ -83,7 +83,17 @@ class RandomFoveation(IntensityAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Foveate a batch `(B, C, H, W)` around the fixations that were drawn, `params`."""
+        """Foveate a batch around the fixations that were drawn.
+
+        Args:
+            input: images `(B, C, H, W)`.
+            params: `gaze`, `(B, 2)`, and `sigma`, `(B,)`, in pixels.
+            flags: `levels`, `growth` and `convention`.
+            transform: unused; Kornia passes it to every augmentation.
+
+        Returns:
+            Foveated images `(B, C, H, W)`.
+        """
         # Kornia's containers add further flags.
         settings = {name: flags[name] for name in ("levels", "growth", "convention")}
         return foveate(input, params["gaze"], sigma=params["sigma"], **settings)

@@ -87,11 +87,27 @@ class Sensor(StatedModule, ABC):
         """
 
     def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int] | None:
-        """Tell the size of the canvas for a picture of the longer side `reference`; None: the detector's input."""
+        """Tell the size of the canvas that the sensor takes.
+
+        Args:
+            size: `(width, height)` of the picture.
+            reference: longer side of the image that the sensor's settings are for.
+
+        Returns:
+            `(width, height)`, to which the picture is stretched; None for the detector's input.
+        """
         return None
 
     def picture(self, state: Any, gaze: Tensor) -> Tensor:
-        """Compute the views from fixations `(F, 2)` as pictures `(F, 3, H, W)` of the canvas, for figures."""
+        """Compute the views as pictures of the canvas, for figures, saliency and environments.
+
+        Args:
+            state: the canvas as `open` prepared it.
+            gaze: fixations `(F, 2)`.
+
+        Returns:
+            `(F, 3, H, W)`.
+        """
         return self.look(state, gaze)
 
     def boxes_to_canvas(self, state: Any, gaze: Tensor, boxes: Tensor) -> Tensor:
@@ -118,24 +134,57 @@ class Sensor(StatedModule, ABC):
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Self:
-        """Make the sensor from its settings by name; `InputError` where one is missing or out of its range."""
+        """Make the sensor from its settings.
+
+        Args:
+            settings: the settings by name; others than `names` are ignored.
+
+        Returns:
+            The sensor.
+
+        Raises:
+            InputError: a setting is missing, or out of its range.
+        """
         for name in cls.names:
             check(name in settings, f"sensor.{name}", f"a setting of a {cls.__name__}", "none")
         return cls(**{name: settings[name] for name in cls.names})
 
     @classmethod
     def width(cls, settings: Mapping[str, Any]) -> float:
-        """Tell the width of the fovea, in pixels of the image that the settings are for; 100 where none is told."""
+        """Tell the width of the fovea, in pixels of the image that the settings are for.
+
+        Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            The width.
+        """
         return 100.0
 
     @classmethod
     def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:
-        """List ascending distances in pixels at which acuity changes; None for a sensor without steps of acuity."""
+        """List the distances from the fixation at which acuity changes, of a sensor with steps of acuity.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            Ascending distances in pixels of the image that the settings are for; None for a sensor without steps.
+        """
         return None
 
     @classmethod
     def describe(cls, settings: Mapping[str, Any]) -> str:
-        """Describe the settings in words, for titles."""
+        """Describe the settings in words, for titles.
+
+        Args:
+            settings: settings of the sensor.
+
+        Returns:
+            The numbers among them with their names.
+        """
         numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 

@@ -176,7 +176,14 @@ class Foveation(Sensor):
         return self.given_sigma
 
     def pyramid(self, image: ImageLike) -> Bands:
-        """Compute the Laplacian pyramid of images `(B, C, H, W)` or of one picture, to share it among fixations."""
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: images `(B, C, H, W)`, or one picture of any common type (`semfov.as_image`).
+
+        Returns:
+            The Laplacian pyramid.
+        """
         return laplacian_pyramid(as_batch(image), self.levels, self.convention)
 
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[Bands, Tensor]:
@@ -209,7 +216,15 @@ class Foveation(Sensor):
         return f"σ {settings['sigma']:g} px, growth {settings['growth']:g}"
 
     def forward(self, image: ImageLike | Bands, gaze: PointLike) -> Tensor:
-        """Foveate images, or their pyramid, around fixations, in the shapes of `foveate`."""
+        """Foveate images around fixations.
+
+        Args:
+            image: images, or their pyramid, as for `foveate`.
+            gaze: fixations `(x, y)` in image pixels, as for `foveate`.
+
+        Returns:
+            Foveated images, in the shapes of `foveate`.
+        """
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
         )

@@ -164,16 +164,39 @@ class LogPolar(Sensor):
         self.retina = _Retina(fovea, spacing, pooling)
 
     def pyramid(self, image: Tensor) -> _Levels:
-        """Compute the levels of the Gaussian pyramid of `(B, C, H, W)`, to share them among fixations."""
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: `(B, C, H, W)`.
+
+        Returns:
+            Levels of the Gaussian pyramid, finest first.
+        """
         return gaussian_pyramid(image, self.retina.levels(_size(image)))
 
     def cortical(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
-        """Compute cortical images `(B, C, M, N)` or `(B, G, C, M, N)` of images or their `pyramid` (`log_polar`)."""
+        """Compute cortical images, see `log_polar`.
+
+        Args:
+            image: `(B, C, H, W)`, or its levels from `pyramid`.
+            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+
+        Returns:
+            `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations.
+        """
         retina = self.retina
         return log_polar(image, gaze, fovea=retina.fovea, spacing=retina.spacing, pooling=retina.pooling)
 
     def forward(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
-        """Compute back-projections `(B, C, H, W)` or `(B, G, C, H, W)` of cortical images (`cortical`)."""
+        """Compute the back-projection of the cortical images of fixations.
+
+        Args:
+            image: `(B, C, H, W)`, or its levels from `pyramid`.
+            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+
+        Returns:
+            Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
+        """
         finest = image[0] if isinstance(image, tuple) else image
         cortical, retina = self.cortical(image, gaze), self.retina
         return from_log_polar(cortical, gaze, _size(finest), fovea=retina.fovea, spacing=retina.spacing)

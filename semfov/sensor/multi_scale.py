@@ -59,7 +59,14 @@ class MultiScaleFovea(Sensor):
         self.scales = self.crops = int(scales)
 
     def means(self, image: Tensor) -> _Planes:
-        """Compute the planes of squares of `(B, C, H, W)` at every scale, finest first, to share among fixations."""
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: `(B, C, H, W)`.
+
+        Returns:
+            Planes of squares at every scale, finest first.
+        """
         check_shape(image, "image", None, None, None, None)
         check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
         # A border of one pixel is black; it stands for everything that is farther outside.
@@ -91,7 +98,14 @@ class MultiScaleFovea(Sensor):
         return result if many else result[:, 0]
 
     def windows(self, gaze: Tensor) -> Tensor:
-        """Squares `(..., L, 4)` that the crops at fixations `(..., 2)` cover, edges between pixels."""
+        """Compute the squares that the crops cover.
+
+        Args:
+            gaze: fixations `(..., 2)`.
+
+        Returns:
+            `(..., L, 4)`, `(x1, y1, x2, y2)`, edges between pixels.
+        """
         reduced = 0.5 ** torch.arange(self.scales, dtype=gaze.dtype, device=gaze.device)
         points = gaze[..., None, :].expand(*gaze.shape[:-1], self.scales, 2)
         return windows_at(points, reduced.expand(points.shape[:-1]), (self.side, self.side))
