@@ -1,7 +1,7 @@
 """Presets: policies by name, and labels for policies without a name."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from types import MappingProxyType
 from typing import get_args
@@ -48,21 +48,14 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
     else:
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
         scored = {name: policy for name, policy in plain.items() if not FUNCTIONS[name].needs_map} | salient
-        alone = {
-            f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
-            for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
-            if not FUNCTIONS[policy.policy].needs_model
-        }
-    both = {
-        f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
-        for name, policy in scored.items()
-        for scores in ("raw", "calibrated")
-    }
+        mapped = {**scored, "expected-gain": PolicyConfig("expected-gain")}
+        mapped = {name: policy for name, policy in mapped.items() if not FUNCTIONS[policy.policy].needs_model}
+        alone = {f"{name}-learned": replace(policy, scores="learned") for name, policy in mapped.items()}
+    kinds: tuple[Scores, ...] = ("raw", "calibrated")
+    both = {f"{name}-{kind}": replace(policy, scores=kind) for name, policy in scored.items() for kind in kinds}
     same = {"recommended": best, "published": published}
     if task == "search":
-        same |= {
-            f"{_MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
-        }
+        same |= {f"{_MAXIMUM_A_POSTERIORI}-{kind}": both[f"non-predictive-{kind}"] for kind in kinds}
         same[f"{_MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
     return MappingProxyType({**alone, **both, **same})
 
