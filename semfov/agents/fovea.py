@@ -12,10 +12,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.agents.episode import Episode, EpisodeLimits, on_cpu
-from semfov.belief.grid import Grid
+from semfov.belief import Grid, Verification
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
-from semfov.belief.verification import Verification
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import (
     MOST_CLOSER,

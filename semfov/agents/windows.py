@@ -16,9 +16,8 @@ from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import Decision, check_thresholds
-from semfov.detection.detections import Detections
+from semfov.detection import LEAST, Detections
 from semfov.detection.load import load_detector, loader_options
-from semfov.detection.objects import LEAST
 from semfov.errors import check, check_number, check_options, check_whole
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath
 from semfov.paths.stimulus import reduced_copy

@@ -13,8 +13,7 @@ from semfov.detection.load import check_detector
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
-from semfov.sensor.foveation import Foveation
-from semfov.sensor.named import SENSORS
+from semfov.sensor import SENSORS, Foveation
 
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:

@@ -21,18 +21,15 @@ from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
-from semfov.data.classes import class_index
-from semfov.data.inputs import as_image
-from semfov.data.scenes import EmbeddedScenes
+from semfov.data import EmbeddedScenes, as_image, class_index
 from semfov.errors import DataError, InputError, SemfovError, check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
+from semfov.viz import plot_belief, plot_foveated_strip
 from semfov.viz.animation import render
-from semfov.viz.belief import plot_belief
-from semfov.viz.scanpath import plot_foveated_strip
 from semfov.viz.style import GAZE, TARGET
 
 _TASKS = ("search", "find all", "explore", "gaze")

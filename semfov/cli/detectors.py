@@ -2,9 +2,7 @@
 
 from os import fspath
 
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.target_evidence import TargetEvidence
-from semfov.belief.verification import Verification
+from semfov.belief import MapEvidence, TargetEvidence, Verification
 from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
 from semfov.detection.load import check_detector, load_detector

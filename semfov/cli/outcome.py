@@ -23,10 +23,8 @@ from semfov.paths import Record, Scanpath
 from semfov.paths.conversion import coco_categories
 from semfov.paths.look import CONFIDENT, detections_in_words
 from semfov.report.episode import jpeg
-from semfov.viz.belief import plot_belief, plot_belief_bars
-from semfov.viz.scanpath import plot_foveated_strip
+from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip, save_figure
 from semfov.viz.semantic import named_regions, plot_semantic_map
-from semfov.viz.style import save_figure
 
 _OBJECTS_LISTED = 20  # largest number of objects that are listed
 

@@ -35,9 +35,8 @@ from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.truth import Truth
-from semfov.data.classes import class_index
+from semfov.data import WordVectors, class_index, spread
 from semfov.data.sources import embedded_picture
-from semfov.data.word_vectors import WordVectors, spread
 from semfov.errors import DataError, InputError, SemfovError, check, check_options, lookup
 from semfov.head.scenes import World
 from semfov.io.files import check_writable, plain_name, sha256, write_bytes

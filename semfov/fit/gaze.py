@@ -10,9 +10,8 @@ from torch.nn import functional as F
 
 from semfov.fit.training import descend
 from semfov.fit.viewing import Events, Viewed, log_centre
-from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency import OculomotorBias, cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
-from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Whole
 
 _EVENTS = 12  # fixations of a picture in a pass of the fit of oculomotor biases

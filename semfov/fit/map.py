@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief import MapEvidence
-from semfov.belief.grid import Grid
+from semfov.belief import Grid, MapEvidence
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.belief.observers.learned_map import MapBelief, MapLook

@@ -15,12 +15,9 @@ from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
-from semfov.observation import MissCounts, fit_discriminative
-from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.statistics import DirichletStatistics
+from semfov.observation import DirichletStatistics, FovealObservationModel, MissCounts, fit_discriminative
 from semfov.runs.samples import Samples, all_cells
-from semfov.viz import plot_reliability
-from semfov.viz.style import save_figure
+from semfov.viz import plot_reliability, save_figure
 from semfov.zoom.eye import WindowEye
 
 _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]

@@ -17,12 +17,11 @@ from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
 from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
-from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance, Glances, Window
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.slices import usual_slices
 
 _FOLDS = 5

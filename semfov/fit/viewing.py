@@ -17,10 +17,7 @@ from tqdm import tqdm
 from semfov.data.fixations import Fixations, by_picture, read_fixations
 from semfov.data.fixations.reading import frame_of
 from semfov.data.pictures import Pictures
-from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import FeatureMaps
-from semfov.detection.placement import Placement
+from semfov.detection import Detections, Detector, FeatureMaps, Placement
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 from semfov.io.code import modules_digest

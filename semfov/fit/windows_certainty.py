@@ -15,11 +15,10 @@ from semfov.runs.progress import track
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
 from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything
-from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
-from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge_with_facts
 
 _AFTER = (3, 6, 12, 24)  # numbers of looks after which objects are taken

@@ -22,9 +22,8 @@ from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
-from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 from semfov.zoom.glances import Glance
 from semfov.zoom.slices import ranked, usual_slices
 

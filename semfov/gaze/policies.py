@@ -4,8 +4,7 @@ from typing import Any, get_args
 
 from torch import Tensor, nn
 
-from semfov.belief.grid import Grid
-from semfov.belief.map_evidence import MapEvidence
+from semfov.belief import Grid, MapEvidence
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction, Task
 from semfov.gaze.acquisition.lookahead import sampled_likelihoods

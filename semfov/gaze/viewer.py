@@ -7,8 +7,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.gaze.choice import Choice
-from semfov.gaze.saliency.cells import cell_saliency
-from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.gaze.saliency import FixationDensity, cell_saliency
 
 
 class Viewer(Choice):

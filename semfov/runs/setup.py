@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from semfov.belief import MapEvidence, TargetEvidence, Verification
-from semfov.data.coco import CocoScenes
-from semfov.data.scene import Scenes
-from semfov.data.scenes import EmbeddedScenes
+from semfov.data import CocoScenes, EmbeddedScenes, Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check

@@ -11,10 +11,9 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.io.schema import Field
 from semfov.runs.store import DetectionStore, RememberedLooks
-from semfov.zoom.eye import WindowEye
+from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.hints import Gist
-from semfov.zoom.lattice import Lattice
 
 
 class GlanceStore(DetectionStore):

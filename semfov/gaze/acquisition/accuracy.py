@@ -2,9 +2,8 @@
 
 from torch import Tensor
 
+from semfov.belief import Grid, MapEvidence
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
-from semfov.belief.grid import Grid
-from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers.base import own
 from semfov.belief.observers.learned_map import MapBelief
 from semfov.errors import InputError, check_shape

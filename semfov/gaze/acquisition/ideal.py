@@ -9,8 +9,7 @@ from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.separation import visibility
+from semfov.observation import FovealObservationModel, visibility
 
 # Where nothing is visible the answer is a guess: with this signal each of n equal cells is right with 1/n.
 _LEAST_SIGNAL = 1e-4

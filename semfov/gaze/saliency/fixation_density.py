@@ -12,9 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import FeatureMaps
-from semfov.detection.placement import Placement
+from semfov.detection import Detector, FeatureMaps, Placement
 from semfov.errors import InputError, check, check_shape
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.io.compatibility import check_same_detector
