@@ -18,8 +18,7 @@ from semfov.paths import Ending, Moment, Record, RecordedLook
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record = TypeVar("_Record", bound=Record)
 
-MOST_PASSES = 1_000_000
-"""Largest number of passes that can be asked for."""
+MOST_PASSES = 1_000_000  # largest number of passes that can be asked for
 
 OnLook = Callable[[Any], object]
 """Function that is called after each look with the record so far; the episode ends if it returns False."""

@@ -44,9 +44,7 @@ from semfov.strategy import Strategy
 _WORTH = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
 _MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
-
-Start = int | tuple[int, int] | None
-"""First cell of an episode: its number, its column and row, or None to draw one."""
+Start = int | tuple[int, int] | None  # first cell of an episode: its number, its column and row, or None to draw one
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from semfov.zoom.lattice import Lattice
 KindOfLook = Literal["fovea", "windows", "head"]
 """Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
 
-How = Literal["auto", "fovea", "windows", "head"]
-"""Kind of look, or `auto` for the one that suits the picture."""
+How = Literal["auto", "fovea", "windows", "head"]  # kind of look, or `auto` for the one that suits the picture
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a

@@ -33,9 +33,7 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.objects import merge, probable_objects, without_replaced
 from semfov.zoom.slices import ranked, usual_slices
 
-LIKELY = 0.5
-"""Default for the least probability of the objects that a record counts."""
-
+LIKELY = 0.5  # default for the least probability of the objects that a record counts
 _NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
 
 _Picture = LargePicture | ImageLike

@@ -13,8 +13,7 @@ from semfov.belief.look_features import LOOK_FEATURES, nothing_seen
 from semfov.io.pretrained import PretrainedForEye
 from semfov.sensor.lines import constant
 
-READOUT = 14
-"""Number of inputs that describe a cell after several looks."""
+READOUT = 14  # number of inputs that describe a cell after several looks
 
 # Distance between fixation and cell, in longer sides of the image, over which the weight of a look falls by a factor e.
 _REACH = 1 / 6

@@ -13,8 +13,7 @@ from semfov.threads import one_thread_if_small
 __all__ = ["fuse", "kaplan", "product", "semba", "sum"]
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
-RULES: dict[str, _Rule] = {}
-"""The rules by name, without checks, for likelihoods from `_scale_likelihood`."""
+RULES: dict[str, _Rule] = {}  # the rules by name, without checks, for likelihoods from `_scale_likelihood`
 
 
 def _rule(rule: _Rule) -> _Rule:

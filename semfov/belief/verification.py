@@ -14,9 +14,7 @@ from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import box_iou
 
-CLOSER_FEATURES = 7
-"""Number of features of a closer look (`closer_features`)."""
-
+CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
 _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a box at which it shows the same object
 
 _FLOOR = 1e-3

@@ -11,8 +11,7 @@ from semfov.errors import InputError
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
 from semfov.sensor.named import SensorName
 
-Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
-"""Figures that can be drawn of an episode."""
+Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]  # figures that can be drawn of an episode
 
 ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 """Figures that are drawn unless others are named."""

@@ -19,11 +19,8 @@ from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
 
 _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")  # ends of the names of files of results
-
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
-
-STDOUT = Path("-")
-"""Standard output in place of a file of results, which takes JSON lines."""
+STDOUT = Path("-")  # standard output in place of a file of results, which takes JSON lines
 
 _DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", "x1", "y1", "x2", "y2", "passes", "seconds")
 

@@ -15,9 +15,7 @@ from semfov.io.files import inside, read_bytes, reading
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
 
-MOST_SIDE = 2**20
-"""Longest side in pixels of a picture that is read by windows."""
-
+MOST_SIDE = 2**20  # longest side in pixels of a picture that is read by windows
 _BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
 # Files beside a raster (.ovr, .aux.xml) may be rasters of any driver themselves, or name others. Threads of a mosaic
 # would not know of that setting.

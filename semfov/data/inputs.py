@@ -19,15 +19,13 @@ if TYPE_CHECKING:
 ImageLike: TypeAlias = Union[Tensor, NDArray[Any], str, PathLike[str], "Image"]
 """A picture: the path of its file, a Pillow image, an array or a tensor; see `as_image`."""
 
-Color = Literal["rgb", "bgr"]
-"""Order of the channels of arrays and tensors; OpenCV reads BGR."""
+Color = Literal["rgb", "bgr"]  # order of the channels of arrays and tensors; OpenCV reads BGR
 
 PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
 
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
-STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")
-"""Kinds of addresses of cameras and streams."""
+STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")  # kinds of addresses of cameras and streams
 
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 

@@ -28,9 +28,7 @@ PHOTOGRAPHS = (
 )
 """Ends of the names of photographs."""
 
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
-"""Ends of the names of videos."""
-
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")  # ends of the names of videos
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)  # seconds between the attempts to open a stream again that broke off
 _MOST_FRAMES = 1e9  # of a file; streams state numbers that mean nothing

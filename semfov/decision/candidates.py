@@ -16,14 +16,10 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou
 
-SAME = 0.5
-"""Boxes with at least this overlap (intersection over union) are of the same object."""
-
+SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
 _MOST_LOOKS = 1000  # largest number of looks at a stream whose detections are kept
-
-LookType = TypeVar("LookType")
-"""A look of a search, with what is known after it."""
+LookType = TypeVar("LookType")  # a look of a search, with what is known after it
 
 LookAt = Callable[[Tensor], Detections]
 """Looks closely at a box `(4,)`; gives the detections, a batch of one (`semfov.Eye.close_up`)."""

@@ -17,9 +17,7 @@ from semfov.detection.selection import Selection, select
 from semfov.errors import InputError, check, check_pixels, check_whole
 from semfov.io.state import StatedModule
 
-FAINT = 0.002
-"""Confidence from which on a candidate is a hint, unless the head has another one."""
-
+FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
 _LARGEST = 65_536  # largest side of a canvas in pixels
 
 

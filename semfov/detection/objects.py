@@ -19,9 +19,7 @@ _Index = NDArray[np.intp]
 LEAST = 0.3
 """Score from which on objects are shown, printed, drawn and counted, unless the detector or the user gives another."""
 
-FAINTEST = 0.05
-"""Score from which on boxes are merged into candidates."""
-
+FAINTEST = 0.05  # score from which on boxes are merged into candidates
 _FAR = 1e9  # pixels of an edge, beyond which areas of single precision overflow
 _PRINTED = 20  # largest number of objects in the text form
 _BORDER = 2 / 416  # boxes that come this near to a border of their window, in longer sides of the window, are cut by it

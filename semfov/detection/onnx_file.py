@@ -17,9 +17,7 @@ from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, che
 _MOST_BYTES = 2**20  # largest number of bytes of a settings file
 _MOST_PIXELS = 89_478_485  # largest number of pixels of a canvas, the same as for pictures that are read
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
-
-METADATA_KEY = "semfov"
-"""Key of the settings, as JSON, in the metadata of models that semfov exports."""
+METADATA_KEY = "semfov"  # key of the settings, as JSON, in the metadata of models that semfov exports
 
 _SETTINGS = Object(
     {

@@ -12,8 +12,7 @@ from semfov.errors import InputError, check_shape, lookup
 
 BackgroundPolicy = Literal["residual", "normalised", "uniform", "none", "own"]
 
-HALVES = (torch.float16, torch.bfloat16)
-"""Half precisions."""
+HALVES = (torch.float16, torch.bfloat16)  # half precisions
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@
 
 import time
 
-STAGES = ("foveate", "detect", "weigh", "update belief", "choose")
-"""Names of the stages of a cycle, in order."""
+STAGES = ("foveate", "detect", "weigh", "update belief", "choose")  # names of the stages of a cycle, in order
 
 
 class Stopwatch:

@@ -28,8 +28,7 @@ from semfov.runs.scene_run import digest_of, store_folder
 from semfov.runs.settings import Count, Range, Settings
 from semfov.runs.store import SceneStore
 
-LONGEST = 20
-"""Number of fixations of a scanpath that are used, the first ones."""
+LONGEST = 20  # number of fixations of a scanpath that are used, the first ones
 
 _LAYERS = ("backbone8", "backbone16", "backbone32", "head8", "head16", "head32")
 

@@ -13,18 +13,12 @@ from semfov.head.belief import SceneBelief
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 
-FORESIGHT = 0.5
-"""Weight of the gain in sharpness over the cells of a view (`SearchGain`)."""
+FORESIGHT = 0.5  # weight of the gain in sharpness over the cells of a view (`SearchGain`)
 
 
-PRIOR = 0.03
-"""Prior probability that a cell that was never seen holds the target of a search."""
-
-UNSEEN = 1.0
-"""Expected fraction of cells that an exploration classifies correctly when it first fixates them."""
-
-OUT = -1e6
-"""Value of actions that must not be chosen."""
+PRIOR = 0.03  # prior probability that a cell that was never seen holds the target of a search
+UNSEEN = 1.0  # expected fraction of cells that an exploration classifies correctly when it first fixates them
+OUT = -1e6  # value of actions that must not be chosen
 
 
 class LookGain(nn.Module):

@@ -354,5 +354,4 @@ class Flat(_Plane):
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
 
 
-World = Sphere | _Plane
-"""A scene of either kind: both have the same methods."""
+World = Sphere | _Plane  # a scene of either kind: both have the same methods

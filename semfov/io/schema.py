@@ -156,8 +156,7 @@ class Maybe(Json):
             self.of.check(name, value, sizes)
 
 
-CLASSES = Array(Text(), "K", least=1, distinct=True)
-"""Names of the K classes of a detector."""
+CLASSES = Array(Text(), "K", least=1, distinct=True)  # names of the K classes of a detector
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ _CLOSER = {
     "place": CHANCE,
     "presence": CHANCE,
 }
-FARTHEST = 2.0**24
-"""Largest coordinate in pixels, up to which float32 holds every whole pixel."""
+FARTHEST = 2.0**24  # largest coordinate in pixels, up to which float32 holds every whole pixel
 
 _DETECTIONS = {
     "boxes": Field(("M", 4), mixed=True, low=-FARTHEST, high=FARTHEST),

@@ -11,11 +11,8 @@ from semfov.data.windowed import LargePicture, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
 
-Box = tuple[float, float, float, float]
-"""`(x1, y1, x2, y2)`."""
-
-CONFIDENT = 0.1
-"""Score from which on the detections of a look are counted, told and drawn."""
+Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
+CONFIDENT = 0.1  # score from which on the detections of a look are counted, told and drawn
 
 
 @dataclass(frozen=True, repr=False)

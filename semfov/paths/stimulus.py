@@ -14,8 +14,7 @@ from semfov.eye import Eye
 from semfov.sensor import Sensor
 from semfov.sensor.named import sensor_of
 
-LONGEST = 1280
-"""Longer side of a kept photograph, in pixels; larger photographs are reduced to it."""
+LONGEST = 1280  # longer side of a kept photograph, in pixels; larger photographs are reduced to it
 
 
 @dataclass(frozen=True)

@@ -253,8 +253,7 @@ class WorkConfig(Settings):
         return self.workers if self.scheduler is None else self.scheduler
 
 
-WHERE = ("out", "cache", "workers", "scheduler")
-"""Settings of folders and processes, which do not change results."""
+WHERE = ("out", "cache", "workers", "scheduler")  # settings of folders and processes, which do not change results
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from semfov.errors import DataError
 from semfov.io.files import check_regular
 from semfov.io.schema import is_number
 
-ResultRecord = dict[str, Any]
-"""The stored outcome of an episode, made of JSON values."""
+ResultRecord = dict[str, Any]  # the stored outcome of an episode, made of JSON values
 
 _TABLE = """
 CREATE TABLE IF NOT EXISTS scenes (

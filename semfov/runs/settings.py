@@ -42,26 +42,16 @@ class _FileName:
         return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
 
 
-SingleName = Annotated[str, _FileName()]
-"""Name of a model to write."""
-Seed = Annotated[int, Range(0, 2**63 - 1)]
-"""Seed of a random generator."""
-Count = Annotated[int, Range(1, 10**9)]
-"""A number of objects, at least one."""
-Whole = Annotated[int, Range(0, 10**9)]
-"""A number of objects, possibly 0."""
-Share = Annotated[float, Range(0, 1)]
-"""A share or a probability."""
-Positive = Annotated[float, Range(above=0, high=10**9)]
-"""A number above 0."""
-Weight = Annotated[float, Range(0, 10**9)]
-"""A number of 0 or more."""
-Shifts = Annotated[int, Range(0, 10_000)]
-"""Number of gaze shifts in an episode."""
-Side = Annotated[int, Range(1, 200)]
-"""Number of cells in a row or in a column."""
-Workers = Annotated[int, Range(1, 1024)]
-"""Number of processes."""
+SingleName = Annotated[str, _FileName()]  # name of a model to write
+Seed = Annotated[int, Range(0, 2**63 - 1)]  # seed of a random generator
+Count = Annotated[int, Range(1, 10**9)]  # a number of objects, at least one
+Whole = Annotated[int, Range(0, 10**9)]  # a number of objects, possibly 0
+Share = Annotated[float, Range(0, 1)]  # a share or a probability
+Positive = Annotated[float, Range(above=0, high=10**9)]  # a number above 0
+Weight = Annotated[float, Range(0, 10**9)]  # a number of 0 or more
+Shifts = Annotated[int, Range(0, 10_000)]  # number of gaze shifts in an episode
+Side = Annotated[int, Range(1, 200)]  # number of cells in a row or in a column
+Workers = Annotated[int, Range(1, 1024)]  # number of processes
 
 
 @dataclass(frozen=True)

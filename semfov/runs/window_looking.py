@@ -23,8 +23,7 @@ from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.objects import merge
 
-TileSize = Annotated[int, Range(16, 16_384)]
-"""Side of a part of a picture in pixels."""
+TileSize = Annotated[int, Range(16, 16_384)]  # side of a part of a picture in pixels
 
 
 @dataclass(frozen=True)

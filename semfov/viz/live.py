@@ -21,8 +21,7 @@ _Box = tuple[float, float, float, float]
 _LONGEST = 640
 _LONGEST_OF_WINDOWS = 1280  # small objects of large frames are to be seen
 # Containers and codecs in the order in which they are tried; every build of OpenCV has the last one.
-VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
-"""Suffixes of videos that can be written, and their codecs."""
+VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}  # suffixes of videos that can be written, and their codecs
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:

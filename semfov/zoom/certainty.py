@@ -27,8 +27,7 @@ FACTS = (
 )
 """Facts about an object, from which its probability is predicted (`semfov.zoom.objects`)."""
 
-SPREAD = 0.3
-"""The spread of a certainty (`Certainty`) for which none was fitted."""
+SPREAD = 0.3  # the spread of a certainty (`Certainty`) for which none was fitted
 
 _SURE, _SEVERAL, _PART = 0.5, 5, 0.6
 """Probability, number and share of the objects to which a detector reacts (`reacts`)."""

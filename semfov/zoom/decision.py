@@ -86,9 +86,7 @@ class SearchFacts:
         return float(odds.sigmoid())
 
 
-CLOSER = 100
-"""Largest number of closer looks in a large picture: as many as there are passes for."""
-
+CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
 _DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has none
 
 

@@ -22,9 +22,7 @@ from semfov.zoom.closer import USUAL_WINDOW
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 
-STEPS = 3
-"""Largest number of octaves between a look and the closer looks that are predicted from it."""
-
+STEPS = 3  # largest number of octaves between a look and the closer looks that are predicted from it
 _CROWD = 9  # side in cells of the square over which the networks read the mean of the strongest hints
 
 _FLOOR = 1e-4

@@ -27,9 +27,7 @@ _Frame = tuple[int, int, int, int, int, int, int, int]
 
 Resampled = tuple[Tensor, list[_Frame]]
 
-BORDER = 2.0
-"""A box this near to the border of its window, in canvas pixels, counts as cut by it."""
-
+BORDER = 2.0  # a box this near to the border of its window, in canvas pixels, counts as cut by it
 _WIDE_BORDER = 16.0  # the same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)
 
 

@@ -13,9 +13,7 @@ from semfov.detection.detections import Detections
 from semfov.zoom.lattice import Lattice
 
 _FINEST = 32  # largest number of cells along a side of a gist
-
-DETECTION_SCORE = 0.1
-"""Score from which on a detection counts as a found object."""
+DETECTION_SCORE = 0.1  # score from which on a detection counts as a found object
 
 
 class Hints(NamedTuple):

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from semfov.errors import check
 
-CELLS = 8
-"""Cells along a side of the closest window."""
+CELLS = 8  # cells along a side of the closest window
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from semfov.zoom.belief import Cells, ZoomBelief
 from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
 
-WindowChoice = tuple[Window, float]
-"""A window and the value of a look at it."""
+WindowChoice = tuple[Window, float]  # a window and the value of a look at it
 
 
 def best_find(

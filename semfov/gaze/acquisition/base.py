@@ -11,8 +11,7 @@ from semfov.belief.belief import Belief
 from semfov.errors import check
 
 Task = Literal["search", "exploration"]
-FUNCTIONS: dict[str, type["AcquisitionFunction"]] = {}
-"""All named acquisition functions."""
+FUNCTIONS: dict[str, type["AcquisitionFunction"]] = {}  # all named acquisition functions
 
 
 class AcquisitionFunction(nn.Module, ABC):
