@@ -52,7 +52,8 @@ class Picture(NamedTuple):
 
 def picture_files(source: Path, *, recursive: bool = False, frames: bool = False) -> list[Path]:
     """List a photograph, or those of a folder, or its `frames`, `recursive` of folders in it, in the order of names."""
-    _check_there(source)
+    if not source.exists() and not source.is_symlink():  # a link to nothing is one that cannot be read
+        raise DataError(f"picture: no such file or folder: {source}; check the path")
     if not source.is_dir():
         return [source]
     # Names that begin with a dot are notes of the system, such as the ._a.jpg of an Apple disk.
@@ -81,12 +82,6 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
         video = "; `semfov live` takes videos" if any(path.suffix.lower() in VIDEOS for path in others) else ""
         warnings.warn(f"{where}: {kept} left out, {'' if count == 1 else 'such as '}{such}{video}", stacklevel=3)
     return [path for path in paths if path not in others]
-
-
-def _check_there(source: Path, argument: str = "picture") -> None:
-    """Raise `DataError` where a file or folder does not exist; a link to nothing is one that cannot be read."""
-    if not source.exists() and not source.is_symlink():
-        raise DataError(f"{argument}: no such file or folder: {source}; check the path")
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
@@ -127,8 +122,7 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
     if isinstance(source, Path):
-        _check_there(source, "source")
-        with reading(source), source.open("rb") as file:
+        with reading(source, f"source: {source}"), source.open("rb") as file:
             video = file.read(len(_PLAYLIST)) != _PLAYLIST
             check_data(video, name, "a video", "a playlist, which names other files; give these")
     recorder = _recorder(cv2, source)
