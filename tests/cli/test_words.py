@@ -36,7 +36,7 @@ REFUSED = {
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
     "find --device meta": "device: expected one that PyTorch has here (cpu",
     "live": "source: expected a video, an address or --camera 0, got none",
-    "live nosuch.mp4": "nosuch.mp4; check the path",
+    "live nosuch.mp4": "source: nosuch.mp4: no such file; check the path",
     "live a.mp4 --camera 0": "camera: expected a video or a camera, not both, got 0",
     "live a.mp4 --out a.json": "out: expected a folder, or a file that ends in .mp4 or .avi, got a.json",
     "live --camera -1": "camera: expected a whole number from 0",
