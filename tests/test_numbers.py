@@ -153,18 +153,10 @@ KNOWN = {
         "114 of 255": "the published networks' grey",
         "(640)": "code",
     },
-    "docs/words.md": {
-        "finds +0.5 ± 0.4, −0.2 ± 0.5 and +0.2 ± 0.2 points": "a study that was removed; the page names the commits",
-        "is 0.356 ± 0.051 higher (331 held-out": "a study that was removed; the page names the commits",
-    },
     "docs/decisions/closer_looks.md": {
         f"shows {USUAL_WINDOW[0]} of the longer side": "code",
-        "photograph holds and 25 that": "tried on the fit set, without a command",
-        "958 searches of 116 photographs": "tried on the fit set, without a command",
         f"{sum(each.numel() for each in _VERIFICATION.parameters())} parameters": "code",
         "21 wrong places": "wrong places of the records of decide-nano, which were looked at one by one",
-        "between 86 and 88 % where 60 %": "tried on photographs of the fit, without a command",
-        "commit 11e960c": "a commit",
     },
     "docs/measurements/head.md": {"the 300 of": "photographs of the results"},
     "docs/measurements/human.md": {"(612 searches of 10 people": "the files of the data set"},
@@ -189,8 +181,6 @@ KNOWN = {
         "for 15 s": "code, tested with a stream that breaks off",
         f"{log(2) / _WINDOW_RATE:.0f} by default": "code",
         f"rate, {_FOVEA_RATE}": "code",
-        "40 of the fitting": "videos of the table",
-        "20 frames": "videos of the table",
         "of 16 bits": "a type",
     },
     "docs/guides/records.md": {
@@ -220,10 +210,6 @@ SHARES = {
         "one in ten at the fovea": (_OBJECTS[0], _DETECTIONS[0]),
     },
     "docs/detectors.md": {"One in five photographs is held out": "a rule", "one in three if there are fewer": "a rule"},
-    "docs/words.md": {
-        "finds +0.5 ± 0.4, −0.2 ± 0.5 and +0.2 ± 0.2 points": "a study that was removed; the page names the commits",
-        "is 0.356 ± 0.051 higher (331 held-out": "a study that was removed; the page names the commits",
-    },
     "docs/results.md": {"windows of a third of the photograph": "a setting"},
     "docs/decisions/closer_looks.md": {"a third of the photograph": "a setting"},
     "docs/sensors.md": {
@@ -233,7 +219,6 @@ SHARES = {
         "almost twice as many objects": ("0.312", "0.159"),
     },
     "docs/pan-tilt.md": {"a tenth of its field of view": "a rule"},
-    "docs/guides/live.md": {"three quarters of its width": "how the videos were made"},
     "docs/measurements/zoom.md": {
         "One of four boxes": ("0.250", 1),
         "less than half of themselves": "visibility in the annotations of the street",
