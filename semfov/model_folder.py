@@ -1,7 +1,5 @@
 """A folder of models: everything that was fitted to one detector, with a reference to the detector."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from functools import cached_property
@@ -39,7 +37,7 @@ KINDS: dict[str, type[FolderModel]] = {
 """Classes of the parts that are models."""
 
 
-def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
+def open_folder(name: str | PathLike[str]) -> "ModelFolder | None":
     """Open a folder of models."""
     path, text = Path(name), os.fspath(name)
     if path.is_dir():

@@ -1,7 +1,5 @@
 """Subcommand app: a page in the browser on which to search a picture, and to look yourself."""
 
-from __future__ import annotations
-
 import os
 import socket
 import tempfile
@@ -83,7 +81,7 @@ def _launched(page: Any, host: str, port: int | None) -> str:
     return str(address)
 
 
-def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> _OwnLooks:
+def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> "_OwnLooks":
     """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
     episode = FoveaEpisode(agent.fovea, class_index(target, agent.classes[1:], "target"), closer=0, cells=cells)
     with torch.inference_mode():
@@ -247,7 +245,7 @@ class _OwnLooks(NamedTuple):
         return "\n\n".join(lines)
 
 
-def _clicked(image: Tensor, looked: _OwnLooks) -> Image.Image:
+def _clicked(image: Tensor, looked: "_OwnLooks") -> Image.Image:
     """The picture with numbered looks, and a ring where the agent would look next."""
     picture = _reduced(image)
     draw, scale = ImageDraw.Draw(picture), picture.width / image.shape[-1]

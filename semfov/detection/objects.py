@@ -1,7 +1,5 @@
 """Objects of a picture, merged from the boxes of many looks at it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -63,7 +61,7 @@ class Objects:
         return "\n  ".join([f"{len(self)} object{'s' if len(self) != 1 else ''}", *lines, *more])
 
     @classmethod
-    def none(cls) -> Objects:
+    def none(cls) -> "Objects":
         """No objects.
 
         Returns:
@@ -72,7 +70,7 @@ class Objects:
         nothing = torch.zeros(0)
         return cls(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
 
-    def above(self, score: float) -> Objects:
+    def above(self, score: float) -> "Objects":
         """Objects with at least a given score.
 
         Args:
@@ -83,7 +81,7 @@ class Objects:
         """
         return self[self.scores >= score]
 
-    def of(self, labels: Sequence[int]) -> Objects:
+    def of(self, labels: Sequence[int]) -> "Objects":
         """Objects of some classes.
 
         Args:
@@ -94,7 +92,7 @@ class Objects:
         """
         return self[torch.isin(self.labels, torch.tensor(labels))] if len(labels) else self
 
-    def __getitem__(self, index: Tensor | slice | int) -> Objects:
+    def __getitem__(self, index: Tensor | slice | int) -> "Objects":
         """Some of the objects, or by a number one of them."""
         index = torch.tensor([index]) if isinstance(index, int) else index
         return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
@@ -116,7 +114,7 @@ def merge_boxes(
     score: float = FAINTEST,
     iou: float = 0.5,
     inside: float = 0.8,
-) -> Objects:
+) -> "Objects":
     """Merge boxes from several windows of a picture into one box for each object.
 
     The boxes may come from any detector, for instance from one that was applied to slices of the picture. They are
@@ -187,7 +185,7 @@ def merge_looks(
     iou: float = 0.5,
     inside: float = 0.8,
     around: float | None = None,
-) -> Objects:
+) -> "Objects":
     """Merge the boxes of several looks into one box for each object.
 
     Two boxes of one class are the same object when their intersection over union is at least `iou`. Boxes of two looks

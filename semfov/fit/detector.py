@@ -1,7 +1,5 @@
 """Fit all models that the agent needs to a detector of the user."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math
@@ -306,7 +304,7 @@ def _place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[st
     return {"relative": Path(relative).as_posix(), "absolute": str(absolute)}
 
 
-def _manifest_of(folder: _FolderFit) -> Manifest:
+def _manifest_of(folder: "_FolderFit") -> Manifest:
     """Build the manifest of the model folder."""
     config, run = folder.inputs.config, folder.inputs.run
     detector = run.eye.detector

@@ -1,7 +1,5 @@
 """What the reports of fitted models have in common: words, tables and plots."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -20,7 +18,7 @@ class Difference(NamedTuple):
     photographs: int
 
     @classmethod
-    def of(cls, fitted: FloatArray, raw: FloatArray) -> Difference:
+    def of(cls, fitted: FloatArray, raw: FloatArray) -> "Difference":
         """Compute the paired difference of two measures `(P,)`, with one value for each photograph."""
         paired = np.asarray(fitted, dtype=np.float64) - np.asarray(raw, dtype=np.float64)
         return cls(float(paired.mean()), float(standard_error(paired)), len(paired))

@@ -1,7 +1,5 @@
 """People who view pictures: their fixations, and the maps of the pictures, each looked at once."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -215,7 +213,7 @@ class Events(NamedTuple):
     person: Tensor
 
     @classmethod
-    def of(cls, paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Events:
+    def of(cls, paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> "Events":
         """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
         before = [torch.zeros(0, LONGEST - 1, 2)]
         for path in paths:
@@ -225,7 +223,7 @@ class Events(NamedTuple):
         person = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(path) - 1 for path in paths]).long())
         return cls(torch.cat(before), cell, person)
 
-    def some(self, index: Tensor) -> Events:
+    def some(self, index: Tensor) -> "Events":
         """Some of the events."""
         return Events(*(each[index] for each in self))
 

@@ -1,7 +1,5 @@
 """Fit evidence by magnification on mosaics of photographs, and on other kinds of large pictures."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -233,7 +231,7 @@ def crowded(scenes: Scenes, share: float) -> ChosenScenes:
     return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
 
 
-def _look(fit: MosaicFit, task: tuple[str, int]) -> bytes:
+def _look(fit: "MosaicFit", task: tuple[str, int]) -> bytes:
     """Look at all windows of a picture that are not in the store yet; returns what the store has of it."""
     kind, index = task
     pictures = fit.pictures[kind]

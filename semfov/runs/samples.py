@@ -1,7 +1,5 @@
 """Labelled detections: the detector's scores, the distance from the fixation, and the true class."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -28,7 +26,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def __getitem__(self, index: Tensor) -> Samples:
+    def __getitem__(self, index: Tensor) -> "Samples":
         """Select detections; all looks are kept."""
         chosen = {name: getattr(self, name)[index] for name in _DETECTIONS}
         return Samples(**chosen, scenes=self.scenes, fixations=self.fixations)
@@ -40,7 +38,7 @@ class Samples:
 
     @classmethod
     @torch.inference_mode()
-    def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
+    def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> "Samples":
         """Label the detections of the looks at one scene; fixations `(R, 2)`."""
         labels = [
             match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
@@ -57,7 +55,7 @@ class Samples:
         )
 
     @classmethod
-    def join(cls, sets: list[Samples]) -> Samples:
+    def join(cls, sets: "list[Samples]") -> "Samples":
         """Concatenate several sets of samples in order."""
         joined = {name: torch.cat([getattr(some, name) for some in sets]) for name in _NAMES}
         counts = torch.tensor([len(some.scenes) for some in sets])

@@ -1,7 +1,5 @@
 """The record of one person's fixations in one picture, and the place of the picture on the person's screen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from numbers import Real
@@ -197,7 +195,7 @@ class Fixations:
         """Number of fixations, the first included."""
         return len(self.points)
 
-    def resized(self, size: tuple[int, int]) -> Fixations:
+    def resized(self, size: tuple[int, int]) -> "Fixations":
         """Convert the fixations to pixels of the same frame at another size.
 
         Args:
@@ -210,7 +208,7 @@ class Fixations:
         box = None if self.box is None else _box(np.array(self.box).reshape(2, 2) * scale)
         return replace(self, points=(self.points + 0.5) * scale - 0.5, size=size, box=box)
 
-    def in_picture(self, size: tuple[int, int]) -> Fixations:
+    def in_picture(self, size: tuple[int, int]) -> "Fixations":
         """Convert the fixations to pixels of a picture that was shown letterboxed on the frame.
 
         Args:
@@ -223,7 +221,7 @@ class Fixations:
         box = None if self.box is None else placed.box_to_picture(self.box)
         return replace(self, points=placed.to_picture(self.points), size=size, box=box)
 
-    def first(self, count: int) -> Fixations:
+    def first(self, count: int) -> "Fixations":
         """Take the first fixations.
 
         Args:
