@@ -9,8 +9,6 @@ from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.errors import values_known
-
 # B_2k / 2k for k = 1, 2, … The error of these terms is below 1e-15 for arguments from `_SHIFT`.
 _STIRLING = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160)
 _SHIFT = 8
@@ -55,12 +53,9 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
 
 def _evaluate(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
     """Value of a polynomial, coefficients constant first."""
-    *others, most, value = (x.new_full((), coefficient) for coefficient in coefficients)
-    value = torch.addcmul(most, value, x)  # a constant that is a tensor saves a pass over x
-    # In place, which keeps less in the cache, where no graph is recorded.
-    known = values_known(x) and not (x.requires_grad and torch.is_grad_enabled())
+    *others, value = (x.new_full((), coefficient) for coefficient in coefficients)
     for coefficient in reversed(others):
-        value = torch.addcmul(coefficient, value, x, out=value if known else None)
+        value = torch.addcmul(coefficient, value, x)  # a constant that is a tensor saves a pass over x
     return value
 
 
