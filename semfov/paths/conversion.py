@@ -62,12 +62,17 @@ class Conversion(Outcome):
             return not_there(self, name, _WORDS)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values, one row for each, whose first columns all kinds of records have.
+        """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
 
-        `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of the picture that it shows.
-        `detections` counts those from score 0.1 on; `seen` and `score` are of the most confident one. `closer` is the
-        probability that the target is there, by a closer look that this is, or that follows it. `brought` is the number
-        of objects that it shows most sharply.
+        `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
+        the picture that it shows, in picture pixels. `detections` counts those from score 0.1 on, `seen` is the class
+        of the most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on the
+        clock of the episode. `value` is that for which the look was chosen. `closer` is the probability that the target
+        is there, by a closer look that this is, or that follows it. `brought` is the number of objects that it shows
+        most sharply. The columns that the kind adds come last.
+
+        Returns:
+            One dictionary for each look.
         """
         closer = {look.of_look: look.place for look in self.closer}
         brought = Counter(self.objects.passes.tolist())
@@ -108,7 +113,14 @@ class Conversion(Outcome):
         return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as rows of plain values, most confident first; `look` is the one that shows it most sharply."""
+        """The objects as a table of plain values, one row for each object, most confident first.
+
+        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
+        number of the look that shows it most sharply.
+
+        Returns:
+            One dictionary for each object.
+        """
         objects = self.objects
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
         return [
@@ -128,14 +140,40 @@ class Conversion(Outcome):
         ]
 
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
-        """The table of `looks` (`rows`) or `objects` (`object_rows`) as a pandas data frame."""
+        """A table of the record as a pandas data frame.
+
+        Args:
+            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
+
+        Returns:
+            One row for each look or object.
+
+        Raises:
+            InputError: there is no such table, or pandas is not installed.
+        """
         rows, columns = self._table(table)
         with needing("pandas", "to_frame"):
             import pandas
         return pandas.DataFrame(rows, columns=columns)
 
     def to_csv(self, path: str | PathLike[str] | None = None, table: _Table = "looks") -> str:
-        """The table of `looks` or `objects` as CSV with a header, which is written to a file if one is named."""
+        """A table of the record as CSV, with a header.
+
+        Args:
+            path: the file to write; None writes none.
+            table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
+
+        Returns:
+            The text of the file.
+
+        Raises:
+            InputError: there is no such table.
+            DataError: the file cannot be written.
+
+        Example::
+
+            agent.find_all("harbour.tif", "person").to_csv("people.csv", "objects")
+        """
         rows, columns = self._table(table)
         return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
 
@@ -152,7 +190,20 @@ class Conversion(Outcome):
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
 
-        Classes are numbered from 0, without background. `data` has `class_name`, `look` and `confirmed` of each box.
+        Supervision numbers classes from 0, without background. `data` has the names of the classes as `class_name`,
+        which its annotators show, the number of the look that each box comes from as `look`, and which of the objects
+        were confirmed as `confirmed`.
+
+        Returns:
+            The objects for Supervision.
+
+        Raises:
+            InputError: Supervision is not installed.
+
+        Example::
+
+            found = agent.find_all("harbour.tif", "person").to_supervision()
+            picture = supervision.LabelAnnotator().annotate(picture, found)
         """
         objects = self.objects
         data = {"look": objects.passes.numpy(), "confirmed": self.confirmed.numpy()}
@@ -168,8 +219,16 @@ class Conversion(Outcome):
     ) -> list[dict[str, Any]]:
         """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
 
-        `categories` are those of the annotation file, in which classes are found by name, or the category id of each
-        class. None takes COCO's own ids, if all classes of the objects are among COCO's 80.
+        Args:
+            image_id: id of the image in the annotation file.
+            categories: the `categories` of the annotation file, in which classes are found by name, or the category id
+                of each class. None takes COCO's own ids, if all classes of the objects are among COCO's 80.
+
+        Returns:
+            `image_id`, `category_id`, `bbox` as `[x, y, width, height]`, and `score` of each object.
+
+        Raises:
+            InputError: the class of an object has no category.
         """
         objects, names = self.objects, self.classes[1:]
         if categories is None:
@@ -190,7 +249,17 @@ class Conversion(Outcome):
     def to_yolo(self, path: str | PathLike[str] | None = None) -> str:
         """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
 
-        Classes are numbered from 0, without background. The others are shares of the sides of the picture, inside it.
+        Classes are numbered from 0, without background. `x` and `y` are the middle of the box, and all four are shares
+        of the width and height of the picture. Boxes end at its borders.
+
+        Args:
+            path: the file to write; None writes none.
+
+        Returns:
+            The text of the file; empty without objects.
+
+        Raises:
+            DataError: the file cannot be written.
         """
         width, height = self.size
         lines = []
@@ -200,9 +269,18 @@ class Conversion(Outcome):
         return _written("".join(lines), path)
 
     def crops(self, picture: LargePicture | ImageLike | None = None) -> list[Tensor]:
-        """Cut what the box of each object shows out of the picture, bytes `(3, h, w)` in their order.
+        """Cut what the box of each object shows out of the picture.
 
-        None takes the file that the record comes from, with the values and bands that were shown.
+        Args:
+            picture: the picture in full size; None takes the file that the record comes from, with the values and
+                bands that were shown.
+
+        Returns:
+            `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.
+
+        Raises:
+            InputError: no picture is given, or the record's is not known, or it has another size.
+            DataError: the file cannot be read.
         """
         shown = self.shown if picture is None and self.shown is not None else {}
         picture = self.source if picture is None else picture
@@ -226,8 +304,24 @@ class Conversion(Outcome):
     ) -> dict[str, Any]:
         """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
 
-        For a picture from a GeoTIFF, the `source` or the record's own file, coordinates are longitude and latitude (WGS
-        84). For others they are pixels with y down, as the member `coordinates` of the collection says.
+        For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84). Other pictures have no place on
+        earth: their coordinates are pixels with y down, as the member `coordinates` of the collection says.
+
+        Args:
+            path: the file to write; None writes none.
+            source: the GeoTIFF; None takes the file that the picture of the record comes from, if it is known.
+
+        Returns:
+            The `FeatureCollection`, as JSON values.
+
+        Raises:
+            InputError: the picture has a georeference, and rasterio is not installed.
+            DataError: a file cannot be read or written.
+
+        Example::
+
+            record = agent.find_all("harbour.tif", "boat")
+            record.to_geojson("boats.geojson")
         """
         file = self.source if source is None else fspath(source)
         place = None if file is None else georeference(file)
