@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_image
@@ -101,19 +100,6 @@ def _show(entry: dict[str, Any], key: str) -> str:
 
 
 _log = logging.getLogger(__name__)
-
-
-def _read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
-    """Read an image file in the orientation in which it was annotated, of `(width, height)`; → `(3, height, width)`."""
-    image = read_image(path)
-    if image.shape[-2:] == size[::-1]:
-        return image
-    height, width = image.shape[-2:]
-    image = read_image(path, oriented=False)
-    got = f"{width} × {height}; use the image that the annotations were made for"
-    fits = image.shape[-2:] == size[::-1]
-    check_data(fits, f"image {path}", f"{size[0]} × {size[1]} pixels as annotated", got)
-    return image
 
 
 class CocoScenes(Scenes):
@@ -221,7 +207,14 @@ class CocoScenes(Scenes):
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
         annotation = self.annotation(index)
-        image = _read_sized(self._files[index], annotation.size)
+        path, (width, height) = self._files[index], annotation.size
+        image = read_image(path)
+        high, wide = image.shape[-2:]
+        if (wide, high) != annotation.size:
+            image = read_image(path, oriented=False)
+            got = f"{wide} × {high}; use the image that the annotations were made for"
+            fits = image.shape[-2:] == (height, width)
+            check_data(fits, f"image {path}", f"{width} × {height} pixels as annotated", got)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
