@@ -83,6 +83,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
         return False
 
+    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
+        """What the look at a candidate shows that it is examined by."""
+        return close_up(candidate.box)
+
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)`."""
         boxes, covered = torch.stack([candidate.box, box]), torch.zeros(0).bool()
@@ -102,7 +106,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
             self.presence,
             candidate.probability,
             candidate.evidence,
-            self.detections if self.seen(candidate) else close_up(candidate.box),
+            self.look_at(candidate, close_up),
             candidate.box,
             self.target,
         )

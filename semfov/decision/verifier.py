@@ -109,10 +109,11 @@ class Verifier(Generic[LookType]):
         return look
 
     def look_closely(self, room: float = math.inf) -> list[CandidatePlace]:
-        """Make all closer looks that are due."""
+        """Make all closer looks that are due; returns the places that took a pass."""
         examined: list[CandidatePlace] = []
         while self.candidate is not None and len(examined) < room:
-            examined.append(self.candidate)
+            if not self.places.seen(self.candidate):
+                examined.append(self.candidate)
             self.look()
         return examined
 

@@ -161,8 +161,8 @@ def verify(
             # Where passes are limited, a search ends with them, after the last closer look.
             last = index + 1 == len(search.steps) if room == math.inf else room <= 1
             verifier.see(search.look(index, count), last=last)
-            for each in verifier.look_closely(room):
-                count += not places.seen(each)
+            for _ in verifier.look_closely(room):
+                count += 1
                 ends.append(count)
             if verifier.outcome() or count >= search.passes:
                 break

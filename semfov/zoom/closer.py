@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
+from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.observation.matching import box_iou
@@ -97,10 +98,10 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
             return None
         return CandidatePlace(boxes[number], score, probability)
 
-    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        super().dismiss(candidate, box)
-        # It is the last look of the path.
+    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
+        """Look closely at a candidate, in the next look of the path."""
         self._number, self._next = self._next, self._next + 1
+        return super().look_at(candidate, close_up)
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is at the place of a closer look, by the detections that overlap it."""
@@ -126,7 +127,8 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 class PhotographPlaces(CandidateBoxes):
     r"""Places of a photograph, hints among them; a look at one is worth :math:`v = p \, (1 - \max_i p_i)`.
 
-    A place whose window is nearly the whole photograph is examined in the look at the whole, without a pass.
+    A place whose window was looked at is examined in that look, without a pass; so is one whose window is nearly the
+    whole photograph.
     """
 
     least = 0.002
@@ -141,6 +143,12 @@ class PhotographPlaces(CandidateBoxes):
     ) -> None:
         super().__init__(target, 0.0, forgetting)
         self._lattice, self._window = lattice, window
+        self._shown = dict[Window, tuple[int, Detections]]()  # by window, the number of the look and what it shows
+
+    def see(self, look: WindowLook) -> None:
+        """Take in a look at the whole photograph."""
+        super().see(look)
+        self._shown[Window.overview(self._lattice)] = look.number - 1, look.detections
 
     @property
     def left(self) -> float:
@@ -154,14 +162,29 @@ class PhotographPlaces(CandidateBoxes):
         return None if place is None or self._worth(place) < least else place
 
     def seen(self, candidate: CandidatePlace) -> bool:
-        """Whether the window that shows a place is nearly the whole photograph."""
-        x1, y1, x2, y2 = closer_window(self._lattice, candidate.box, self._window).region(self._lattice)
-        return (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
+        """Whether the window that shows a place was looked at."""
+        return self._showing(candidate) in self._shown
 
-    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        super().dismiss(candidate, box)
-        if self.seen(candidate):
-            self._next, self._number = self._next - 1, self._look.number - 1
+    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
+        """Look closely at a place, unless its window was looked at."""
+        window = self._showing(candidate)
+        if window not in self._shown:
+            self._shown[window] = self._next, super().look_at(candidate, close_up)
+        self._number, detections = self._shown[window]
+        return detections
+
+    def wait(self, frames: float = 1) -> None:
+        """Let frames pass; closer looks of earlier ones show other pixels where the scene changes."""
+        super().wait(frames)
+        if self.forgetting.rate:
+            self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
+
+    def _showing(self, candidate: CandidatePlace) -> Window:
+        """The window of a closer look at a place, or the whole photograph where it shows no more."""
+        window = closer_window(self._lattice, candidate.box, self._window)
+        x1, y1, x2, y2 = window.region(self._lattice)
+        whole = (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
+        return Window.overview(self._lattice) if whole else window
 
     def _worth(self, place: CandidatePlace) -> float:
         return place.probability * (1 - max((known for _, known in self._known), default=0.0))

@@ -450,8 +450,8 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
-    made = [agent.search(photograph, "red", confirm=least, give_up=0.0).passes for least in (0.01, 0.9)]
-    assert made[0] == made[1] > max(path.passes, 3)
+    made = [len(agent.search(photograph, "red", confirm=least, give_up=0.0).closer) for least in (0.01, 0.9)]
+    assert made[0] == made[1] > max(len(path.closer), 2)
 
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
