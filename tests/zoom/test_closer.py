@@ -11,6 +11,7 @@ from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
+from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
@@ -401,6 +402,33 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     assert (len(looked), places.record(box, 0.4, 0.5).number) == (1, 1)
 
 
+@pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (0.1, 2)])
+def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
+    boxes = torch.tensor([[[4.0, 4, 24, 24], [30.0, 4, 50, 24], [120.0, 90, 140, 110]]])
+    scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0.1], [0, 0.2, 0]]])
+    closely, looked = Detections(boxes + 1, scores / 2, torch.ones(1, 3).bool()), []
+
+    def close_up(box):
+        looked.append(box.tolist())
+        return closely
+
+    judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), close_up, AT, most=9)
+    judge.see(WindowLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
+    judge.look()
+    # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
+    assert judge.places.seen(judge.candidate)
+    judge.wait()
+    assert judge.places.seen(judge.candidate) == (rate == 0)
+    due = judge.candidate
+    assert len(judge.look_closely(1)) == 1
+    assert looked[0] == boxes[0, 0].tolist()
+    assert looked[1] == boxes[0, 3 - passes].tolist()
+    second = judge.looks[1]
+    assert (second.number, second.box.tolist()) == (passes, closely.boxes[0, 1].tolist())
+    expected, _ = closer_features(0.9, due.probability, due.evidence, closely, due.box, 1)
+    assert second.place == pytest.approx(Alike()(expected).sigmoid()[0].item())
+
+
 def test_the_window_of_a_closer_look_shows_other_places_too():
     x1, y1, x2, y2 = closer_window(OVER, torch.tensor([150.0, 100, 160, 110])).within
     assert (x2 - x1, y2 - y1) == pytest.approx((0.6 * 192, 0.6 * 192))
@@ -450,8 +478,11 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
-    made = [len(agent.search(photograph, "red", confirm=least, give_up=0.0).closer) for least in (0.01, 0.9)]
-    assert made[0] == made[1] > max(len(path.closer), 2)
+    made = [agent.search(photograph, "red", confirm=least, give_up=0.0) for least in (0.01, 0.9)]
+    assert len(made[0].closer) == len(made[1].closer) > max(len(path.closer), 2)
+    for each in made:
+        assert len({glance.window for glance in each.glances}) == each.passes < 1 + len(each.closer)
+        assert {look.number for look in each.closer} == set(range(1, each.passes))
 
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
