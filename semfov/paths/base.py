@@ -327,8 +327,7 @@ class Moment(Record):
     @property
     def examined(self) -> CloseUp | None:
         """The closer look, if this frame was spent on one; otherwise None."""
-        last = self.closer[-1] if self.closer else None
-        return last if last is not None and last.number == len(self) - 1 else None
+        return next((each for each in self.closer if each.number == len(self) - 1), None)
 
     @property
     @abstractmethod

@@ -74,7 +74,7 @@ class Conversion(Outcome):
         Returns:
             One dictionary for each look.
         """
-        closer = {look.of_look: look.place for look in self.closer}
+        closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda each: each.place)}
         brought = Counter(self.objects.passes.tolist())
         rows: list[dict[str, Any]] = []
         for look in self:

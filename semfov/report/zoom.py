@@ -62,7 +62,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
     detections = _detections(path, look, view)
     brought = Counter(path.classes[label] for label in path.objects.labels[path.objects.passes == number].tolist())
-    closer = next((each for each in path.closer if each.number == number), None)
+    closer = max((each for each in path.closer if each.number == number), key=lambda each: each.place, default=None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     turned, warm, ends = None, False, [each.seconds for each in path]
     if number == 0 and path.how != "head" and len(ends) >= 3 and None not in ends:

@@ -483,18 +483,23 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     for each in made:
         assert len({glance.window for glance in each.glances}) == each.passes < 1 + len(each.closer)
         assert {look.number for look in each.closer} == set(range(1, each.passes))
+        rows = [row["closer"] for row in each.rows()]
+        assert rows == [None, *(max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes))]
 
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
-    path = agent.search(photograph, "red")
-    live = agent.episode(1, rate=0.0)
+    path = agent.search(photograph, "red", give_up=0.0)
+    assert path.passes < 1 + len(path.closer)  # some places are in one window
+    live = agent.episode(1, rate=0.0, give_up=0.0)
     for _ in range(path.passes):
         live.look(photograph)
     moment = live.moment()
     assert moment.decision.outcome == path.decision.outcome
     assert moment.decision.probability == pytest.approx(path.decision.probability, abs=1e-9)
     assert torch.equal(moment.decision.box, path.decision.box)
+    assert moment.examined.number == path.passes - 1
+    assert [look.number for look in moment.closer] == [look.number for look in path.closer]
     assert [look.box.tolist() for look in moment.closer] == [look.box.tolist() for look in path.closer]
     path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", closer=0)
     assert path.passes == 1
