@@ -252,7 +252,6 @@ class FoveaEpisode(Episode[Scanpath]):
         return self._fixate(watch.seconds)
 
     def _fixate(self, opened: dict[str, float]) -> RecordedLook | None:
-        """Move the gaze and look."""
         step = next(self._steps, None)
         if step is None:
             return None
@@ -270,7 +269,6 @@ class FoveaEpisode(Episode[Scanpath]):
         return self._looked(int(step.cell), step.detections, {**opened, **step.seconds}, None)
 
     def _look_closely(self, cell: int) -> RecordedLook:
-        """Look closely at a place in a cell."""
         assert self._verifier is not None
         watch = Stopwatch()
         closer = self._verifier.look()
@@ -330,7 +328,6 @@ class FoveaEpisode(Episode[Scanpath]):
         return conclude(self._outcome, step.belief, seen, self._looks.grid, meant, cell)
 
     def record(self) -> Scanpath:
-        """The scanpath so far."""
         decision = self.decision
         if self.target is None or self._last is None:
             return self._trace.scanpath(ending=self.ending, **self._kept)
@@ -348,7 +345,6 @@ class FoveaEpisode(Episode[Scanpath]):
         )
 
     def moment(self) -> FoveaMoment:
-        """What is known at the present frame."""
         assert self._last is not None
         assert self._looks is not None
         (step, _), grid, belief = self._last, self._looks.grid, self._last[0].belief

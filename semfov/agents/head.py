@@ -289,7 +289,6 @@ class _HeadEpisode(Episode[HeadPath]):
         self.ending = self.ending or limit or usual
 
     def record(self) -> HeadPath:
-        """The record of the looks so far."""
         steps, decision, picture = self._made, self.decision, self.views.world.image()
         return HeadPath(
             views=self.views,

@@ -424,7 +424,6 @@ class WindowEpisode(Episode[ZoomPath]):
         return [look.glance for look in self._looks]
 
     def record(self) -> ZoomPath:
-        """The record of the looks so far."""
         picture = self._glances.view.picture if isinstance(self._glances, LiveGlances) else None
         path = None if picture is None else picture.path
         return ZoomPath(
@@ -436,7 +435,6 @@ class WindowEpisode(Episode[ZoomPath]):
         )
 
     def moment(self) -> WindowMoment:
-        """What is known at the present frame."""
         assert self._last is not None
         assert isinstance(self._glances, LiveGlances)
         candidate = None if self._decisions is None else self._decisions.candidate

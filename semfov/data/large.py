@@ -168,7 +168,6 @@ class _TiffPicture(LargePicture):
         return page.decode(data, number, jpegtables=page.jpegtables)[0][0]
 
     def _bytes(self, values: NDArray[Any]) -> NDArray[np.uint8]:
-        """Grey or RGB bytes, in which 0 is black."""
         count = len(self._channels) - bool(self._alpha)
         tile = bytes_between(values[..., :count], self._tone)
         if self.page.photometric == _WHITE_IS_ZERO:

@@ -151,7 +151,6 @@ class CandidateCells(CandidatePlaces[Step]):
     _step: Step
 
     def see(self, look: Step) -> None:
-        """Take in a step of the search."""
         self._step, self._fixation, self.detections = look, look.shift, look.detections
         self.target = class_meant(look.belief, self._target)
         self.presence = float(look.belief.presence(self._target))

@@ -70,7 +70,6 @@ class Verifier(Generic[LookType]):
 
     @property
     def looks(self) -> list[CloseUp]:
-        """The closer looks, in order."""
         return [verdict.look for verdict in self.verdicts]
 
     def wait(self, frames: float = 1) -> None:

@@ -49,7 +49,6 @@ class Convolution(nn.Conv2d):
         self.activation, self.normalised = activation, normalised
 
     def forward(self, input: Tensor) -> Tensor:
-        """Convolve and activate."""
         return _ACTIVATIONS[self.activation](super().forward(input))
 
 
@@ -147,7 +146,6 @@ class _Builder:
         self._here = _Shape(channels, Fraction(1))
 
     def add(self, section: Section) -> nn.Module:
-        """Make the layer of the next section."""
         count, kind, here = len(self.shapes), section.kind, self._here
         check_data(count < _MOST_LAYERS, section.where, f"at most {_MOST_LAYERS} layers", "more; check the cfg")
         for key, value in _NEUTRAL.get(kind, {}).items():
@@ -286,7 +284,6 @@ class Darknet(nn.Module):
         self._stem = next((index for index, shape in enumerate(builder.shapes) if shape.step >= 8), 0)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Compute the raw maps of the heads."""
         self.check_image(image)
         image = image.contiguous(memory_format=torch.channels_last)
         stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
@@ -319,7 +316,6 @@ class Darknet(nn.Module):
         return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:
-        """sha256 of the sections."""
         cfg = repr([(section.kind, sorted(section.options.items())) for section in self.sections])
         return hashlib.sha256(cfg.encode()).hexdigest()
 

@@ -77,7 +77,6 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
 
 def read_cfg(path: str | PathLike[str]) -> list[Section]:
-    """Read the sections of a cfg file."""
     return _parse_cfg(read_text(path, most=_MOST_BYTES), str(path))
 
 

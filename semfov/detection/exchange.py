@@ -46,7 +46,6 @@ def coco_results(
 def category_ids(
     categories: Sequence[int] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
 ) -> list[int]:
-    """Find the category id of each class."""
     named = [category for category in categories if isinstance(category, Mapping)]
     if not named:
         check(all(map(_is_whole, categories)), "categories", "whole numbers, or categories of a file", categories[:3])

@@ -66,7 +66,6 @@ class _NetworkGraph(Graph):
     """The graph of a Darknet network, in float32."""
 
     def activation(self, kind: str, source: str) -> str:
-        """Add an activation of Darknet."""
         if kind == "linear":
             return source
         if kind == "leaky":
@@ -79,7 +78,6 @@ class _NetworkGraph(Graph):
         return self.add("Mul", source, gate) if kind == "swish" else gate
 
     def layer(self, layer: Any, *sources: str) -> str:
-        """Add a layer of a Darknet network."""
         if isinstance(layer, Convolution):
             vertical, horizontal = (int(side) for side in layer.padding)
             convolved = self.add(

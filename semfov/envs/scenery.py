@@ -128,7 +128,6 @@ class _SceneLooking(PolicyLooking):
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
-        """The given scenes, or those of the settings."""
         given, seed = self._chosen, self.config.data.scene_seed
         scenes = super().open_scenes() if given is None or isinstance(given, str | Path) else given
         return Mosaics(scenes, *self._tiles, count=self._mosaics, seed=seed) if self._mosaics else scenes
@@ -270,7 +269,6 @@ class ZoomScenery(_Surroundings):
         return bool(found_in(looks, objects, target).any())
 
     def share(self, looks: Sequence[Glance], scene: int) -> float:
-        """Fraction of the objects that looks have found."""
         if not self.annotated:
             return float(len(merge(looks, None, score=LEAST)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
@@ -284,7 +282,6 @@ class _PictureLooking(WindowLooking):
         super().__init__(config)
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        """The given pictures, or all pictures of the folder."""
         if self._chosen is not None and not isinstance(self._chosen, str | Path):
             return self._chosen
         if self._chosen is None or self.config.data.annotations is not None:

@@ -153,7 +153,6 @@ def _thin_classes(counts: dict[str, int], thin: int) -> list[str]:
 
 
 def _detector_report(inputs: PartInputs, seconds: float) -> str:
-    """Write the report as Markdown."""
     config, run, results, held_out = inputs.config, inputs.run, inputs.results, inputs.held_out
     counts = _class_counts(run, {*range(len(run.scenes))} - {*held_out})
     rows = [["part", "used", "result on held-out photographs"]]
@@ -305,7 +304,6 @@ def _place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[st
 
 
 def _manifest_of(folder: "_FolderFit") -> Manifest:
-    """Build the manifest of the model folder."""
     config, run = folder.inputs.config, folder.inputs.run
     detector = run.eye.detector
     options = plain(detector_options(config.detector))

@@ -106,7 +106,6 @@ def _make_examples(run: Looking, config: FitSearchConfig, scenes: Sequence[int] 
 
 
 def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
-    """Fit the model and its thresholds."""
     examples = _make_examples(run, config)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(*config.cells, config.cells)

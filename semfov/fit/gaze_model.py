@@ -101,7 +101,6 @@ def summaries(scored: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
 
 
 def gaze_report(scored: Scores) -> str:
-    """The means as Markdown."""
     if not scored:
         return "fitted to all pictures; no folds were held out\n"
     lines = []

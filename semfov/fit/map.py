@@ -106,7 +106,6 @@ def _make_map_examples(run: Looking, config: FitMapConfig) -> _MapExamples:
 
 
 def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
-    """Fit the model."""
     examples = _make_map_examples(run, config)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(*config.cells, config.cells)
@@ -227,7 +226,6 @@ def _judge_map(config: FitMapConfig, model: MapEvidence, examples: _MapExamples,
 
 
 def _map_report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
-    """Report the evaluation as Markdown."""
     shares = {
         "cells right, %": "all",
         "with objects, %": "objects",

@@ -224,7 +224,6 @@ class Events(NamedTuple):
         return cls(torch.cat(before), cell, person)
 
     def some(self, index: Tensor) -> "Events":
-        """Some of the events."""
         return Events(*(each[index] for each in self))
 
 

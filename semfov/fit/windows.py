@@ -312,7 +312,6 @@ class MosaicFit:
         return model.eval().requires_grad_(False)
 
     def survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> None:
-        """Fit a new survey."""
         config = self.config
         torch.manual_seed(config.seed)
         random.seed(config.seed)

@@ -68,7 +68,6 @@ class Exploration(NamedTuple):
 
     @property
     def looks(self) -> int:
-        """Number of looks."""
         return len(self.promised)
 
     def sums(self, certainty: Certainty, number: int) -> tuple[float, float]:

@@ -281,7 +281,6 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
 
 @torch.no_grad()
 def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
-    """Evaluate the model on held-out mosaics."""
     windows = pair_windows(examples)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
     figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}

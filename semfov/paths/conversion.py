@@ -182,7 +182,6 @@ class Conversion(Outcome):
         return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
 
     def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:
-        """Rows and columns of a table."""
         check(table in get_args(_Table), "table", "looks or objects", table)
         rows = self.rows() if table == "looks" else self.object_rows()
         return rows, list(self._columns if table == "objects" else dict.fromkeys(name for row in rows for name in row))

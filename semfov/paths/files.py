@@ -92,7 +92,6 @@ class Format:
         tensors: Mapping[str, Tensor],
         record: Mapping[str, Any],
     ) -> None:
-        """Write a record to a file atomically."""
         call = _OTHERS.get(Path(path).suffix.lower())
         name = repr(fspath(path))
         check(call is None, "path", "a file of a record, such as 'record.safetensors'", f"{name}; use {call}({name})")

@@ -75,7 +75,6 @@ class Outcome(ABC):
 
     @cached_property
     def looks(self) -> tuple[RecordedLook, ...]:
-        """The looks in their order."""
         return tuple(self._looks())
 
     def __iter__(self) -> Iterator[RecordedLook]:

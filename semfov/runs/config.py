@@ -107,7 +107,6 @@ class SensorConfig(Settings):
 
     @property
     def kind(self) -> type[Sensor]:
-        """Class of the sensor."""
         return SENSORS[lookup(self.name, SENSORS, "sensor")].make
 
     def whole(self) -> dict[str, Any]:
@@ -118,7 +117,6 @@ class SensorConfig(Settings):
         return named.changed({**changes, **(self.settings or {})})
 
     def make(self) -> Sensor:
-        """Build the sensor."""
         return self.kind.from_settings(self.whole())
 
     @property
@@ -249,7 +247,6 @@ class WorkConfig(Settings):
 
     @property
     def where(self) -> Where:
-        """Where the work is done."""
         return self.workers if self.scheduler is None else self.scheduler
 
 

@@ -44,11 +44,9 @@ class Looking(SceneRun):
         return make_scenes(self.config.data, self.eye.detector.classes)
 
     def depends_on(self) -> dict[str, Any]:
-        """List the eye and the cells."""
         return {"eye": self.eye.settings(), "cells": [*self.cells]}
 
     def grid(self, index: int) -> Grid:
-        """The grid over a scene."""
         return Grid(*self.cells, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:

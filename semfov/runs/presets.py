@@ -30,7 +30,6 @@ _OF_THE_MAP = ("tempering", "footprint", "memory", "misses")  # settings of the 
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
-    """The presets for a task."""
     return _presets(task, tuple(policy_names(task)))
 
 

@@ -99,7 +99,6 @@ class DrawnSearch(NamedTuple):
 
     @property
     def present(self) -> bool:
-        """Whether the photograph holds the class."""
         return bool(self.goal.any())
 
 

@@ -38,7 +38,6 @@ class _FileName:
         return "that is valid as a file name (letters, digits, space and _ . + -; at most 100 characters)"
 
     def holds(self, value: object, *, whole: bool) -> bool:
-        """Whether a value is a valid file name."""
         return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
 
 

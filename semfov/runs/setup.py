@@ -62,7 +62,6 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
-    """Load the detector that the settings name."""
     # A session of onnxruntime keeps the number of threads that it is opened with.
     with one_thread():
         return load_detector(detector.name, **detector_options(detector))

@@ -47,7 +47,6 @@ class SceneStore:
         return read_tensors(self.path(digest), self.key, self.schema)
 
     def write(self, digest: str, tensors: Mapping[str, Tensor]) -> None:
-        """Write the tensors of a scene."""
         write_tensors(self.path(digest), self.key, tensors)
 
 
@@ -72,7 +71,6 @@ class DetectionStore(SceneStore):
         super().__init__(folder, what, code, Schema(fields | {**self.more}))
 
     def load(self, digest: str) -> dict[Any, Any]:
-        """Read the looks at a scene."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return {}
@@ -80,7 +78,6 @@ class DetectionStore(SceneStore):
         return dict(zip(actions, self.unpack(tensors, actions), strict=True))
 
     def save(self, digest: str, looks: Mapping[Any, Any]) -> None:
-        """Store the looks at a scene."""
         rows = {action: tuple(map(float, self.encode(action))) for action in looks}
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
@@ -138,7 +135,6 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
 
     @property
     def looks(self) -> dict[_Action, _StoredLook]:
-        """All looks so far, by action."""
         if self._looks is None:
             self._looks = {} if self._store is None else self._store.load(self._digest())
             self._stored = len(self._looks)

@@ -82,7 +82,6 @@ class WindowLooking:
         return make_scenes(self.config.data, classes)
 
     def glances(self, index: int) -> StoredGlances:
-        """The looks at a scene."""
         return StoredGlances(self.eye, self.scenes, index, self.store if self.config.store else None)
 
 

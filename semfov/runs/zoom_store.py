@@ -42,7 +42,6 @@ class GlanceStore(DetectionStore):
         return (*action.fixation, *(action.within or (0.0, 0.0, 0.0, 0.0)), action.level, *action.cells)
 
     def decode(self, row: Sequence[float]) -> Window:
-        """A window."""
         within: Any = tuple(row[3:7]) if row[5] > 0 else None
         cells: Any = tuple(map(int, row[8:12]))
         return Window((row[0], row[1], row[2]), int(row[7]), cells, within)

@@ -186,7 +186,6 @@ class WindowDecisions:
         self.outcome = verifier.outcome()
 
     def decision(self, *, over: bool | None = None) -> Decision:
-        """The decision as it stands."""
         assert self._facts is not None
         if self.verifier is not None and self.verifier.looks:
             return self.verifier.decision(over=over)

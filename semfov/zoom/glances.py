@@ -145,7 +145,6 @@ def _aims(windows: Sequence[Window]) -> tuple[Tensor, list[tuple[float, float, f
 
 
 def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
-    """The result of one of the looks of an eye."""
     detections = looks.detections
     if len(detections.mask) > 1:  # a batch of one, without padding
         count, one = int(detections.mask[number].sum()), slice(number, number + 1)
