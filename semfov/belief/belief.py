@@ -211,10 +211,7 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Apply a function to each row `(B, ...)` separately: rounding depends on the size of the tensor.
-
-    While a graph is traced all rows are computed at once, and on an accelerator as many as fit.
-    """
+    """Apply a function to each row `(B, ...)` alone, as rounding depends on the batch; an accelerator takes many."""
     some = 1 if rows[0].device.type == "cpu" else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
     if not values_known(*rows) or len(rows[0]) <= some:
         return function(*rows)

@@ -77,10 +77,7 @@ class _SceneLooks(Looks):
 
 
 class CellGazes(Gazes):
-    """Episodes with a fovea that moves from cell to cell, each in a scene of its own; cell `(B,)`.
-
-    A search is over on a cell that an object of the target overlaps, an exploration when every cell was fixated.
-    """
+    """Episodes with a fovea that moves from cell to cell, each in a scene of its own, until a find or all cells."""
 
     coordinates = 2
     scenery: Scenery

@@ -41,10 +41,7 @@ class _HeadLooks(Looks):
 
 
 def live(eye: Eye, views: Views) -> Detect:
-    """Detections of an eye, computed when they are asked for; the view of the last pose of a picture is kept.
-
-    Where a frame was taken from another pose, the eye fixates the same point, and boxes are moved to the right view.
-    """
+    """Detections of an eye on request; those in a frame from another pose are moved to the view that was asked for."""
     world = views.world
     opened: tuple[int, View] | None = None
 

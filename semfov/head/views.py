@@ -78,10 +78,7 @@ class Views:
 
     @cached_property
     def distances(self) -> list[Tensor]:
-        """Distance `(cells, V)` from each cell of a view to those of the scene that it shows, in longer sides.
-
-        In a view wider by r, acuity 1 / (1 + d / σ) is lower by r: d is seen as r (σ + d) - σ in the narrowest.
-        """
+        """Distance `(cells, V)` from each cell of a view to those seen; d in a view wider by r is r (σ + d) - σ."""
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []
         for pose, points in zip(self.poses, self.points, strict=True):

@@ -99,10 +99,7 @@ _RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class BinarySums:
-    """Sums over binary predictions, for the mean log likelihood and Brier score (1950; of one of the two classes).
-
-    The first of 15 equally wide bins is divided into 7, as it can hold nearly all predictions; bins `(3, 21)`.
-    """
+    """Sums over binary predictions, for their log likelihood and Brier score (1950); bins `(3, 21)`, the first in 7."""
 
     bins: Tensor
     surprisal: float

@@ -18,10 +18,7 @@ def merge_fixations(
     cut: Sequence[Tensor] | None = None,
     around: float | None = None,
 ) -> Objects:
-    """Merge the detections of fixations and closer looks into one box for each object; distances and cut `(L,)`.
-
-    The nearest fixation sees a box most sharply, and a closer look more sharply still.
-    """
+    """Merge detections `(L,)` of fixations, the nearest the sharpest, and closer looks, sharper still, into objects."""
     rows = []
     for number, (seen, distance) in enumerate(zip(looks, distances, strict=True)):
         chosen = seen.mask[0] & (seen.confidence[0] >= FAINTEST)

@@ -137,10 +137,7 @@ def _borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]
 
 
 def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
-    """Regions of adjacent cells with the same most probable class, with name, cells and highest probability.
-
-    Its class is more probable than background, and than 3 over the number of classes, or 0.5 where that is less.
-    """
+    """Regions of adjacent cells with one class that beats background and 3 / K, or 0.5: name, cells, probability."""
     grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)
     sure = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))

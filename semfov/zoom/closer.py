@@ -30,10 +30,7 @@ _SMALLEST = 1e-4
 
 
 def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Window:
-    """The window around a box `(4,)`, three times its longer side and at most an octave above the last level.
-
-    In a photograph the two numbers of `window` say how large it is, to show other places, too.
-    """
+    """The window around a box `(4,)`, three times its longer side; in a `photograph` of a size of its own."""
     least, context = window
     if lattice.levels > 1:
         context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
@@ -125,11 +122,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
 
 class PhotographPlaces(CandidateBoxes):
-    r"""Places of a photograph, hints among them; a look at one is worth :math:`v = p \, (1 - \max_i p_i)`.
-
-    A place whose window was looked at is examined in that look, without a pass; so is one whose window is nearly the
-    whole photograph.
-    """
+    r"""Places of a photograph, hints among them; a look at one is worth :math:`v = p \, (1 - \max_i p_i)`."""
 
     least = 0.002
     by_worth = True

@@ -109,10 +109,7 @@ def _through(network: nn.Sequential, values: Tensor, outputs: slice | None = Non
 
 
 class Survey(nn.Module):
-    r"""Predicts how many objects of any class closer looks find, :math:`E[n(w)] = \sum_{x \in w} r(x) \lambda(x)`.
-
-    The network λ reads sums over the hints of all classes with learned weights, because some come in numbers.
-    """
+    r"""Predicts how many objects of any class closer looks find, :math:`E[n(w)] = \sum_{x \in w} r(x) \lambda(x)`."""
 
     def __init__(self, classes: int, *, foresight: float = 0.35) -> None:
         super().__init__()

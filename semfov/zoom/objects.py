@@ -184,10 +184,7 @@ def _object_facts(
     *,
     latest: bool = False,
 ) -> Tensor:
-    """Facts `(M, 14)` about the objects `index` `(M,)` (`FACTS`), from boxes `(L, 4)` of looks at windows `(N, 4)`.
-
-    A look should show an object of 6 canvas pixels or more that lies in its window and not at its border.
-    """
+    """Facts `(M, 14)` about the objects `index` `(M,)` (`FACTS`), from boxes `(L, 4)` of looks at windows `(N, 4)`."""
     (boxes, scores, labels, looks, cut, *_), count = every, len(index)
     if not count:
         return scores.new_zeros(0, len(FACTS))

@@ -30,10 +30,7 @@ def best_find(
 def best_hit(
     belief: ZoomBelief, done: set[Window], *, closest: bool = False, beside: Window | None = None
 ) -> WindowChoice | None:
-    """Choose the window that most probably shows the target, or one after which the target is soon found.
-
-    A value is the probability of a hit, or the sum of those of the closer windows in it over `patience`, if larger.
-    """
+    """Choose the window that most probably shows the target, or of closer ones that do, divided by `patience`."""
     lattice, patience = belief.lattice, belief.evidence.patience
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
     best: WindowChoice | None = None

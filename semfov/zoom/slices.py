@@ -20,10 +20,7 @@ def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
 
 
 def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
-    """Slices as people cut them, which overlap by a fifth: half as long again as the canvas shows at the last level.
-
-    Those of pictures nearly as small as the canvas are shorter. Slices of `blank` cells alone are left out.
-    """
+    """Slices as people cut them, which overlap by a fifth, without those of `blank` cells alone."""
     if lattice.levels == 1:
         side = max(1, round(0.6 * max(lattice.size)))
     else:

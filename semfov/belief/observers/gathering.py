@@ -87,10 +87,7 @@ class Gatherer(Observer, Generic[_Model]):
         return gathered, [gathered["nearest"], gathered["best"], mean, *unchanged]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
-        r"""Discount the evidence towards that of nothing seen, and move the closest looks away; see `Observer.fade`.
-
-        A look's weight (`nearness`) is multiplied by k; the closest one moves away by :math:`d \leftarrow d - R \ln k`.
-        """
+        """Discount the evidence towards that of nothing seen, and move the closest looks away; see `Observer.fade`."""
         if keep == 1:
             return belief
         fields: dict[str, Tensor] = vars(belief)
