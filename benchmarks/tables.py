@@ -14,7 +14,8 @@ RESULTS = Path(__file__).parent / "results"
 
 def command(name: str, description: str | None, seconds: float, threads: int = 1) -> argparse.ArgumentParser:
     """A command line with the options of all benchmarks that write a page."""
-    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=(description or "").split("\n", 1)[0])
+    lines = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(f"python -m {name}", description=description, formatter_class=lines)
     parser.add_argument("--seconds", type=float, default=seconds, help="shortest duration of each measurement")
     parser.add_argument("--threads", type=int, default=threads, help="number of threads")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")

@@ -1,6 +1,6 @@
-"""Regenerate the tables of docs/results.md and docs/tables.md: `python -m eval.results` runs the experiments.
+r"""Regenerate the tables of docs/results.md and docs/tables.md: `python -m eval.results` runs the experiments.
 
-    python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
+    python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx \
         --fit_root fit --fit_annotations instances_fit.json
 
 Results are measured on the photographs listed in configs/results_photographs.txt; settings are chosen on the

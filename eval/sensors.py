@@ -1,7 +1,7 @@
-"""Sensors at equal numbers of the detector's pixels: `python -m eval.sensors`.
+r"""Sensors at equal numbers of the detector's pixels: `python -m eval.sensors`.
 
     python -m eval.sensors --data.root val --data.annotations instances_val.json \
-      --fit.root train --fit.annotations instances_train.json
+        --fit.root train --fit.annotations instances_train.json
 
 Every sensor gets an observation model of its own, fitted to the same photographs (`--fit`). Then it searches and
 explores the same other photographs (`--data`). `--fixations 0` fits nothing, and measures only what raw scores tell.

@@ -7,8 +7,7 @@ Without photographs, the command uses the embedded scenes, which is enough only 
 Every photograph is fixated at random points. The detections are matched to the annotated boxes, and p(scores | class,
 distance to the fovea) is fitted to them. The folder `out` gets the model (`<name>.safetensors`), a report that
 evaluates it on held-out photographs, and a reliability diagram. If a run is interrupted, repeat the command to
-continue. Several machines share the work with
-`--scheduler` (docs/guides/cluster.md).
+continue. Several machines share the work with `--scheduler` (docs/guides/cluster.md).
 
 Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 """

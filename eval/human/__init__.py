@@ -32,11 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_line = list(sys.argv[1:] if arguments is None else arguments)
     if not command_line or command_line[0] not in JOBS:
         print(__doc__)
+        print("`python -m eval.human search --help` and `… viewing --help` list the settings.")
+        if command_line in (["--help"], ["-h"]):
+            return 0
         got = repr(command_line[0]) if command_line else "nothing"
-        print(
-            f"expected {' or '.join(JOBS)} as the first argument, got {got}; add --help to see its settings",
-            file=sys.stderr,
-        )
-        return 0 if command_line in (["--help"], ["-h"]) else 2
+        print(f"expected {' or '.join(JOBS)} as the first argument, got {got}", file=sys.stderr)
+        return 2
     job, config = JOBS[command_line[0]]
-    return run_command(job, config, __doc__, command_line[1:])
+    return run_command(job, config, __doc__, command_line[1:], program=f"python -m eval.human {command_line[0]}")

@@ -60,10 +60,12 @@ def make_parser(
     from jsonargparse import ArgumentParser, DefaultHelpFormatter, set_parsing_settings
 
     class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """Keep the line breaks of the description, and print the range of a number in a readable form."""
+        """Keep the line breaks of the description, and print types in a readable form."""
 
         def _expand_help(self, action: argparse.Action) -> str:
-            return re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", super()._expand_help(action))
+            text = re.sub(r"<class '(\w+)'>", r"\1", super()._expand_help(action))
+            text = re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", text)
+            return re.sub(r"Optional\[(.*)\](?=, default)", r"\1 | null", text)
 
     class Parser(ArgumentParser):
         """A parser that reports wrong arguments in one line."""
@@ -72,12 +74,14 @@ def make_parser(
             if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells
                 super().error(message, ex)
             options = [option for option in self._option_string_actions if option.startswith("--")]
-            print(f"error: {_in_one_line(message, config, options)}", file=sys.stderr)
+            every = "--help-all" if self.prog.startswith("semfov") else "--help"
+            print(f"error: {_in_one_line(message, config, options, every)}", file=sys.stderr)
             self.exit(2)
 
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
+    module = sys.modules["__main__"].__spec__
     parser = Parser(
-        prog=program,
+        prog=program or (module and f"python -m {module.name.removesuffix('.__main__')}"),
         description=description,
         default_env=False,
         formatter_class=Formatter,
@@ -233,8 +237,8 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
     return usual
 
 
-def _in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str:
-    """Say in one line what is wrong with the arguments, and suggest names."""
+def _in_one_line(message: str, config: type[Any], options: Iterable[str], every: str) -> str:
+    """Say in one line what is wrong with the arguments, and suggest names, or the option that lists all (`every`)."""
     unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
     if unknown:
         words = unknown[1].split()
@@ -243,7 +247,7 @@ def _in_one_line(message: str, config: type[Any], options: Iterable[str]) -> str
             return f"unexpected argument {unknown[1]!r}; put a name with spaces in quotes, and commas in a list"
         plain = [each[2:].replace("_", "-") for each in options]
         near = get_close_matches(option.lstrip("-").replace("_", "-"), plain, n=1, cutoff=0.6)
-        remedy = f"did you mean --{near[0]}?" if near else "--help-all lists all options"
+        remedy = f"did you mean --{near[0]}?" if near else f"{every} lists all options"
         return f"unknown option {option}; {remedy}"
     missing = re.match(r"argument (--\S+): expected one argument", message)
     if missing:
