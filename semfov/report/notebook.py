@@ -37,28 +37,32 @@ def record_html(record: Record) -> str:
         style = f'font-size="{11 * unit:.0f}" fill="{GAZE}" stroke="#fff" stroke-width="{3 * unit:.1f}"'
         shapes.append(f'<text {at} {style} paint-order="stroke">{look.number}</text>')
     marks = [
-        ([row[side] for side in ("x1", "y1", "x2", "y2")], f"{row['class']} {row['score']:.2f}", row["confirmed"], "")
+        (
+            [row[side] for side in ("x1", "y1", "x2", "y2")],
+            f"{row['class']} {row['score']:.2f}",
+            row["confirmed"],
+            False,
+        )
         for row in record.object_rows()[:_MOST]
     ]
     best = record.best_place
-    if best is not None:
-        dashes = f' stroke-dasharray="{8 * unit:.1f} {5 * unit:.1f}"'
-        marks.append((best[0].tolist(), f"best place {best[1]:.2f}", True, dashes))
-    for (x1, y1, x2, y2), name, sure, dashes in marks:
-        title = f"<title>{escape(name)}{', confirmed' * (sure and not dashes)}</title>"
-        colour, line = (FOUND, 2 * unit) if sure else (TARGET, 1.2 * unit)
+    marks += [] if best is None else [(best[0].tolist(), f"best place {best[1]:.2f}", True, True)]
+    for (x1, y1, x2, y2), name, green, dashed in marks:
+        title = f"<title>{escape(name)}{', confirmed' * (green and not dashed)}</title>"
+        colour, line = (FOUND, 2 * unit) if green else (TARGET, 1.2 * unit)
         for turn in (0, width) if x2 > width else (0,):
-            shapes.append(_rect((x1 - turn, y1, x2 - turn, y2), colour, line, title, dashes))
+            shapes.append(_rect((x1 - turn, y1, x2 - turn, y2), colour, line, title, dashed=dashed))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
-    green = ", and confirmed ones green" if record.confirmable else ""
-    key = f"Objects from {record.threshold_in_words} are orange{green}. " if len(record.objects) else ""
+    sure = ", and confirmed ones green" if record.confirmable else ""
+    key = f"Objects from {record.threshold_in_words} are orange{sure}. " if len(record.objects) else ""
     key += "The best place, not sure enough, is dashed." if best is not None else ""
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key}</div>"
 
 
-def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", dashes: str = "") -> str:
+def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", *, dashed: bool = False) -> str:
     x1, y1, x2, y2 = box
     side = f'x="{x1:.1f}" y="{y1:.1f}" width="{x2 - x1:.1f}" height="{y2 - y1:.1f}"'
+    dashes = f' stroke-dasharray="{4 * line:.1f} {2.5 * line:.1f}"' * dashed
     stroke = f'stroke="{colour}" stroke-width="{line:.1f}"{dashes}'
     return f'<rect {side} fill="none" {stroke} pointer-events="all">{inside}</rect>'
 
