@@ -36,16 +36,10 @@ def record_html(record: Record) -> str:
         at = f'x="{x1 + 3 * unit:.0f}" y="{y1 + 11 * unit:.0f}"'
         style = f'font-size="{11 * unit:.0f}" fill="{GAZE}" stroke="#fff" stroke-width="{3 * unit:.1f}"'
         shapes.append(f'<text {at} {style} paint-order="stroke">{look.number}</text>')
+    rows, best, sides = record.object_rows()[:_MOST], record.best_place, ("x1", "y1", "x2", "y2")
     marks = [
-        (
-            [row[side] for side in ("x1", "y1", "x2", "y2")],
-            f"{row['class']} {row['score']:.2f}",
-            row["confirmed"],
-            False,
-        )
-        for row in record.object_rows()[:_MOST]
+        ([row[side] for side in sides], f"{row['class']} {row['score']:.2f}", row["confirmed"], False) for row in rows
     ]
-    best = record.best_place
     marks += [] if best is None else [(best[0].tolist(), f"best place {best[1]:.2f}", True, True)]
     for (x1, y1, x2, y2), name, green, dashed in marks:
         title = f"<title>{escape(name)}{', confirmed' * (green and not dashed)}</title>"
@@ -62,8 +56,8 @@ def record_html(record: Record) -> str:
 def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", *, dashed: bool = False) -> str:
     x1, y1, x2, y2 = box
     side = f'x="{x1:.1f}" y="{y1:.1f}" width="{x2 - x1:.1f}" height="{y2 - y1:.1f}"'
-    dashes = f' stroke-dasharray="{4 * line:.1f} {2.5 * line:.1f}"' * dashed
-    stroke = f'stroke="{colour}" stroke-width="{line:.1f}"{dashes}'
+    stroke = f'stroke="{colour}" stroke-width="{line:.1f}"'
+    stroke += f' stroke-dasharray="{4 * line:.1f} {2.5 * line:.1f}"' * dashed
     return f'<rect {side} fill="none" {stroke} pointer-events="all">{inside}</rect>'
 
 
