@@ -1,6 +1,7 @@
 """Closer looks of a search in a large picture: the boxes they are made at, and the windows that show these."""
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -159,12 +160,12 @@ class PhotographPlaces(CandidateBoxes):
         return self._showing(candidate) in self._shown
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """Look closely at a place, unless its window was looked at."""
+        """Look closely at a place, unless its window was looked at; objects that were examined are left out."""
         window = self._showing(candidate)
         if window not in self._shown:
             self._shown[window] = self._next, super().look_at(candidate, close_up)
         self._number, detections = self._shown[window]
-        return detections
+        return replace(detections, mask=detections.mask & ~self._again(detections.boxes[0]))
 
     def wait(self, frames: float = 1) -> None:
         """Let frames pass; closer looks of earlier ones show other pixels where the scene changes."""

@@ -429,6 +429,22 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     assert second.place == pytest.approx(Alike()(expected).sigmoid()[0].item())
 
 
+def test_a_closer_look_is_not_at_an_object_that_was_examined():
+    boxes = torch.tensor([[[10.0, 10, 30, 30], [18.0, 10, 38, 30]]])  # they overlap by 0.43
+    places = PhotographPlaces(1, OVER)
+    whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
+    places.see(WindowLook(whole, 1, 0.8, 0.5, 0.0))
+    one = Detections(boxes[:, :1] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
+    _, box = places.examine(places.due(0.1, last=True), lambda box: one)
+    assert torch.equal(box, one.boxes[0, 0])
+    second = places.due(0.1, last=True)
+    assert torch.equal(second.box, boxes[0, 1])
+    features, box = places.examine(second, lambda box: one)
+    nothing = closer_features(0.8, second.probability, 0.3, Detections.empty(1, 2), second.box, 1)
+    assert torch.equal(features, nothing[0])
+    assert torch.equal(box, second.box)
+
+
 def test_the_window_of_a_closer_look_shows_other_places_too():
     x1, y1, x2, y2 = closer_window(OVER, torch.tensor([150.0, 100, 160, 110])).within
     assert (x2 - x1, y2 - y1) == pytest.approx((0.6 * 192, 0.6 * 192))
