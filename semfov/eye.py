@@ -53,16 +53,14 @@ class Eye(StatedModule):
         detections = eye.look(view, [(320.0, 240.0), (100.0, 50.0)])  # a batch of two looks
     """
 
+    _told = ("reference",)  # the size that the settings of the sensor are for
+
     def __init__(self, sensor: Sensor, detector: Detector, *, reference: float = 640.0) -> None:
         super().__init__()
         check(reference > 0, "reference", "a positive number of pixels", reference)
         self.sensor = sensor
         self.detector = detector
         self.reference = reference
-
-    def _stated(self) -> dict[str, Any]:
-        """The size that the settings of the sensor are for."""
-        return {"reference": self.reference}
 
     def open(self, image: ImageLike) -> View:
         """Fit an image into the detector's input, and compute what the sensor needs once per image.

@@ -91,7 +91,9 @@ class LargePicture(ABC):
 
     def read(self, box: _Box, reduction: int = 1) -> Tensor:
         """Read a window, `(3, h, w)`; coarse ones of pictures of more than 16 million pixels from reduced copies."""
-        self._inside(box)
+        (x1, y1, x2, y2), (width, height) = box, self.size
+        inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
+        check(inside, "box", f"a window inside {width} × {height} pixels", box)
         coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
         return self._reduced(box, reduction) if coarse and reduction >= self._first else _bytes_of(self._given(box))
 
@@ -101,14 +103,6 @@ class LargePicture(ABC):
         fits = pixels.dtype == np.uint8 and pixels.shape == (y2 - y1, x2 - x1, 3)
         check(fits, "pixels", f"bytes of shape {(y2 - y1, x2 - x1, 3)}", f"{pixels.dtype} of {pixels.shape}")
         return pixels
-
-    def _inside(self, box: _Box) -> _Box:
-        """The box; raises `InputError` where it is empty or not inside the picture."""
-        x1, y1, x2, y2 = box
-        width, height = self.size
-        inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
-        check(inside, "box", f"a window inside {width} × {height} pixels", box)
-        return box
 
     @cached_property
     def _first(self) -> int:

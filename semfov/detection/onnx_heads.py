@@ -133,16 +133,14 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
         return "boxes that are not finite"
     spread = middle.quantile(0.9, 0) - middle.quantile(0.1, 0)
     many = len(rows) >= _MANY and bool((spread > size / 4).all())
-
-    def mostly(odd: Tensor) -> bool:
-        return float(odd.any(-1).double().mean()) >= _MOST_MISPLACED
-
+    odd = torch.stack([high < low, (middle - size / 2).abs() > size])
+    crossed, outside = (odd.any(-1).double().mean(-1) >= _MOST_MISPLACED).tolist()
     places = middle.median(0).values.round().long().tolist()
     forms = {
         "fractions of the canvas instead of pixels": float(rows.abs().max()) <= _FRACTIONS < min(canvas),
-        "boxes whose right or lower edge comes first": mostly(high < low),
+        "boxes whose right or lower edge comes first": crossed,
         "corners of boxes that were read as their centres and sizes": many and bool((high >= 3 * low).all()),
-        f"boxes around {places}, outside the canvas": mostly((middle - size / 2).abs() > size),
+        f"boxes around {places}, outside the canvas": outside,
     }
     return next((form for form, fits in forms.items() if fits), None)
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
@@ -104,31 +103,27 @@ class Panoramas(ComposedScenes):
         """Compose a panorama."""
         canvas = torch.full((3, self.size[1], self.size[0]), self.fill)
         for patch in self.patches(index):
-            self._put(canvas, patch)
+            camera = Camera(torch.tensor(patch.pose), _SLOT)
+            x1, y1, x2, y2 = patch.box
+            # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
+            scale = self.size[0] / (2 * math.pi) / float(camera.focal)
+            image = self.scenes[patch.scene].image[None]
+            shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
+            image = F.interpolate(image, shape, mode="bilinear", antialias=True)
+            (frame,) = (
+                Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT)).panorama_boxes(self.size).tolist()
+            )
+            columns = torch.arange(math.floor(frame[0]), math.ceil(frame[2])) % self.size[0]
+            rows = torch.arange(math.floor(frame[1]), min(math.ceil(frame[3]), self.size[1]))
+            pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
+            points, _ = camera.points(panorama_directions(pixels.flatten(0, 1), self.size))
+            low, high = points.new_tensor([x1, y1]) - 0.5, points.new_tensor([x2, y2]) - 0.5
+            inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
+            place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
+            projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
+            row, column = inside.nonzero().unbind(-1)
+            canvas[:, rows[row], columns[column]] = projection[:, row, column]
         return self._scene(index, "panorama", canvas)
-
-    def _put(self, canvas: Tensor, patch: _Patch) -> None:
-        camera = Camera(torch.tensor(patch.pose), _SLOT)
-        x1, y1, x2, y2 = patch.box
-        # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
-        scale = self.size[0] / (2 * math.pi) / float(camera.focal)
-        image = self.scenes[patch.scene].image[None]
-        shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
-        image = F.interpolate(image, shape, mode="bilinear", antialias=True)
-
-        (frame,) = (
-            Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT)).panorama_boxes(self.size).tolist()
-        )
-        columns = torch.arange(math.floor(frame[0]), math.ceil(frame[2])) % self.size[0]
-        rows = torch.arange(math.floor(frame[1]), min(math.ceil(frame[3]), self.size[1]))
-        pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
-        points, _ = camera.points(panorama_directions(pixels.flatten(0, 1), self.size))
-        low, high = points.new_tensor([x1, y1]) - 0.5, points.new_tensor([x2, y2]) - 0.5
-        inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
-        place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, len(rows), len(columns), 2)
-        projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
-        row, column = inside.nonzero().unbind(-1)
-        canvas[:, rows[row], columns[column]] = projection[:, row, column]
 
     def regions(self, index: int) -> Regions:
         """The exact regions of the objects of a panorama: boxes in the planes of their photographs.

@@ -11,7 +11,6 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks, rollout
-from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.episodes import right_cells
 from semfov.runs.config import ProtocolConfig
@@ -150,24 +149,25 @@ def _run_batch(
     found_at = torch.where(goals.gather(1, starts[:, None])[:, 0], 0, -1)
     # A search that starts on its target has ended before its first look.
     seeking = (found_at < 0).nonzero()[:, 0]
-
-    def acquisition(order: Tensor, cell: Tensor) -> AcquisitionFunction:
-        return strategy.acquisition(cues[seeking[order]], grid, cell)
-
-    def lands(step: Step) -> Tensor:
-        return goals[seeking[step.episodes], step.next_cell]
-
     if strategy.policy.function.by_belief:
         observer, source = strategy.observer, looks.of(seeking)
     else:
         # No look changes what the policy does, and most of the time would go into the belief.
         observer, source = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)
-    choice = Greedy(drawn_from(noise[seeking]))
-    for step in rollout(source, observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
+    steps = rollout(
+        source,
+        observer,
+        lambda order, cell: strategy.acquisition(cues[seeking[order]], grid, cell),
+        starts[seeking],
+        Greedy(drawn_from(noise[seeking])),
+        most=shifts,
+        ends=lambda step: goals[seeking[step.episodes], step.next_cell],
+    )
+    for step in steps:
         going = ~step.visited.all(-1)
-        number = seeking[step.episodes[going]]
-        visits[number, step.shift + 1] = step.next_cell[going]
-        found_at[number[lands(step)[going]]] = step.shift + 1
+        number, cell = seeking[step.episodes[going]], step.next_cell[going]
+        visits[number, step.shift + 1] = cell
+        found_at[number[goals[number, cell]]] = step.shift + 1
     return [(row[row >= 0].tolist(), int(at)) for row, at in zip(visits, found_at, strict=True)]
 
 
@@ -208,13 +208,17 @@ def run_explorations(
 ) -> list[tuple[list[int], dict[str, list[int]]]]:
     """Run explorations until their gaze shifts are spent or no cell is left; noise `(episodes, shifts+1, X·Y)`."""
     starts, progress = torch.tensor([episode.start for episode in episodes]), []
-
-    def policy(_: Tensor, cell: Tensor) -> AcquisitionFunction:
-        return strategy.acquisition(None, looks.grid, cell)
-
     for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
         visits, counts = [], []
-        for step in rollout(looks, strategy.observer, policy, start, Greedy(drawn_from(random)), most=shifts + 1):
+        steps = rollout(
+            looks,
+            strategy.observer,
+            lambda _, cell: strategy.acquisition(None, looks.grid, cell),
+            start,
+            Greedy(drawn_from(random)),
+            most=shifts + 1,
+        )
+        for step in steps:
             visits.append(step.cell)
             counts.append(counts_of(step.belief.class_probabilities(), answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.

@@ -43,25 +43,11 @@ def features(scores: Tensor) -> Tensor:
 
 def _hint_maps(own: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
     """Maps `(T, rows, columns)` of one look: hints, detections and sizes of objects in and around each cell."""
-
-    def wide(values: Tensor) -> Tensor:
-        return values.expand(own.shape)
-
     # One call for the peaks of both: after a pass of the detector a call costs more than the work in it.
     peak, near = neighbourhood_peak(torch.cat([own, detections]), 3).chunk(2)
-    return [
-        own,
-        wide(best),
-        peak,
-        neighbourhood_peak(peak, 7),
-        _neighbourhood_mean(own, 5),
-        wide(crowd),
-        wide(size / 4 - 1),
-        wide((size > 0).to(own)),
-        detections,
-        near,
-        wide(own.amax((-1, -2), keepdim=True)),
-    ]
+    hints = [own, best, peak, neighbourhood_peak(peak, 7), _neighbourhood_mean(own, 5), crowd]
+    sizes = [size / 4 - 1, (size > 0).to(own)]
+    return [each.expand(own.shape) for each in (*hints, *sizes, detections, near, own.amax((-1, -2), keepdim=True))]
 
 
 def _memory_maps(own: Tensor, before: Tensor | None) -> list[Tensor]:

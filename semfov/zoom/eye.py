@@ -144,7 +144,8 @@ class WindowEye(nn.Module):
         exact, here = canvas.dtype == torch.uint8, canvas.device
         canvas = canvas.to(next(self.detector.parameters(), canvas).device)
         with beside(meanwhile, idle=canvas.device.type != "cpu"):
-            proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
+            unit = canvas if exact else canvas.to(torch.get_default_dtype()).contiguous() / 255
+            proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(unit)
             candidates = proposals.precise().to(here)
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
@@ -182,7 +183,8 @@ class WindowEye(nn.Module):
             InputError: a fixation is not finite, or its magnification is not positive.
         """
         canvases, frames = self.resample(view, fixations, within)
-        return _unit(canvases), torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)
+        unit = canvases.to(torch.get_default_dtype()).contiguous() / 255
+        return unit, torch.tensor(frames, dtype=unit.dtype).view(-1, 8)
 
     def resample(self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None) -> Resampled:
         """Resample windows for `glance`.
@@ -274,11 +276,6 @@ def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, fain
     check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
     check_numbers(image, 0, 1, class_scores=selected.classes, objectness=selected.objectness)
     return Hints(boxes, shares(selected, policy)[1].detach())
-
-
-def _unit(canvases: Tensor) -> Tensor:
-    """Canvases in [0, 1], of those from 0 to 255."""
-    return canvases.to(torch.get_default_dtype()).contiguous() / 255
 
 
 def _window_pixels(

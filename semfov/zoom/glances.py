@@ -127,21 +127,18 @@ class LiveGlances(Glances):
         self._prepared.clear()
 
     def prepare(self, window: Window) -> None:
-        self._prepared[window] = self.eye.resample(self.view, *_aims([window]))
+        fixation = torch.tensor([window.fixation], dtype=torch.float64)
+        self._prepared[window] = self.eye.resample(self.view, fixation, [window.within])
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
         meanwhile, self.meanwhile = self.meanwhile, None
-        looks = self.eye.glance(self.view, *_aims(windows), hints=hints, resampled=resampled, meanwhile=meanwhile)
+        fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
+        within = [window.within for window in windows]
+        looks = self.eye.glance(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
         return [_glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
-
-
-def _aims(windows: Sequence[Window]) -> tuple[Tensor, list[tuple[float, float, float, float] | None]]:
-    """Fixations `(F, 3)` of windows, and the boxes that they are limited to."""
-    fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
-    return fixations, [window.within for window in windows]
 
 
 def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
