@@ -235,7 +235,11 @@ class Eye(StatedModule):
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """Settings that the detections depend on, JSON values by `sensor` and `detector`."""
+        """Settings that the detections depend on, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values by `sensor` and `detector`.
+        """
         sensor = self.sensor.settings() | {"reference": self.reference}
         return {"sensor": sensor, "detector": self.detector.settings()}
 

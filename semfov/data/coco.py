@@ -3,6 +3,7 @@
 import contextlib
 import io
 import logging
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -42,7 +43,7 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
 _Field = tuple[Callable[[Any], object], str]  # whether a value of an entry fits, and what it is expected to be
 
 _ID: _Field = (
-    lambda value: isinstance(value, int | str) and not isinstance(value, bool) and is_plain(str(value)),
+    lambda value: type(value) is int or (isinstance(value, str) and is_plain(value)),
     "an integer or a string without control characters",
 )
 _TEXT: _Field = (
@@ -82,15 +83,16 @@ def _checked_ids_of(data: dict[str, Any], key: str, name: str, fields: Mapping[s
     entries, ids = data.get(key), set()
     if not isinstance(entries, list):
         raise DataError(f"{name}: expected {key} to be a list, got {_show(data, key)}; {_WAY}")
-    for place, entry in enumerate(entries):
-        where = f"{name}: {key}[{place}]"
+    for place, entry in enumerate(entries):  # of which there are many, so that messages are made where they are needed
         if not isinstance(entry, dict):
-            raise DataError(f"{where}: expected an object, got {excerpt(entry)}; {_WAY}")
+            raise DataError(f"{name}: {key}[{place}]: expected an object, got {excerpt(entry)}; {_WAY}")
         for field, (fits, expected) in fields.items():
             if not fits(entry.get(field, 0 if field == "iscrowd" else None)):
-                raise DataError(f"{where}: expected {field} to be {expected}, got {_show(entry, field)}; {_WAY}")
+                fault = f"expected {field} to be {expected}, got {_show(entry, field)}; {_WAY}"
+                raise DataError(f"{name}: {key}[{place}]: {fault}")
         if entry["id"] in ids:
-            raise DataError(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once; {_WAY}")
+            fault = f"expected unique ids, got id {_show(entry, 'id')} more than once; {_WAY}"
+            raise DataError(f"{name}: {key}[{place}]: {fault}")
         ids.add(entry["id"])
     return ids
 
@@ -198,7 +200,7 @@ class CocoScenes(Scenes):
         self._files = [inside(root, name) for name in names]
         for path in self._files:
             check_regular(path, f"image {path}")
-        if missing := [path for path in self._files if not path.exists()]:
+        if missing := [path for path in self._files if not os.path.exists(path)]:  # also names that are too long
             counts = f"{len(missing)} of {len(names)} are missing"
             raise DataError(f"image {missing[0]}: no such file ({counts}); check data.root")
         settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]

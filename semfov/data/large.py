@@ -70,10 +70,10 @@ class _TiffPicture(LargePicture):
             # The first page may be a thumbnail of another one.
             first = (number for number in range(min(len(pages), 64)) if not pages[number].is_reduced)
             self.page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
-        page: Any = self.page
-        count = int(page.samplesperpixel)
-        self.size = int(page.imagewidth), int(page.imagelength)
-        self._check_kind(known=white is not None)
+            page: Any = self.page
+            count = int(page.samplesperpixel)
+            self.size = int(page.imagewidth), int(page.imagelength)
+            self._check_kind(known=white is not None)
         extra = [int(each) for each in page.extrasamples]
         self._alpha = next((kind for kind in extra if kind in (_PREMULTIPLIED, _UNASSOCIATED)), 0)
         colours = count - len(extra)

@@ -229,6 +229,7 @@ class _Builder:
             fits, "pairs of anchors and a mask of their indices", f"{len(numbers)} numbers and the mask {mask}"
         )
         scale = section.numbers("scale_x_y", "1")
+        section.check(len(scale) == 1, "one number", excerpt(section.text("scale_x_y", "1")), "scale_x_y")
         head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
         section.check(head.channels == self._here.channels, f"{head.channels} channels", self._here.channels)
         self._note(self._here.channels, self._here.step)

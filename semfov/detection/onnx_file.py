@@ -27,7 +27,7 @@ _SETTINGS = Object(
         "stride": Maybe(Number(whole=True)),
         "logits": Flag(),
         "preprocessing": Object(others=Json()),
-        **dict.fromkeys(("licence", "source"), Text()),  # for people
+        **dict.fromkeys(("licence", "source"), Json()),  # for people, of any length and in lines
     }
 )
 

@@ -103,7 +103,7 @@ class Array(Json):
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
         size = len(self.of) if isinstance(self.of, tuple) else self.size
         fits = size is None or _fits(size, len(value), sizes)
-        check(fits, name, f"{size} items", f"{len(value)} with {sizes}")
+        check(fits, name, f"{size} items", f"{len(value)}" + (f" with {sizes}" if sizes else ""))
         check(len(value) >= self.least, name, f"at least {self.least} items", len(value))
         kinds = self.of if isinstance(self.of, tuple) else [self.of] * len(value)
         for place, (item, kind) in enumerate(zip(value, kinds, strict=True)):

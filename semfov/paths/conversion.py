@@ -97,7 +97,11 @@ class Conversion(Outcome):
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, None if not claimed."""
+        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.
+
+        Returns:
+            Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
+        """
         (width, height), decision = self.size, self.decision
         values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}
         values["targets"] = [self.classes[label] for label in self._sought]
@@ -178,7 +182,17 @@ class Conversion(Outcome):
         return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> str:
-        """The values of `to_dict` as JSON, which is written to a file if one is named."""
+        """The record as JSON: the values of `to_dict`.
+
+        Args:
+            path: the file to write; None writes none.
+
+        Returns:
+            The text of the file.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
         return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
 
     def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:

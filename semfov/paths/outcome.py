@@ -180,13 +180,22 @@ class Outcome(ABC):
     def expected(self) -> dict[str, float]:
         """Expected number of objects by the name of their class; NaN, and null in files, where it is not known.
 
-        It is known where scores are probabilities and the detector reacts to the class (`ZoomPath.reacts`).
+        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
+        each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
+        or a head, nor of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`).
         """
         return {name: mean for name, (mean, _) in self._claimed().items()}
 
     @property
     def expected_error(self) -> dict[str, float]:
-        """Standard deviation of the expected numbers by class (`zoom.certainty.number_of`); NaN where not known."""
+        r"""Standard deviation of the expected number of objects by the name of their class; NaN where it is not known.
+
+        The candidates are independent (a Poisson-binomial distribution), and what no look has shown has the
+        distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a share
+        :math:`\tau` (`spread`) of the expected number E:
+
+        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+        """
         return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
@@ -244,7 +253,11 @@ class Outcome(ABC):
         return ""
 
     def why_it_ended(self) -> str:
-        """Explain in one sentence why the search or the exploration ended; empty if that is not known."""
+        """Explain in one sentence why the search or the exploration ended.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
         sentences, looks = self._sentences, self.passes
         if self.closer and self.found:
             # Windows as large as the picture: the first look is a closer look already.

@@ -125,7 +125,11 @@ class Sensor(StatedModule, ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """List what the views depend on as JSON values by name, for keys of caches and metadata of fitted models."""
+        """List the settings that the views depend on, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values by name.
+        """
 
     def _stated(self) -> dict[str, Any]:
         """The settings by which commands make the sensor, without those that are parameters."""

@@ -221,6 +221,8 @@ def test_a_missing_image_is_an_error_only_if_it_is_used(photographs, make_coco, 
     with pytest.raises(DataError, match=r"gone\.png: no such file \(1 of 3 are missing\); check data\.root"):
         CocoScenes(photographs, make_coco(data=data), CLASSES, **ALL)
     only = CocoScenes(photographs, make_coco(data=data), CLASSES, min_instances=1, max_target_area=None)
+    data["images"][0]["file_name"] = "n" * 300  # longer than names of files may be
+    unusable(r"nnn: no such file \(1 of 3", CocoScenes, photographs, make_coco(data=data), CLASSES, **ALL)
     assert only.ids == [10, 20]  # an image that is not used may be missing
 
 

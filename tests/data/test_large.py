@@ -165,6 +165,16 @@ def test_truncated_files_are_refused(tmp_path):
         unusable(r"a\.(jpg|tif): .*cannot be", open_large(tmp_path / name).pixels, (0, 0, 230, 150))
 
 
+def test_a_tiff_with_two_widths_is_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", pixels())
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        count = file.pages[0].tags["ImageWidth"].offset + 4
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    content[count] = 2
+    (tmp_path / "a.tif").write_bytes(content)
+    unusable(r"a\.tif: truncated, damaged", open_large, tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("photometric", ["minisblack", "miniswhite", "rgb"])
 def test_sixteen_bit_tiffs_are_scaled_by_their_white(tmp_path, photometric):
     """Tile by tile and as a whole, against the values that were written."""

@@ -161,6 +161,7 @@ MAPS = "[convolutional]\nfilters=6\nactivation=linear\n"
         (NET + MAPS + "[yolo]\nmask=0,1\nanchors=1,2,3,4\nclasses=1\n", "expected 12 channels, got 6"),
         (NET + MAPS + "[yolo]\nmask=1\nanchors=1,2\nclasses=1\n", "got 2 numbers and the mask (1,)"),
         (NET + MAPS + "[yolo]\nmask=0\nanchors=1,2,3\nclasses=1\n", "got 3 numbers and the mask (0,)"),
+        (NET + MAPS + "[yolo]\nanchors=1,2\nclasses=1\nscale_x_y=\n", "scale_x_y: expected one number, got ''"),
     ],
 )
 def test_refuses_invalid_cfgs_with_an_error_of_one_line(text, message):

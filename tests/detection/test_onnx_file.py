@@ -29,12 +29,12 @@ from tests.small import write_network
 
 def test_the_settings_file_overrides_the_metadata(tmp_path):
     inside = {"head": "yolox", "classes": ["a"], "preprocessing": {"scale": 1.0, "channels": "rgb"}}
-    beside = {"head": "yolov5", "licence": "MIT", "preprocessing": {"scale": 255.0}}
+    beside = {"head": "yolov5", "licence": "MIT\n\nPermission is", "preprocessing": {"scale": 255.0}}
     (tmp_path / "model.json").write_text(json.dumps(beside))
     assert read_settings(tmp_path / "model.onnx", {"semfov": json.dumps(inside)}) == {
         "head": "yolov5",
         "classes": ["a"],
-        "licence": "MIT",
+        "licence": "MIT\n\nPermission is",
         "preprocessing": {"scale": 255.0, "channels": "rgb"},
     }
 
