@@ -146,7 +146,20 @@ class _Calls:
             looked = _look_at_cells(self.agent, image, target, cells)
             seen = render([plot_foveated_strip(looked.record, most=1)], dpi=250)[0]
             believed = render([plot_belief(looked.record, -1)], dpi=110)[0]
-            return cells, _clicked(image, looked), seen, believed, looked.describe()
+            # Numbered looks, and a ring where the agent would look next.
+            drawn = _reduced(image)
+            draw, scale = ImageDraw.Draw(drawn), drawn.width / image.shape[-1]
+            radius = max(drawn.size) / 50
+            points = [(x * scale, y * scale) for x, y in looked.record.fixations.tolist()]
+            draw.line(points, fill="white", width=5)
+            draw.line(points, fill=GAZE, width=3)
+            for number, (x, y) in enumerate(points, 1):
+                draw.circle((x, y), radius, fill=GAZE, outline="white", width=2)
+                draw.text((x, y), str(number), fill="white", anchor="mm", font_size=1.2 * radius)
+            x, y = (side * scale for side in looked.point)
+            draw.circle((x, y), radius, outline="white", width=6)
+            draw.circle((x, y), radius, outline=TARGET, width=4)
+            return cells, drawn, seen, believed, looked.describe()
 
     def fresh(self, picture: Any) -> tuple[Any, ...]:
         """No cells, and the picture to click on."""
@@ -243,20 +256,3 @@ class _OwnLooks(NamedTuple):
             f"The agent itself, from your first look and in as many looks: {self.agent.describe()}.",
         ]
         return "\n\n".join(lines)
-
-
-def _clicked(image: Tensor, looked: "_OwnLooks") -> Image.Image:
-    """The picture with numbered looks, and a ring where the agent would look next."""
-    picture = _reduced(image)
-    draw, scale = ImageDraw.Draw(picture), picture.width / image.shape[-1]
-    radius = max(picture.size) / 50
-    points = [(x * scale, y * scale) for x, y in looked.record.fixations.tolist()]
-    draw.line(points, fill="white", width=5)
-    draw.line(points, fill=GAZE, width=3)
-    for number, (x, y) in enumerate(points, 1):
-        draw.circle((x, y), radius, fill=GAZE, outline="white", width=2)
-        draw.text((x, y), str(number), fill="white", anchor="mm", font_size=1.2 * radius)
-    x, y = (side * scale for side in looked.point)
-    draw.circle((x, y), radius, outline="white", width=6)
-    draw.circle((x, y), radius, outline=TARGET, width=4)
-    return picture

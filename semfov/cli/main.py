@@ -4,8 +4,8 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
@@ -81,7 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     dotted = ["detector.classes"] if name == "fit" else []
     words = partial(_in_command_words, options=[*dotted, *(field.name for field in fields(options))])
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
-    with _plain_warnings(words):
+    with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
+        warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
         return run_command(partial(_run, name), options, HELP[name], rest, words=words, **names)
 
 
@@ -199,15 +200,3 @@ def _in_command_words(message: str, options: Iterable[str]) -> str:
         return f"--{by_name[match[1]].replace('_', '-')}{' ' if value else ''}{value}"
 
     return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)
-
-
-@contextmanager
-def _plain_warnings(words: Callable[[str], str]) -> Iterator[None]:
-    """Print each warning as one line in the words of the command, without the place in the code."""
-
-    def show(message: Warning | str, *_: object, **__: object) -> None:
-        print(f"warning: {words(str(message))}", file=sys.stderr)
-
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield

@@ -30,7 +30,19 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     data = read_json(path, name=name)
     expected = "an object with images, annotations and categories"
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
-    _check(data, name)
+    images = _checked_ids_of(data, "images", name, {"id": _ID, "file_name": _TEXT, "width": _SIDE, "height": _SIDE})
+    check_data(
+        len({type(i) for i in images}) < 2, f"{name}: images", "ids of one kind", f"integers and strings; {_WAY}"
+    )
+    categories = _checked_ids_of(data, "categories", name, {"id": _ID, "name": _TEXT})
+    fields: dict[str, _Field] = {
+        "id": _ID,
+        "image_id": (lambda value: _ID[0](value) and value in images, "the id of one of the images"),
+        "category_id": (lambda value: _ID[0](value) and value in categories, "the id of one of the categories"),
+        "bbox": _BOX,
+        "iscrowd": (lambda value: value in (0, 1), "0 or 1"),
+    }
+    _checked_ids_of(data, "annotations", name, fields)
     from pycocotools.coco import COCO
 
     coco = COCO()
@@ -59,23 +71,6 @@ _BOX: _Field = (
     "[x, y, width, height] with finite numbers and a size of at least 0",
 )
 _WAY = "correct or replace the file"
-
-
-def _check(data: dict[str, Any], name: str) -> None:
-    """Raise `DataError` with the entry and the field that is missing or has another form than it is used in."""
-    images = _checked_ids_of(data, "images", name, {"id": _ID, "file_name": _TEXT, "width": _SIDE, "height": _SIDE})
-    check_data(
-        len({type(i) for i in images}) < 2, f"{name}: images", "ids of one kind", f"integers and strings; {_WAY}"
-    )
-    categories = _checked_ids_of(data, "categories", name, {"id": _ID, "name": _TEXT})
-    fields: dict[str, _Field] = {
-        "id": _ID,
-        "image_id": (lambda value: _ID[0](value) and value in images, "the id of one of the images"),
-        "category_id": (lambda value: _ID[0](value) and value in categories, "the id of one of the categories"),
-        "bbox": _BOX,
-        "iscrowd": (lambda value: value in (0, 1), "0 or 1"),
-    }
-    _checked_ids_of(data, "annotations", name, fields)
 
 
 def _checked_ids_of(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> set[int | str]:

@@ -362,26 +362,22 @@ class Darknet(nn.Module):
         got = "NaN or infinite ones; the file is damaged or not a weights file"
         check_data(bool(numbers.isfinite().all()), f"weights {str(path)!r}", "finite numbers", got)
         for layer in layers:
-            numbers = _fill(layer, numbers, str(path))
+            channels = layer.out_channels
+            vectors = numbers[: channels * (4 if layer.normalised else 1)].view(-1, channels).double()
+            weight = numbers[vectors.numel() : _count(layer)].view(layer.weight.shape).double()
+            bias = vectors[0]
+            if layer.normalised:
+                _, scale, mean, variance = vectors
+                got = "negative ones; the file does not fit the cfg"
+                least = not bool((variance < 0).any())
+                check_data(least, f"weights {str(path)!r}", "variances of at least 0", got)
+                factor = scale / (variance + _EPSILON).sqrt()
+                weight, bias = weight * factor[:, None, None, None], bias - mean * factor
+            layer.weight.copy_(weight)
+            cast(Tensor, layer.bias).copy_(bias)
+            numbers = numbers[_count(layer) :]
         return hashlib.sha256(data).hexdigest()
 
 
 def _count(layer: Convolution) -> int:
     return layer.weight.numel() + layer.out_channels * (4 if layer.normalised else 1)
-
-
-def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
-    """Load the first numbers into `layer`, and return the rest."""
-    channels = layer.out_channels
-    vectors = numbers[: channels * (4 if layer.normalised else 1)].view(-1, channels).double()
-    weight = numbers[vectors.numel() : _count(layer)].view(layer.weight.shape).double()
-    bias = vectors[0]
-    if layer.normalised:
-        _, scale, mean, variance = vectors
-        got = "negative ones; the file does not fit the cfg"
-        check_data(not bool((variance < 0).any()), f"weights {path!r}", "variances of at least 0", got)
-        factor = scale / (variance + _EPSILON).sqrt()
-        weight, bias = weight * factor[:, None, None, None], bias - mean * factor
-    layer.weight.copy_(weight)
-    cast(Tensor, layer.bias).copy_(bias)
-    return numbers[_count(layer) :]

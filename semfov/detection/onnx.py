@@ -133,7 +133,13 @@ class OnnxDetector(Detector):
             objectness = None if candidates.objectness is None else candidates.objectness.sigmoid()
             candidates = replace(candidates, classes=candidates.classes.sigmoid(), objectness=objectness)
         if values_known(candidates.boxes):
-            self._check(candidates)
+            named = f"with head {self.head!r}; check that head= names the model's head"
+            check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
+            for scores in (candidates.classes, candidates.objectness):
+                low, high = (0.0, 0.0) if scores is None else _range(scores)
+                way = "set logits=True if the model returns them before the sigmoid"
+                got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
+                check_data(low >= 0 and high <= 1, self.name, "scores in [0, 1]", got)
         self._placed |= first
         return keep_classes(candidates, self._places, self._scores)
 
@@ -150,16 +156,6 @@ class OnnxDetector(Detector):
         wrong, heads = misplaced(candidates.boxes, size), ", ".join(sorted(HEADS))
         expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
         check_data(wrong is None, self.name, expected, f"{wrong}; name the model's head with head=, one of {heads}")
-
-    def _check(self, candidates: Candidates) -> None:
-        """Raise `DataError` where the numbers show a wrong head or a missing sigmoid."""
-        named = f"with head {self.head!r}; check that head= names the model's head"
-        check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
-        for scores in (candidates.classes, candidates.objectness):
-            low, high = (0.0, 0.0) if scores is None else _range(scores)
-            way = "set logits=True if the model returns them before the sigmoid"
-            got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
-            check_data(low >= 0 and high <= 1, self.name, "scores in [0, 1]", got)
 
     def settings(self) -> dict[str, object]:
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}

@@ -79,6 +79,7 @@ def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
     # A fully convolutional network knows its size in the shape of its input, and in those that its `Reshape` nodes ask
     # for.
     import onnx
+    from onnx import numpy_helper
 
     check_canvas("input_size", canvas)
     check(all(side % _COARSEST == 0 for side in canvas), "input_size", f"multiples of {_COARSEST} pixels", canvas)
@@ -88,20 +89,7 @@ def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
     size = sides[1].dim_value, sides[0].dim_value
     if size == canvas:
         return path
-    _resize(model.graph, size, canvas)
-    content = model.SerializeToString()
-    digest = hashlib.sha256(content).hexdigest()
-    new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
-    if not new.is_file() or sha256(new) != digest:
-        write_bytes(new, content)
-    return new
-
-
-def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int]) -> None:
-    """Replace the sizes that a graph has in constants."""
-    from onnx import numpy_helper
-
-    maps = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
+    graph, maps = model.graph, {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
     shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
     constants = {tensor.name: tensor for tensor in graph.initializer}
     constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
@@ -110,9 +98,14 @@ def _resize(graph: Any, size: tuple[int, int], canvas: tuple[int, int]) -> None:
         if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
             shape[-2:] = maps[int(shape[-1]), int(shape[-2])][::-1]
             constants[name].CopyFrom(numpy_helper.from_array(shape, constants[name].name))
-    sides = graph.input[0].type.tensor_type.shape.dim[2:4]
     sides[0].dim_value, sides[1].dim_value = canvas[1], canvas[0]
     del graph.value_info[:]
     for output in graph.output:
         for side in output.type.tensor_type.shape.dim[1:2]:
             side.Clear()
+    content = model.SerializeToString()
+    digest = hashlib.sha256(content).hexdigest()
+    new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
+    if not new.is_file() or sha256(new) != digest:
+        write_bytes(new, content)
+    return new

@@ -428,8 +428,13 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
         terminated, truncated = self._ended.numpy().copy()
         if mode == AutoresetMode.SAME_STEP:
             ended = self._ended.any(0).nonzero()[:, 0]
-            if len(ended):
-                last = self._last(ended)
+            if len(ended):  # Gymnasium keeps the last observations and infos where a reset follows at once
+                observations = self.gazes.observe(ended)
+                each = np.full(self.num_envs, None, dtype=object)
+                for number, row in enumerate(ended.tolist()):
+                    each[row] = {name: value[number] for name, value in observations.items()}
+                infos = self.gazes.infos(self._rows, detections=self._detections)
+                last = _marked({"final_obs": each, "final_info": infos}, self._ended.any(0).numpy())
                 self._restart(ended)
                 self._ended[:] = False
         observation, info = self._observed()
@@ -446,17 +451,6 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]], EzPickle
     def _restart(self, rows: Tensor) -> None:
         if len(rows):
             self.gazes.begin(rows, [self.gazes.choose(self._randoms[row], {}) for row in rows.tolist()])
-
-    def _last(self, rows: Tensor) -> Arrays:
-        """Last observations and infos of finished episodes, which Gymnasium keeps where a reset follows at once."""
-        ended = np.zeros(self.num_envs, dtype=bool)
-        ended[rows.numpy()] = True
-        observations = self.gazes.observe(rows)
-        each = np.full(self.num_envs, None, dtype=object)
-        for number, row in enumerate(rows.tolist()):
-            each[row] = {name: value[number] for name, value in observations.items()}
-        infos = self.gazes.infos(self._rows, detections=self._detections)
-        return _marked({"final_obs": each, "final_info": infos}, ended)
 
     def _observed(self) -> tuple[Arrays, Arrays]:
         infos = self.gazes.infos(self._rows, detections=self._detections)

@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from os import PathLike, fspath
@@ -200,7 +201,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     started = time.monotonic()
     print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
-    _check_photographs(run)
+    unseen = _check_photographs(run)
     folder = _FolderFit(config, run)
     config, results = folder.inputs.config, folder.inputs.results
     counts = _class_counts(run, range(len(run.scenes)))
@@ -215,7 +216,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
             some,
         )
     stages = {name: each.tasks for name, each in folder.fits.items()}
-    stages = {"looking": {"looking": _seconds_of_looks(run)}, **stages}
+    stages = {"looking": {"looking": _seconds_of_looks(run, unseen)}, **stages}
     minutes = math.ceil(sum(sum(tasks.values()) for tasks in stages.values()) / 60)
     looks = len(run.scenes) * math.prod(config.cells)
     print(
@@ -259,16 +260,11 @@ def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
     return config
 
 
-def _unseen(run: Looking) -> list[int]:
-    """The photographs without stored looks from all cells."""
-    cells = len(run.grid(0))
-    return [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
-
-
-def _check_photographs(run: Looking) -> None:
-    """Decode all photographs that will be looked at; raises `DataError` with all that cannot be decoded."""
-    faults = []
-    for index in tqdm(_unseen(run), "decoding photographs", unit="photograph", leave=False, dynamic_ncols=True):
+def _check_photographs(run: Looking) -> list[int]:
+    """Decode the photographs without looks from all cells; raises `DataError` with all that cannot be decoded."""
+    faults, cells = [], len(run.grid(0))
+    unseen = [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
+    for index in tqdm(unseen, "decoding photographs", unit="photograph", leave=False, dynamic_ncols=True):
         try:
             run.scenes[index]
         except DataError as error:
@@ -276,11 +272,11 @@ def _check_photographs(run: Looking) -> None:
     if faults:
         more = f", and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
         raise DataError(f"photographs: {len(faults)} cannot be read: {'; '.join(faults[:_MOST_FAULTS])}{more}")
+    return unseen
 
 
-def _seconds_of_looks(run: Looking) -> float:
-    """Estimate the seconds that the remaining looks will take, from the time of one look."""
-    left = _unseen(run)
+def _seconds_of_looks(run: Looking, left: Sequence[int]) -> float:
+    """Estimate the seconds that looks at the photographs that are left will take, from the time of one look."""
     if not left:
         return 1.0
     image = run.scenes[left[0]].image[None]

@@ -83,7 +83,13 @@ class Manifest:
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         path = Path(folder) / FILE
-        record = _read(path)
+        if not path.exists():
+            gaze, what = path.with_name("gaze.safetensors"), "a folder of models that semfov fit wrote"
+            if gaze.is_file():
+                what = f"{what} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
+            raise DataError(f"{path}: no such file; expected {what}")
+        record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
+        check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
         recorded = record.pop("sha256", None)
         if recorded != checksum({}, record):
             raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
@@ -101,14 +107,3 @@ class Manifest:
 
 
 _AGAIN = "run semfov fit again, or copy the folder again"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        gaze, what = path.with_name("gaze.safetensors"), "a folder of models that semfov fit wrote"
-        if gaze.is_file():
-            what = f"{what} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
-        raise DataError(f"{path}: no such file; expected {what}")
-    record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
-    check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
-    return record

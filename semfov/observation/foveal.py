@@ -255,17 +255,7 @@ class FovealObservationModel(Pretrained):
             raise InputError("miss_rate: expected a model fitted with miss rates (`train.fit_fom`), got one without")
         return F.embedding(self.level(distance), self.miss_rate.t())
 
-    def forward(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Calibrated scores; see `calibrate`.
-
-        Args:
-            scores: `(..., K+1)`.
-            distance: `(...)`.
-
-        Returns:
-            `(..., K+1)`.
-        """
-        return self.calibrate(scores, distance)
+    forward = calibrate
 
     @torch.no_grad()
     def fit(

@@ -76,7 +76,17 @@ class DirichletStatistics:
         check(not bool((scores < 0).any()), "scores", "no negative numbers", "some")
         check(not bool(off.any()), "scores", "vectors that sum to 1", f"{int(off.sum())} that do not")
         scores = scores.reshape(-1, self.components)
-        cells = self._cells(index, len(scores)).to(self.count.device)
+        indices = (index,) if isinstance(index, Tensor) else tuple(index)
+        sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
+        check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
+        cells, samples = torch.zeros(len(scores), dtype=torch.int64, device=indices[0].device), len(scores)
+        for row, size in zip(indices, sizes, strict=True):
+            whole = not row.is_floating_point() and row.dtype != torch.bool
+            check(whole and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
+            inside = bool(((row >= 0) & (row < size)).all())
+            check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
+            cells = cells * size + row
+        cells = cells.to(self.count.device)
         count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
         self._check_room(count)
         raised = scores.to(self.count.device, torch.float64).clamp(min=self.epsilon).contiguous()
@@ -200,20 +210,6 @@ class DirichletStatistics:
 
     def _mean(self, which: int) -> Tensor:
         return self.sums[which].to(torch.float64) / 2.0**_FRACTION_BITS / self.count[..., None]
-
-    def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
-        """Row-major cell numbers, after checking the index."""
-        indices = (index,) if isinstance(index, Tensor) else tuple(index)
-        sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
-        check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
-        cells = torch.zeros(samples, dtype=torch.int64, device=indices[0].device)
-        for row, size in zip(indices, sizes, strict=True):
-            whole = not row.is_floating_point() and row.dtype != torch.bool
-            check(whole and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
-            inside = bool(((row >= 0) & (row < size)).all())
-            check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
-            cells = cells * size + row
-        return cells
 
     def _check_room(self, count: Tensor) -> None:
         """Raise `InputError` if the sums of so many samples could exceed 63 bits."""

@@ -47,18 +47,41 @@ class GlanceStore(DetectionStore):
         return Window((row[0], row[1], row[2]), int(row[7]), cells, within)
 
     def pack(self, looks: Sequence[Glance]) -> dict[str, Tensor]:
-        """Convert glances to tensors for a file."""
+        """Convert glances to tensors for a file, gists without empty cells; a look without a gist has a scale of 0."""
+        gists, kinds = [glance.gist for glance in looks], self.classes
+        some = [look for look in gists if look is not None]
+        frames = [[0, 0, 0] if look is None else [look.scale, *look.scores.shape[:2]] for look in gists]
+        scores = torch.cat([torch.zeros(0, kinds), *(look.scores.flatten(0, 1) for look in some)])
+        sizes = torch.cat([torch.zeros(0), *(look.size.flatten() for look in some)])
+        found = torch.cat([torch.zeros(0, kinds, dtype=torch.bool), *(look.found.flatten(0, 1) for look in some)])
+        full = (scores > 0).any(-1)
         return {
             **super().pack([glance.detections for glance in looks]),
             "cut": torch.cat([glance.cut for glance in looks]),
             "show": torch.stack([glance.show for glance in looks]),
-            **_pack_gists([glance.gist for glance in looks], self.classes),
+            "gist.frames": torch.tensor(frames),
+            "gist.cells": full.nonzero()[:, 0],
+            "gist.scores": scores[full].float(),
+            "gist.sizes": sizes[full].float(),
+            "gist.found": found.flatten().nonzero()[:, 0],
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
         """Convert the tensors of a file back to the glances at these windows."""
-        seen = super().unpack(tensors, actions)
-        cut, gists = tensors["cut"].split(tensors["count"].tolist()), _unpack_gists(tensors, actions)
+        frames, kinds = tensors["gist.frames"].tolist(), tensors["gist.scores"].shape[-1]
+        counts = [rows * columns for _, rows, columns in frames]
+        scores, size = torch.zeros(sum(counts), kinds), torch.zeros(sum(counts))
+        found = torch.zeros(sum(counts) * kinds, dtype=torch.bool)
+        cells = tensors["gist.cells"]
+        scores[cells], size[cells], found[tensors["gist.found"]] = tensors["gist.scores"], tensors["gist.sizes"], True
+        parts = scores.split(counts), size.split(counts), found.view(-1, kinds).split(counts)
+        gists = [
+            Gist(window.level, window.cells[:2], scale, *(part.unflatten(0, (rows, columns)).clone() for part in three))
+            if scale
+            else None
+            for window, (scale, rows, columns), *three in zip(actions, frames, *parts, strict=True)
+        ]
+        seen, cut = super().unpack(tensors, actions), tensors["cut"].split(tensors["count"].tolist())
         return [Glance(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
 
 
@@ -83,37 +106,3 @@ class StoredGlances(Glances):
     def save(self) -> None:
         """Store the looks at the picture if there are new ones."""
         self.looks.save()
-
-
-def _pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Pack gists into tensors for a file, without their empty cells; a look without a gist has a scale of 0."""
-    some = [look for look in gists if look is not None]
-    frames = [[0, 0, 0] if look is None else [look.scale, *look.scores.shape[:2]] for look in gists]
-    scores = torch.cat([torch.zeros(0, kinds), *(look.scores.flatten(0, 1) for look in some)])
-    sizes = torch.cat([torch.zeros(0), *(look.size.flatten() for look in some)])
-    found = torch.cat([torch.zeros(0, kinds, dtype=torch.bool), *(look.found.flatten(0, 1) for look in some)])
-    full = (scores > 0).any(-1)
-    return {
-        "gist.frames": torch.tensor(frames),
-        "gist.cells": full.nonzero()[:, 0],
-        "gist.scores": scores[full].float(),
-        "gist.sizes": sizes[full].float(),
-        "gist.found": found.flatten().nonzero()[:, 0],
-    }
-
-
-def _unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
-    """Unpack the tensors of `_pack_gists`."""
-    frames, kinds = tensors["gist.frames"].tolist(), tensors["gist.scores"].shape[-1]
-    counts = [rows * columns for _, rows, columns in frames]
-    scores, size = torch.zeros(sum(counts), kinds), torch.zeros(sum(counts))
-    found = torch.zeros(sum(counts) * kinds, dtype=torch.bool)
-    cells = tensors["gist.cells"]
-    scores[cells], size[cells], found[tensors["gist.found"]] = tensors["gist.scores"], tensors["gist.sizes"], True
-    parts = scores.split(counts), size.split(counts), found.view(-1, kinds).split(counts)
-    return [
-        Gist(window.level, window.cells[:2], scale, *(part.unflatten(0, (rows, columns)).clone() for part in three))
-        if scale
-        else None
-        for window, (scale, rows, columns), *three in zip(windows, frames, *parts, strict=True)
-    ]

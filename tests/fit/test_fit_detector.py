@@ -27,7 +27,7 @@ from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.fit.detector import _seconds_of_looks, _thin_classes, _with_classes
+from semfov.fit.detector import _check_photographs, _seconds_of_looks, _thin_classes, _with_classes
 from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import FitSearchConfig, choose_thresholds
 from semfov.fit.part import PartInputs, PartResult
@@ -510,15 +510,15 @@ def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path
     )
     clock = itertools.count(step=2.0)
     monkeypatch.setattr("semfov.fit.detector.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    assert _seconds_of_looks(run) == 2 * 6 * 3
+    assert _seconds_of_looks(run, _check_photographs(run)) == 2 * 6 * 3
     run.detections(1)
-    assert _seconds_of_looks(run) == 2 * 6 * 2
+    assert _seconds_of_looks(run, _check_photographs(run)) == 2 * 6 * 2
     looks = run.store.load(run.digest(1))
     run.store.save(run.digest(1), {cell: looks[cell] for cell in (0, 4)})
-    assert _seconds_of_looks(run) == 2 * 6 * 3
+    assert _seconds_of_looks(run, _check_photographs(run)) == 2 * 6 * 3
     for index in range(3):
         run.detections(index)
-    assert _seconds_of_looks(run) == 1
+    assert _seconds_of_looks(run, _check_photographs(run)) == 1
 
 
 @pytest.mark.slow

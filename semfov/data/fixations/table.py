@@ -112,20 +112,7 @@ def read_table(
 def _records_of(
     where: str, lines: Sequence[_Line], size: _Size | None, units: _Units, origin: _Origin
 ) -> list[Fixations]:
-    """The records of lines, with a warning of what their coordinates look like."""
-    records = [_record(where, group, size, units, origin) for group in _scanpaths(where, lines)]
-    return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
-
-
-def _named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
-    """The names of columns in a source by ours, of which some are known."""
-    fits = columns is None or (isinstance(columns, Mapping) and all(isinstance(each, str) for each in columns.values()))
-    check(fits, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
-    return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
-
-
-def _scanpaths(where: str, lines: Sequence[_Line]) -> list[list[_Line]]:
-    """The lines of each scanpath."""
+    """The records of lines, one for each scanpath, with a warning of what their coordinates look like."""
     groups: dict[tuple[str, ...], list[_Line]] = {}
     previous = None
     for place, line in lines:
@@ -138,7 +125,15 @@ def _scanpaths(where: str, lines: Sequence[_Line]) -> list[list[_Line]]:
             )
         groups.setdefault(who, []).append((place, line))
         previous = who
-    return list(groups.values())
+    records = [_record(where, group, size, units, origin) for group in groups.values()]
+    return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
+
+
+def _named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
+    """The names of columns in a source by ours, of which some are known."""
+    fits = columns is None or (isinstance(columns, Mapping) and all(isinstance(each, str) for each in columns.values()))
+    check(fits, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
+    return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
 
 
 def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> None:
