@@ -9,7 +9,7 @@ import torch
 from semfov.agent import ActivePerception
 from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.data.classes import class_index
-from semfov.detection.load import check_detector
+from semfov.detection.load import check_detector, given_names
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check
 from semfov.io.manifest import Manifest
@@ -40,9 +40,9 @@ def detector_options(options: AgentOptions | GazeOptions) -> dict[str, Any]:
         have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
         expected = f"expected one that PyTorch has here ({', '.join(have)})"
         raise InputError(f"device: {expected}, got {options.device!r}") from None
-    names: Any = options.classes
+    names = options.classes
     if names is not None and len(names) == 1 and Path(names[0]).is_file():
-        names = names[0]  # of the file, whose lines are the names
+        names = given_names(names[0])
     given = {"weights": options.weights, "device": options.device, "classes": names}
     return {name: value for name, value in given.items() if value is not None}
 

@@ -106,7 +106,7 @@ def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, opti
     own = _options_of(load)
     check_options(options, [*own, *_COMMON], f"semfov.load_detector for {what}")
     if options.get("classes") is not None:
-        options = {**options, "classes": _given_names(options["classes"])}
+        options = {**options, "classes": given_names(options["classes"])}
     if "device" in options:
         try:
             torch.device(options["device"])
@@ -200,7 +200,7 @@ def load_yolo(
     return detector.eval()
 
 
-def _given_names(classes: Any) -> tuple[str, ...]:
+def given_names(classes: Any) -> tuple[str, ...]:
     """Class names in the order of the scores: of a list, a text with commas, the lines of a file, or by numbers."""
     expected = "names in the order of the scores, in a list"
     if isinstance(classes, str | PathLike):

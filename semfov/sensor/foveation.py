@@ -84,7 +84,7 @@ def foveate(
     for name, value in (("sigma", sigma), ("growth", growth)):
         known = not isinstance(value, Tensor) or values_known(value)
         if known and not (value > 0 if isinstance(value, Real) else bool((torch.as_tensor(value) > 0).all())):
-            check(False, name, "a positive number", torch.as_tensor(value).tolist())
+            check(False, name, "a positive number", value.tolist() if isinstance(value, Tensor) else value)
     widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
     size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
     details = source.details if isinstance(source, Bands) else ()

@@ -192,7 +192,10 @@ def test_ctrl_c_while_the_command_is_imported_ends_in_one_line(program, changes,
         signal.signal(signal.SIGINT, before)
 
 
-def test_texts_of_options_are_read():
+def test_texts_of_options_are_read(tmp_path):
+    (tmp_path / "names.txt").write_text("cup\ntin can\n")
+    named = options.SearchOptions(detector="torchvision:ssd", classes=(str(tmp_path / "names.txt"),))
+    assert agent.detector_options(named)["classes"] == agent.detector_classes(named) == ("cup", "tin can")
     assert agent.several_classes("Cups, fork", ("cup", "fork")) == ["cup", "fork"]
     assert [options.start_of(text) for text in ("5,7", "47", None)] == [(5, 7), 47, None]
     assert [options.white_of(text) for text in ("300,3000", "4095", "auto")] == [(300.0, 3000.0), 4095.0, "auto"]

@@ -213,7 +213,7 @@ GAZE = torch.tensor([4.0, 4.0])
         ({"image": torch.rand(2, 8, 8)}, "image: expected a picture of shape"),
         ({"levels": -1}, "levels: expected 0 or more, got -1"),
         ({"sigma": 0.0}, "sigma: expected a positive number, got 0.0"),
-        ({"sigma": -2}, "sigma: expected a positive number, got -2"),
+        ({"sigma": -0.1}, r"sigma: expected a positive number, got -0\.1$"),
         ({"sigma": math.nan}, "sigma: expected a positive number, got nan"),
         ({"sigma": torch.tensor([1.0, -1.0])}, "sigma: expected a positive number"),
         ({"sigma": torch.ones(3)}, "sigma: expected a number or shape"),
