@@ -36,10 +36,10 @@ _SIGNATURES = {
 # Parts of a mosaic's text that are handed to GDAL, those that are left out, and no others.
 _DATASET = "SRS", "GeoTransform", "OverviewList", "VRTRasterBand"
 _BAND = "ColorInterp", "NoDataValue", "HideNoDataValue", "ColorTable"
-_SOURCES = "SimpleSource", "ComplexSource", "AveragedSource", "KernelFilteredSource"
+_SOURCES = "SimpleSource", "ComplexSource", "AveragedSource"  # a filtered one without a kernel ends the process
 _SOURCE = (
     *("SourceFilename", "SourceBand", "SourceProperties", "SrcRect", "DstRect", "NODATA", "UseMaskBand", "LUT"),
-    *("ScaleOffset", "ScaleRatio", "ColorTableComponent", "Exponent", "SrcMin", "SrcMax", "DstMin", "DstMax", "Kernel"),
+    *("ScaleOffset", "ScaleRatio", "ColorTableComponent", "Exponent", "SrcMin", "SrcMax", "DstMin", "DstMax"),
 )
 _LEFT_OUT = (
     *("Metadata", "GCPList", "MaskBand", "BlockXSize", "BlockYSize"),

@@ -271,6 +271,7 @@ def test_reduced_copies_are_those_of_the_file(rasterio, private, address, place)
         (mosaic("a.png", band=' subClass="VRTRawRasterBand"'), "the kind 'VRTRawRasterBand'"),
         (mosaic("a.png", band=' SUBCLASS="VRTDerivedRasterBand"'), "the kind 'VRTDerivedRasterBand'"),
         (mosaic("a.png", kind="ArraySource"), "the kind 'ArraySource'"),
+        (mosaic("a.png", kind="KernelFilteredSource"), "the kind 'KernelFilteredSource'"),
         (mosaic("a.png", more="<GDALWarpOptions/>"), "the kind 'GDALWarpOptions'"),
         (mosaic("a.png", more="<vrtrasterband/>"), "the kind 'vrtrasterband'"),
         (mosaic("a.png", source="<OpenOptions/>"), "the kind 'OpenOptions'"),
