@@ -25,9 +25,9 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS
 from semfov.zoom.evidence import GlimpseEvidence
 
-FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence | GlimpseEvidence
+_FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence | GlimpseEvidence
 
-KINDS: dict[str, type[FolderModel]] = {
+KINDS: dict[str, type[_FolderModel]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
     "verification": Verification,
@@ -125,7 +125,7 @@ class ModelFolder:
         return eye
 
     @cached_property
-    def _models(self) -> dict[str, FolderModel]:
+    def _models(self) -> dict[str, _FolderModel]:
         """The models that the agent uses."""
         files = {part: self.file(part) for part in KINDS if self.used(part)}
         return {part: KINDS[part].from_pretrained(file) for part, file in files.items() if file is not None}

@@ -44,8 +44,7 @@ def recommended_arguments(
     eye = Eye(Foveation(sigma, growth=growth), detector)
     name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
     evidence = TargetEvidence.from_pretrained(name)
-    everything = MapEvidence.from_pretrained(name)
-    mapping = LearnedMap(everything), Policy("closer-look", fovea=sigma / eye.reference)
+    mapping = LearnedMap(MapEvidence.from_pretrained(name)), Policy("closer-look", fovea=sigma / eye.reference)
     verification = Verification.if_shipped(name)
     return {
         "eye": eye,

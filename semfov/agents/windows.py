@@ -30,7 +30,8 @@ from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
-from semfov.zoom.objects import merge, probable_objects, without_replaced
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge, probable_objects
 from semfov.zoom.slices import ranked, usual_slices
 
 LIKELY = 0.5  # default for the least probability of the objects that a record counts
@@ -92,8 +93,7 @@ class ZoomAgent(nn.Module):
         """
         check_options(options, ["finest", "cut", *loader_options()], "the agent or of semfov.load_detector")
         eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
-        evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
-        return cls(eye, evidence).eval().requires_grad_(False)
+        return cls(eye, GlimpseEvidence.from_pretrained(eye.detector.name)).eval().requires_grad_(False)
 
     def search(
         self,
@@ -454,7 +454,7 @@ class WindowEpisode(Episode[ZoomPath]):
         fading = self.forgetting is not None and self.forgetting.rate > 0
         closer = () if self._decisions is None else self._decisions.looks
         places = {look.number: place for place, look in enumerate(self._looks)}
-        current = without_replaced(glances, lattice) if fading else glances
+        current = _without_replaced(glances, lattice) if fading else glances
         sought, unseen = self.targets or self.target, None
         if self.certainty is None:
             objects = merge(current, sought)
@@ -487,3 +487,20 @@ class WindowEpisode(Episode[ZoomPath]):
     def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
         return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None
+
+
+def _without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
+    """The looks at a stream, without detections whose place and surroundings a later look has shown as closely."""
+    current = []
+    for number, glance in enumerate(glances):
+        detections, left = glance.detections, glance.detections.mask[0]
+        low, high = detections.boxes[0].split(2, -1)
+        around = (high - low) / 2
+        low, high = (low - around).clamp(min=0), (high + around).minimum(low.new_tensor(lattice.size))
+        for later in (each.window for each in glances[number + 1 :]):
+            if later.fixation[2] >= glance.window.fixation[2]:
+                first, last = low.new_tensor(later.region(lattice)).split(2)
+                left = left & ~((low >= first) & (high <= last)).all(-1)
+        remaining = Detections(detections.boxes[:, left], detections.scores[:, left], detections.mask[:, left])
+        current.append(replace(glance, detections=remaining, cut=glance.cut[left]))
+    return current

@@ -104,8 +104,7 @@ def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Siz
     """Apply a network with one output to its inputs, one tensor each, broadcast to `shape`."""
     # Each input is copied in one piece, and the matrix product reads the table transposed. To interleave the inputs
     # takes longer than the product.
-    table = torch.stack([each.expand(shape) for each in inputs]).flatten(1)
-    return network(table.mT).view(shape)
+    return network(torch.stack([each.expand(shape) for each in inputs]).flatten(1).mT).view(shape)
 
 
 def network(inputs: int, width: int, outputs: int = 1) -> nn.Sequential:

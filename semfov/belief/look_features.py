@@ -78,8 +78,7 @@ def nothing_seen(distance: Tensor) -> Tensor:
     """`look_features` `(..., 10)` for a look without detections from distances `(...)`."""
     none = torch.zeros_like(distance)
     least = _log(none)
-    features = [4 * distance, least, least, none, none, none, none, none, none, none + 1]
-    return torch.stack(features, -1)
+    return torch.stack([4 * distance, least, least, none, none, none, none, none, none, none + 1], -1)
 
 
 def _log(score: Tensor) -> Tensor:

@@ -28,8 +28,7 @@ def show(options: DetectorsOptions) -> int:
     """List the detectors, or the classes of one."""
     if options.name is not None:
         name = fspath(options.name)
-        folder = options.name.is_dir()
-        classes = Manifest.read(options.name).classes if folder else check_detector(name)
+        classes = Manifest.read(options.name).classes if options.name.is_dir() else check_detector(name)
         classes = load_detector(name).classes if classes is None else classes
         print(f"{name} knows {len(classes)} classes:")
         wide = max(map(len, classes)) + 2

@@ -75,8 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     options, positional, program = _options_of(name), _SUBCOMMANDS[name][0], f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
-        usage = HELP[name].partition("\nusage:")[0]
-        make_parser(options, usage, positional, program).print_help()
+        make_parser(options, HELP[name].partition("\nusage:")[0], positional, program).print_help()
         return 0
     dotted = ["detector.classes"] if name == "fit" else []
     words = partial(_in_command_words, options=[*dotted, *(field.name for field in fields(options))])

@@ -29,8 +29,7 @@ class Pictures(Scenes):
     @property
     def fingerprint(self) -> str:  # type: ignore[override]
         """sha256 of the names and contents of the files."""
-        what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]
-        return json_sha256(what)
+        return json_sha256([(name, self.digest(index)) for index, name in enumerate(self.ids)])
 
     def __getitem__(self, index: int) -> Scene:
         image = read_image(self._path(self.ids[index]))

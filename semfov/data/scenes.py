@@ -163,7 +163,15 @@ class EmbeddedScenes(ComposedScenes):
 
         generator = self._generator(index)
         items = _layout(generator)
-        canvas = _background(generator)
+        # Behind them are random clouds and a faint texture, in a random tint: integers, the same everywhere.
+        clouds = np.zeros(_SIZE[::-1], dtype=np.int64)
+        for octave in range(6):
+            grid = generator.integers(256, size=(3 << octave, 4 << octave), dtype=np.uint8)
+            smooth = Image.fromarray(grid).resize(_SIZE, Image.Resampling.BICUBIC)
+            clouds += (np.asarray(smooth, dtype=np.int64) - 128) << (5 - octave)
+        texture = _texture(_TEXTURES[generator.integers(len(_TEXTURES))])
+        tint = generator.integers(110, 180) + generator.integers(-20, 21, size=3)
+        canvas = (tint + (clouds // 150 + texture // 8)[..., None]).clip(0, 255).astype(np.uint8)
         for item in items:
             x1, y1, x2, y2 = item.patch
             photograph = Image.fromarray(_photograph(item.photograph.package, item.photograph.file))
@@ -190,21 +198,6 @@ def _layout(generator: np.random.Generator) -> list[_Item]:
         y = slot // columns * pitch[1] + int(generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True))
         items.append(_Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
     return items
-
-
-def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Random clouds and a faint texture, in a random tint, in integers, the same everywhere; → `(H, W, 3)`."""
-    from PIL import Image
-
-    clouds = np.zeros(_SIZE[::-1], dtype=np.int64)
-    for octave in range(6):
-        grid = generator.integers(256, size=(3 << octave, 4 << octave), dtype=np.uint8)
-        smooth = Image.fromarray(grid).resize(_SIZE, Image.Resampling.BICUBIC)
-        clouds += (np.asarray(smooth, dtype=np.int64) - 128) << (5 - octave)
-    texture = _texture(_TEXTURES[generator.integers(len(_TEXTURES))])
-    tint = generator.integers(110, 180) + generator.integers(-20, 21, size=3)
-    levels = tint + (clouds // 150 + texture // 8)[..., None]
-    return levels.clip(0, 255).astype(np.uint8)
 
 
 @cache

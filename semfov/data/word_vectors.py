@@ -59,9 +59,28 @@ class WordVectors:
             InputError: the file has none of the words.
         """
         words = sorted({word for name in names for word in _words_of(name)})
-        vectors: dict[str, Tensor] = {}
+        wanted, vectors = set(words), dict[str, Tensor]()
         with reading(path), Path(path).open(encoding="utf-8", errors="replace", newline="\n") as file:
-            _read(iter(lambda: file.readline(_LONGEST), ""), set(words), vectors, str(path))
+            size: int | None = None
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
+                word, _, rest = line.strip().partition(" ")
+                if number == 1 and word.isdigit() and rest.isdigit():
+                    size = int(rest)
+                    continue
+                key = word.lower()
+                # A word in lower case takes precedence; in upper case it may be a proper name.
+                if key not in wanted or (key in vectors and word != key):
+                    continue
+                try:
+                    values = [float(value) for value in rest.split()]
+                except ValueError:
+                    values = []
+                size = len(values) if size is None else size
+                if not values or len(values) != size or not all(map(math.isfinite, values)):
+                    raise DataError(
+                        f"{path}, line {number}: expected a word and {size or 'some'} numbers, got {line[:60]!r}"
+                    )
+                vectors[key] = torch.tensor(values)
         some = f"a file with vectors of some of the words {', '.join(words)}"
         check(bool(vectors), "embeddings", some, f"{path}, which has none of them")
         return cls(vectors, [word for word in words if word not in vectors], sha256(Path(path)))
@@ -161,25 +180,3 @@ def spread(
     weights = ((near - near[has_words].max()) / temperature).exp().nan_to_num(0)
     order = weights.argsort(descending=True, stable=True).tolist()
     return {classes[k]: float(weights[k]) for k in order if weights[k] >= least}
-
-
-def _read(lines: Iterable[str], words: set[str], vectors: dict[str, Tensor], path: str) -> None:
-    """Add the vectors of some words, read from the lines of a file, to `vectors`."""
-    size: int | None = None
-    for number, line in enumerate(lines, 1):
-        word, _, rest = line.strip().partition(" ")
-        if number == 1 and word.isdigit() and rest.isdigit():
-            size = int(rest)
-            continue
-        key = word.lower()
-        # A word in lower case takes precedence; in upper case it may be a proper name.
-        if key not in words or (key in vectors and word != key):
-            continue
-        try:
-            values = [float(value) for value in rest.split()]
-        except ValueError:
-            values = []
-        size = len(values) if size is None else size
-        if not values or len(values) != size or not all(map(math.isfinite, values)):
-            raise DataError(f"{path}, line {number}: expected a word and {size or 'some'} numbers, got {line[:60]!r}")
-        vectors[key] = torch.tensor(values)

@@ -226,21 +226,18 @@ class _OnnxTwin:
     ) -> tuple[Candidates, dict[str, Tensor]]:
         """All boxes on a canvas `(B, 3, H, W)`, and maps of layers by name, in float32, without gradients."""
         network.check_image(canvas)
-        outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
-        candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
-        return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
-
-    def _session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
-        key = (os.getpid(), torch.get_num_threads())
-        if layers not in self._opened or self._opened[layers][0] != key:
+        needed, key = tuple(sorted(set(layers.values()))), (os.getpid(), torch.get_num_threads())
+        if needed not in self._opened or self._opened[needed][0] != key:
             try:
                 folder = cache_folder() / "exported"
-                session = OnnxSession(_exported(network, self.digest, folder, layers), open_ended=False)
+                session = OnnxSession(_exported(network, self.digest, folder, needed), open_ended=False)
             except DataError:  # the cache cannot be written to
                 with tempfile.TemporaryDirectory() as own:
-                    session = OnnxSession(_exported(network, self.digest, Path(own), layers), open_ended=False)
-            self._opened[layers] = key, session
-        return self._opened[layers][1]
+                    session = OnnxSession(_exported(network, self.digest, Path(own), needed), open_ended=False)
+            self._opened[needed] = key, session
+        outputs = self._opened[needed][1](canvas.float())
+        candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+        return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
 
 
 def _network_digest(network: Darknet) -> str:

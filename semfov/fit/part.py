@@ -13,7 +13,8 @@ from semfov.belief.observers import Semantic
 from semfov.fit.settings import FitConfig, FitDetectorConfig
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
-from semfov.model_folder import KINDS, FolderModel
+from semfov.io.pretrained import Pretrained
+from semfov.model_folder import KINDS
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looking import Looking
@@ -64,7 +65,7 @@ class PartInputs:
         names = {each.name for each in fields(self.config)} & {each.name for each in fields(kind)}
         return kind(**{name: getattr(self.config, name) for name in names} | own)
 
-    def model(self, name: str) -> FolderModel | None:
+    def model(self, name: str) -> Pretrained | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
         part = self.results[name].part
         return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
@@ -111,7 +112,7 @@ class PartFit(ABC):
     def fit(self) -> PartResult:
         """Fit the part."""
 
-    def write(self, name: str, model: FolderModel, used: bool, why: str) -> Part:
+    def write(self, name: str, model: Pretrained, used: bool, why: str) -> Part:
         """Write the model of a part and return its entry in the manifest."""
         file = f"{name}.safetensors"
         model.save(self.config.out / file)

@@ -151,8 +151,7 @@ def _fit_closer(
     if closer is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
     chosen = [fit(closer, closer.fold != fold, prior) for fold in range(_FOLDS)]
-    limits = Thresholds(1.0, config.worth, config.worth)
-    decisions = list(verify(searches, chosen, limits, None))
+    decisions = list(verify(searches, chosen, Thresholds(1.0, config.worth, config.worth), None))
     confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
     fitted = fit(closer, closer.fold >= 0, prior)
     fitted.thresholds = Thresholds(confirm, config.worth, config.worth)

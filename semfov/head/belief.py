@@ -83,8 +83,7 @@ class SceneObserver(Observer):
         pose = int((float(fixation[0, 1]) + 0.5) // high)
         point = fixation - fixation.new_tensor([0, pose * high])
         inner = self.inner.weigh(detections, point, self.views.view_grid, target)
-        action = self.views.grid.cell_of(fixation)
-        return _SceneLook(pose, inner, self.views.gaze_cell[action])
+        return _SceneLook(pose, inner, self.views.gaze_cell[self.views.grid.cell_of(fixation)])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         belief, look = own(belief, SceneBelief, "belief"), own(look, _SceneLook, "look")

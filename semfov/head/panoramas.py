@@ -71,8 +71,7 @@ class Panoramas(ComposedScenes):
         super().__init__(scenes.classes, count, seed)
         self.scenes, self.rings, self.slot, self.fill = scenes, rings, slot, fill
         self.size = width, width // 2
-        what = [_VERSION, scenes.fingerprint, rings, slot, width, count, seed, fill]
-        self.fingerprint = json_sha256(what)
+        self.fingerprint = json_sha256([_VERSION, scenes.fingerprint, rings, slot, width, count, seed, fill])
 
     def patches(self, index: int) -> list[_Patch]:
         """The photographs of a panorama, ring by ring.

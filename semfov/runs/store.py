@@ -67,8 +67,7 @@ class DetectionStore(SceneStore):
             "boxes": Field(("M", 4)),
             "scores": Field(("M", "C" if components is None else components), low=0, high=1),
         }
-        code = modules_digest(*sources, __name__)
-        super().__init__(folder, what, code, Schema(fields | {**self.more}))
+        super().__init__(folder, what, modules_digest(*sources, __name__), Schema(fields | {**self.more}))
 
     def load(self, digest: str) -> dict[Any, Any]:
         tensors = self.read(digest)

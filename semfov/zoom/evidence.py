@@ -155,8 +155,7 @@ class PhotographEvidence(nn.Module):
 
     def presence(self, best: Tensor, target: Tensor) -> Tensor:
         """Log odds that the photograph holds classes 1..K, by their highest scores; shapes `(...)`."""
-        facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
-        return self.whole(facts)[..., 0]
+        return self.whole(torch.stack([best.logit(1e-4), self.usual[target - 1]], -1))[..., 0]
 
 
 _SUMMARY = 3

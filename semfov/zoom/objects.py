@@ -27,23 +27,6 @@ _SMALLEST = 6.0  # side in canvas pixels from which on a look should show an obj
 _EDGE = 2.0  # canvas pixels from the border of a window within which it may cut an object
 
 
-def without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
-    """The looks at a stream, without detections whose place and surroundings a later look has shown as closely."""
-    current = []
-    for number, glance in enumerate(glances):
-        detections, left = glance.detections, glance.detections.mask[0]
-        low, high = detections.boxes[0].split(2, -1)
-        around = (high - low) / 2
-        low, high = (low - around).clamp(min=0), (high + around).minimum(low.new_tensor(lattice.size))
-        for later in (each.window for each in glances[number + 1 :]):
-            if later.fixation[2] >= glance.window.fixation[2]:
-                first, last = low.new_tensor(later.region(lattice)).split(2)
-                left = left & ~((low >= first) & (high <= last)).all(-1)
-        remaining = Detections(detections.boxes[:, left], detections.scores[:, left], detections.mask[:, left])
-        current.append(replace(glance, detections=remaining, cut=glance.cut[left]))
-    return current
-
-
 def merge(
     glances: Sequence[Glance],
     target: int | Sequence[int] | None = None,

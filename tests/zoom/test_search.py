@@ -10,10 +10,10 @@ from torchvision.transforms.functional import to_pil_image
 
 from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import OpenedPicture
+from semfov.agents.windows import _without_replaced
 from semfov.data.large import open_large
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.glances import Glance, LiveGlances, Window
-from semfov.zoom.objects import without_replaced
 from tests.refusals import refused
 from tests.zoom.test_closer import Fickle, evidence
 
@@ -311,7 +311,7 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
         boxes = torch.cat([low, low + 40], -1)[None]
         detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
         glances.append(Glance(Window.on(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
-    kept = without_replaced(glances, lattice)
+    kept = _without_replaced(glances, lattice)
     for number, (glance, left) in enumerate(zip(glances, kept, strict=True)):
         expected = []
         for place, (x1, y1, x2, y2) in enumerate(glance.detections.boxes[0].tolist()):

@@ -81,8 +81,7 @@ class Letterbox:
         Returns:
             `(x1, y1, x2, y2)`, edges of picture pixels.
         """
-        corners = (np.array(box).reshape(2, 2) - self.offset) / self.scale
-        return _box(corners)
+        return _box((np.array(box).reshape(2, 2) - self.offset) / self.scale)
 
     def box_to_screen(self, box: tuple[float, ...]) -> tuple[float, float, float, float]:
         """Convert a box from the picture to the screen.

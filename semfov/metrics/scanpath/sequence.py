@@ -60,8 +60,7 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
     >>> bool(labels[0] == labels[1])
     False
     """
-    clusters = fitted_clusters(others, bandwidth)
-    return np.asarray(clusters.predict(as_path(points, "points")), dtype=np.int64)
+    return np.asarray(fitted_clusters(others, bandwidth).predict(as_path(points, "points")), dtype=np.int64)
 
 
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
