@@ -95,7 +95,23 @@ class _GazeJob:
         image = OpenedPicture.of(source.opened("auto")).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
         prediction = GazePrediction.of(self.detector, image, model=self.model, source=file)
-        outcome = _outcome(prediction, self.options, source.name)
+        paths = prediction.scanpaths(self.options.people, seconds=self.options.seconds, seed=self.options.seed)
+        places = "; ".join(
+            f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
+            for number, peak in enumerate(prediction.peaks(), 1)
+        )
+        terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
+        mean = sum(map(len, paths)) / len(paths)
+        text = (
+            f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
+            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
+        )
+        width, height = prediction.size
+        if self.options.model is None and width <= height:
+            text += "\n  the model was fitted to pictures that are wider than high, and may be wrong here"
+        viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
+        part = None if self.options.report is None else gaze_part(prediction, paths)
+        outcome: _Outcome = {"text": text, "size": prediction.size, "viewers": viewers, "part": part}
         if out is not None and self.kind != ".csv":
             name = f"{plain_name(Path(prediction.name).stem)}.png"
             name = f"{number:03d}-{name}" if self.several else name
@@ -127,24 +143,3 @@ class _GazeJob:
                 part["picture"]["name"] = names[number]
             written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
-
-
-def _outcome(prediction: GazePrediction, options: GazeOptions, name: str) -> _Outcome:
-    """Draw viewers, and say what was predicted."""
-    paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-    places = "; ".join(
-        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
-        for number, peak in enumerate(prediction.peaks(), 1)
-    )
-    terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
-    mean = sum(map(len, paths)) / len(paths)
-    text = (
-        f"{name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
-        f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
-    )
-    width, height = prediction.size
-    if options.model is None and width <= height:
-        text += "\n  the model was fitted to pictures that are wider than high, and may be wrong here"
-    viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
-    part = None if options.report is None else gaze_part(prediction, paths)
-    return {"text": text, "size": prediction.size, "viewers": viewers, "part": part}

@@ -115,8 +115,16 @@ class _PictureJob(ABC):
         source, began = self.sources[number], time.perf_counter()
         try:
             with torch.inference_mode():
-                picture = source.opened(self.options.how)
-                record = self.look(picture, self._shared(picture, source), source)
+                options: PictureOptions = self.options
+                picture = source.opened(options.how)
+                how: How = "auto" if isinstance(picture, World) else options.how
+                shared: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
+                shared |= {"shifts": options.shifts, "duration": options.duration}
+                if not self.several and not options.quiet and sys.stderr.isatty():
+                    title = Path(source.name).name
+                    bar = tqdm(desc=title, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
+                    shared["on_look"] = lambda record: bar.update(record.passes - bar.n)
+                record = self.look(picture, shared, source)
                 seconds = time.perf_counter() - began
                 return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
         except SemfovError as error:
@@ -127,17 +135,6 @@ class _PictureJob(ABC):
             # One picture of many, whatever is wrong with it, is not the end of the command.
             reason = " ".join(str(error).split()) or "no message"
             return DataError(f"{source.name}: cannot be looked at ({type(error).__name__}: {reason})")
-
-    def _shared(self, picture: PictureLike, source: PictureSource) -> dict[str, Any]:
-        """Arguments that all subcommands share, and a bar for the passes in a single picture."""
-        options: PictureOptions = self.options
-        how: How = "auto" if isinstance(picture, World) else options.how
-        arguments: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
-        arguments |= {"shifts": options.shifts, "duration": options.duration}
-        if not self.several and not options.quiet and sys.stderr.isatty():
-            bar = tqdm(desc=Path(source.name).name, unit="pass", total=options.passes, leave=False, dynamic_ncols=True)
-            arguments["on_look"] = lambda record: bar.update(record.passes - bar.n)
-        return arguments
 
 
 def _make_again(kind: type[_PictureJob], options: PictureOptions) -> _PictureJob:

@@ -225,7 +225,26 @@ class Outcome(ABC):
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
         candidates = self.candidates.of(self._sought)
-        objects, sure = _confirm(candidates, self._confirmed_places, self._counts(candidates))
+        boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
+        counts, sure = self._counts(candidates), torch.zeros(len(candidates), dtype=torch.bool)
+        for place, label, chance, look in self._confirmed_places:
+            box, probability = place[None].to(boxes), scores.new_tensor([chance])
+            overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
+            same = overlap.argmax()[None] if len(overlap) else overlap.long()
+            if not bool((overlap[same] >= SAME).any()):
+                same = torch.tensor([len(boxes)])
+                boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
+                labels = torch.cat([labels, labels.new_tensor([label])])
+                looks = torch.cat([looks, looks.new_tensor([look])])
+                sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
+            boxes, scores = (
+                boxes.index_copy(0, same, box),
+                scores.index_copy(0, same, probability.maximum(scores[same])),
+            )
+            sure[same] = True
+        order = scores.argsort(descending=True, stable=True)
+        order = order[(counts | sure)[order]]
+        objects, sure = Objects(boxes, scores, labels, looks)[order], sure[order]
         if self.decision is not None and self.decision.outcome != "found":
             # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
             objects = objects[~sure | (objects.scores >= self.least)]
@@ -295,26 +314,3 @@ class Outcome(ABC):
         """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""
         place = self.best_place_in_words().capitalize()
         return " ".join(filter(None, (f"{self.describe()}.", self.why_it_ended(), place and f"{place}.")))
-
-
-def _confirm(
-    candidates: Objects, places: Sequence[tuple[Tensor, int, float, int]], counts: Tensor
-) -> tuple[Objects, Tensor]:
-    """The candidates that count `(N,)`, and those that were confirmed; and which of all these were, `(M,)`."""
-    boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
-    sure = torch.zeros(len(candidates), dtype=torch.bool)
-    for place, label, chance, look in places:
-        box, probability = place[None].to(boxes), scores.new_tensor([chance])
-        overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
-        same = overlap.argmax()[None] if len(overlap) else overlap.long()
-        if not bool((overlap[same] >= SAME).any()):
-            same = torch.tensor([len(boxes)])
-            boxes, scores = torch.cat([boxes, box]), torch.cat([scores, probability])
-            labels = torch.cat([labels, labels.new_tensor([label])])
-            looks = torch.cat([looks, looks.new_tensor([look])])
-            sure, counts = (torch.cat([each, torch.tensor([False])]) for each in (sure, counts))
-        boxes, scores = boxes.index_copy(0, same, box), scores.index_copy(0, same, probability.maximum(scores[same]))
-        sure[same] = True
-    order = scores.argsort(descending=True, stable=True)
-    order = order[(counts | sure)[order]]
-    return Objects(boxes, scores, labels, looks)[order], sure[order]
