@@ -164,7 +164,7 @@ def plot_scanpath(
         rest = "not confirmed: " if count or scanpath.decision is not None else ""
         entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
     if objects and (lower := int(scanpath.listed_by_score.sum())):
-        entries.append((TARGET, "--", f"by score alone ({lower})"))
+        entries.append((TARGET, "--", f"of them by score alone ({lower})"))
     best = scanpath.best_place
     if objects and best is not None:
         entries.append((FOUND, "--", "best place, not sure enough"))

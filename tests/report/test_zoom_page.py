@@ -116,7 +116,7 @@ def test_an_object_that_counts_by_its_score_in_the_whole_picture_is_told_from_th
     (axes,) = path.plot(image=large_picture).axes
     dashed = [patch.get_bbox().extents.tolist() for patch in axes.patches if patch.get_linestyle() == "--"]
     assert dashed == [window[1].tolist()]
-    assert "by score alone (1)" in [text.get_text() for text in axes.get_legend().get_texts()]
+    assert "of them by score alone (1)" in [text.get_text() for text in axes.get_legend().get_texts()]
 
 
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
