@@ -240,10 +240,12 @@ class ZoomPath(Record):
         return "the expected number of new objects in it, with a share of those that closer looks would then show"
 
     def sensor_in_words(self) -> str:
-        """Describe the windows of the lattice."""
+        """Describe the windows of the lattice and of the closer looks."""
         wide, high = self.lattice.canvas
-        magnifications = ", ".join(f"{m:.2g}" for m in self.lattice.magnifications)
-        several = "s" if self.lattice.levels > 1 else ""
+        looked = {*self.lattice.magnifications, *(glance.window.fixation[2] for glance in self.glances)}
+        told = list(dict.fromkeys(f"{magnification:.2g}" for magnification in sorted(looked)))
+        magnifications = ", ".join(told) if len(told) <= 6 else f"from {told[0]} to {told[-1]}"
+        several = "s" if len(told) > 1 else ""
         return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
     def _lines(self) -> list[str]:

@@ -136,6 +136,10 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     assert "It is a closer look: the target is there with a probability of 0.88." in data["looks"][2]["status"]
     texts = " ".join(Elements(page_html("field", [data])).texts)
     assert texts.count("Closer look probability 0.88 that the target is there") == 1
+    last = path.glances[2]
+    near = [replace(last, window=replace(last.window, fixation=(0, 0, 1.5 + more))) for more in range(4)]
+    for glances, told in ((near[:1], "magnifications 0.25, 0.5, 1, 1.5"), (near, "magnifications from 0.25 to 4.5")):
+        assert replace(path, glances=(*path.glances[:2], *glances)).sensor_in_words().endswith(told)
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
