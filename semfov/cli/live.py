@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from shlex import quote
 from time import perf_counter
 
 from semfov.agents.fovea import cell_at
@@ -54,7 +55,11 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
         return several_classes(options.find, classes)
     if options.target is None or classes is None:
         return options.target
-    return classes[class_index(options.target, classes, "target") - 1]
+    try:
+        return classes[class_index(options.target, classes, "target") - 1]
+    except InputError as error:
+        several = f"; a search is for one class, and --find {quote(options.target)} takes several"
+        raise InputError(f"{error}{several * (',' in options.target)}") from None
 
 
 def _watch(live: LivePerception, stream: Stream, path: Path | None) -> Path | None:

@@ -36,6 +36,8 @@ REFUSED = {
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
     "find --device meta": "device: expected one that PyTorch has here (cpu",
     "live": "source: expected a video, an address or --camera 0, got none",
+    "live a.mp4 --target cup,fork": "; a search is for one class, and --find cup,fork takes several",
+    "live a.mp4 --target qqq": "`semfov detectors NAME` lists them",
     "live nosuch.mp4": "source: nosuch.mp4: no such file; check the path",
     "live a.mp4 --camera 0": "camera: expected a video or a camera, not both, got 0",
     "live a.mp4 --out a.json": "out: expected a folder, or a file that ends in .mp4 or .avi, got a.json",
