@@ -190,11 +190,12 @@ def _looks_html(data: Data, place: str, *, headed: bool = True) -> str:
         f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {what.title()}s</label> '
         f'<label><input type="checkbox" class="names-shown"{names}> Names</label></span>'
     )
-    entries = [("objects", "object that was found")]
-    if data["confirmable"]:
-        entries.append(("sure", "confirmed by the decision or a closer look"))
+    sure = [each["confirmed"] for each in data["objects"]]
+    entries = [("objects", "object that was found")] if not all(sure) else []
+    entries += [("sure", "confirmed by the decision or a closer look")] if any(sure) else []
     entries += [("best", "best place, not sure enough")] if data["best"] else []
-    entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
+    if not all(look["whole"] for look in data["looks"]):
+        entries += [("windows", f"{what} of a look, numbered in their order"), ("now", "the chosen look")]
     entries += [("truth", "true box")] if data["truth"] else []
     legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in entries)
     return (

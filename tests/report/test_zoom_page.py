@@ -215,7 +215,11 @@ def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_p
     data = zoom_data(path, large_picture, name="field.png")
     assert f" {place.capitalize()}." in data["decision"]
     assert data["best"] == path.best_place[0].tolist()
-    assert len(Elements(page_html("t", [data])).of("best")) == 1
+    page = page_html("t", [data])
+    assert len(Elements(page).of("best")) == 1
+    nothing = page_html("t", [data | {"objects": [], "count": 0, "looks": data["looks"][:1]}])
+    entries = [re.findall(r'<i class="of-(\w+)">', text) for text in (page, nothing)]
+    assert entries == [["objects", "best", "windows", "now"], ["best"]]
     (dashed,) = re.findall(r"<rect [^>]*stroke-dasharray[^>]*><title>([^<]*)</title>", path._repr_html_())
     assert dashed == f"best place {path.best_place[1]:.2f}"
     assert "dash" not in zoom_path._repr_html_()
