@@ -54,9 +54,9 @@ class Outcome(ABC):
         "stopped": "It was stopped.",
         "found": "The target is probable enough, and was looked at closely enough.",
         "absent": "No remaining cell is worth a look, and the target is probably absent.",
-        "undecided": "No remaining cell is worth a look, but the target is probably there.",
+        "undecided": "No remaining cell is worth a look, but the target is too probable to call it absent.",
         "closer found": "A closer look confirmed the target.",
-        "closer undecided": "No closer look was sure enough, but the target is probably there.",
+        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
     }
     """Why it ended, by the ending, or by the outcome of the decision that ended the search."""
 

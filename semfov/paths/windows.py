@@ -104,12 +104,12 @@ class ZoomPath(Record):
         "detection": "A detection shows the target.",
         "found": "The probability is high enough, and a detection shows the target.",
         "absent": "No remaining look is worth a pass, and the target is probably absent.",
-        "undecided": "No remaining look is worth a pass, but the target is probably there.",
+        "undecided": "No remaining look is worth a pass, but the target is too probable to call it absent.",
         "unseen": "No look shows a candidate: the probability follows from the class's frequency and low score.",
         "first found": "The first look shows the target closely enough.",
         "closer found": "A closer look confirmed the target.",
         "closer absent": "No closer look was sure enough, and the target is probably absent.",
-        "closer undecided": "No closer look was sure enough, but the target is probably there.",
+        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
     }
     # `unseen` is for a photograph in which no look shows a place that may hold the target.
 

@@ -194,9 +194,9 @@ def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     first = dataclasses.replace(path, closer=(whole,))
     assert first.why_it_ended() == "The first look shows the target closely enough."
     doubt = dataclasses.replace(first, decision=Decision("undecided", 0.5))
-    assert doubt.why_it_ended() == "No remaining look is worth a pass, but the target is probably there."
+    assert doubt.why_it_ended().endswith(" is worth a pass, but the target is too probable to call it absent.")
     both = dataclasses.replace(doubt, closer=(whole, *path.closer))
-    assert both.why_it_ended() == "No closer look was sure enough, but the target is probably there."
+    assert both.why_it_ended() == "No closer look was sure enough, but the target is too probable to call it absent."
 
 
 @pytest.mark.parametrize("make", RECORDS)
