@@ -43,14 +43,15 @@ from train.fit_fom import main as fit
 
 Main = Callable[[Sequence[str]], int]
 
+_ALONE = ("--workers", "1")
 _SMALL = [
-    "--workers", "1", "--data.limit", "2", "--belief.columns", "3", "--belief.rows", "2",
+    "--data.limit", "2", "--belief.columns", "3", "--belief.rows", "2",
     "--protocol.starts", "2", "--protocol.shifts", "4",
 ]  # fmt: skip
 _SEARCH = [*_SMALL, "--scanpaths", "0", "--policies", '["random", "non-predictive-raw"]']
 _EXPLORE = [*_SMALL, "--policies", '["random-raw", "kl-calibrated"]']
 _FIT = [
-    "--workers", "1", "--data.limit", "4", "--fixations", "1", "--holdout", "3", "--shard", "1", "--method", "newton",
+    *_ALONE, "--data.limit", "4", "--fixations", "1", "--holdout", "3", "--shard", "1", "--method", "newton",
 ]  # fmt: skip
 
 
@@ -98,11 +99,11 @@ class Command:
 HEAD = ("run", "s", "kills", "finished files", "unfinished files", "processes left", "same bits after restart")
 _RECORDS = ("episodes.jsonl", "summary.csv")
 COMMANDS = (
-    Command("store", search, tuple(_SEARCH), (*_RECORDS, "cumulative_performance.png")),
-    Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
+    Command("store", search, (*_ALONE, *_SEARCH), (*_RECORDS, "cumulative_performance.png")),
+    Command("evaluation", explore, (*_ALONE, *_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
     Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
     Command("workers", search, (*_SEARCH, "--workers", "2"), _RECORDS),
-    Command("reports", explore, tuple(_EXPLORE), (*_RECORDS, "report.html"), stored=True, finished=True),
+    Command("reports", explore, (*_ALONE, *_EXPLORE), (*_RECORDS, "report.html"), stored=True, finished=True),
 )
 
 
