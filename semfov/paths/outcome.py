@@ -305,10 +305,8 @@ class Outcome(ABC):
 
     def best_place_in_words(self) -> str:
         """Name the most likely place of the target of an undecided search; empty for others and without one."""
-        if self.best_place is None:
-            return ""
-        (box, best), of = self.best_place, "probability" if self.closer else self.measure
-        return f"best place: box {box_text(box.tolist())}, {of} {best:.2f}"
+        place, of = self.best_place, "probability" if self.closer else self.measure
+        return "" if place is None else f"best place: box {box_text(place[0].tolist())}, {of} {place[1]:.2f}"
 
     def summary(self) -> str:
         """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""

@@ -31,7 +31,7 @@ _SMALLEST = 1e-4
 
 
 def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Window:
-    """The window around a box `(4,)`, three times its longer side; in a `photograph` of a size of its own."""
+    """The window around a box `(4,)`, three times its longer side; in a photograph `window` says its size."""
     least, context = window
     if lattice.levels > 1:
         context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)

@@ -55,6 +55,15 @@ def examples(run):
     return _make_examples(run, FitSearchConfig(classes=2, max_target_area=0.5))
 
 
+def classes_in(annotation, cell):
+    left, top = cell % 4 * 160, cell // 4 * 120
+    return {
+        label
+        for (x, y, z, w), label in zip(annotation.boxes.tolist(), annotation.labels.tolist(), strict=True)
+        if x < left + 160 and z > left and y < top + 120 and w > top
+    }
+
+
 def test_examples_match_looks_from_every_cell(run, examples):
     assert len(examples) == len(examples.goal) > 10
     kinds = set()
@@ -67,12 +76,7 @@ def test_examples_match_looks_from_every_cell(run, examples):
         for cell in range(CELLS):
             shown = [float(seen.scores[cell, d, target]) for d in range(5) if seen.mask[cell, d]]
             assert float(examples.score[row, cell]) == pytest.approx(max(shown, default=0.0))
-            left, top = cell % 4 * 160, cell // 4 * 120
-            there = any(
-                x < left + 160 and z > left and y < top + 120 and w > top
-                for (x, y, z, w), label in zip(annotation.boxes.tolist(), annotation.labels.tolist(), strict=True)
-                if label == target
-            )
+            there = target in classes_in(annotation, cell)
             assert bool(examples.goal[row, cell]) == there
             for other in range(CELLS):
                 offset = math.dist(GRID.centres[cell].tolist(), GRID.centres[other].tolist())
@@ -316,15 +320,6 @@ def looked():
 @pytest.fixture(scope="module")
 def map_examples(looked):
     return _make_map_examples(looked, FitMapConfig(classes=6, others=2))
-
-
-def classes_in(annotation, cell):
-    left, top = cell % 4 * 160, cell // 4 * 120
-    return {
-        label
-        for (x, y, z, w), label in zip(annotation.boxes.tolist(), annotation.labels.tolist(), strict=True)
-        if x < left + 160 and z > left and y < top + 120 and w > top
-    }
 
 
 def test_examples_of_the_map_match_looks_from_every_cell(looked, map_examples):
