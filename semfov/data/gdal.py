@@ -1,131 +1,82 @@
-"""Opening of rasters by GDAL with the drivers that their names tell, and of mosaics whose files lie beside them.
+"""Opening of rasters by the GDAL driver of their kind, which reads the file itself and nothing beside it.
 
-GDAL chooses a driver by the content of a file, and some of its drivers send requests or read other files.
+GDAL would choose a driver by the content of a file, and some of its drivers send requests or read other files.
 """
 
-import io
+import math
 import re
 from os import PathLike
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as XML
 
+import numpy as np
+
+from semfov.data.images import check_proportion
 from semfov.errors import DataError, check_data
-from semfov.io.files import inside, read_bytes, reading
-
-_DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG", ".vrt": "VRT"}
+from semfov.io.files import reading
 
 MOST_SIDE = 2**20  # longest side in pixels of a picture that is read by windows
+_MOST_BLOCK = 2**28  # bytes of a tile or a strip, which GDAL decodes as a whole
+_MOST_BANDS = 2**12
 _BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a twentieth of the machine's memory
-# Files beside a raster (.ovr, .aux.xml) may be rasters of any driver themselves, or name others. Threads of a mosaic
-# would not know of that setting.
-_SETTINGS = {"GDAL_CACHEMAX": _BLOCKS, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "VRT_NUM_THREADS": "1"}
-
-_MOST_BYTES = 2**26  # of the text of a mosaic
-_SYSTEM = re.compile(r"(EPSG:\d+|[A-Z_]+\[.*)", re.DOTALL)  # others may be files and addresses
+# Files beside a raster (.ovr, .aux.xml, .msk) may be rasters of any driver themselves, or name others.
+_SETTINGS = {"GDAL_CACHEMAX": _BLOCKS, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+_PATH = re.compile(r"""["=@,]\s*(/|~|\.{1,2}[/\\]|[A-Za-z]+:[/\\])""")
 _SIGNATURES = {
-    b"II*\0": ".tif",
-    b"MM\0*": ".tif",
-    b"II+\0": ".tif",
-    b"MM\0+": ".tif",
-    b"\0\0\0\x0cjP  ": ".jp2",
-    b"\xff\x4f\xff\x51": ".jp2",
-    b"\x89PNG": ".png",
-    b"\xff\xd8\xff": ".jpg",
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"\0\0\0\x0cjP  ": "JP2OpenJPEG",
+    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8\xff": "JPEG",
 }
-# Parts of a mosaic's text that are handed to GDAL, those that are left out, and no others.
-_DATASET = "SRS", "GeoTransform", "OverviewList", "VRTRasterBand"
-_BAND = "ColorInterp", "NoDataValue", "HideNoDataValue", "ColorTable"
-_SOURCES = "SimpleSource", "ComplexSource", "AveragedSource"  # a filtered one without a kernel ends the process
-_SOURCE = (
-    *("SourceFilename", "SourceBand", "SourceProperties", "SrcRect", "DstRect", "NODATA", "UseMaskBand", "LUT"),
-    *("ScaleOffset", "ScaleRatio", "ColorTableComponent", "Exponent", "SrcMin", "SrcMax", "DstMin", "DstMax"),
-)
-_LEFT_OUT = (
-    *("Metadata", "GCPList", "MaskBand", "BlockXSize", "BlockYSize"),
-    *("Description", "UnitType", "Offset", "Scale", "CategoryNames", "Histograms"),
-)
 
 
 def raster_settings() -> Any:
-    """GDAL's settings for rasters of others, a context in which `open_raster` is called and windows are read."""
+    """GDAL's settings for rasters of others, a context in which rasters are opened and windows are read."""
     import rasterio
 
     return rasterio.Env(**_SETTINGS)
 
 
-def open_raster(path: str | PathLike[str]) -> Any:
-    """A raster opened by the driver of its name, inside `raster_settings`; raises `DataError` for what is refused."""
+def driver_of(path: Path) -> str | None:
+    """The only driver that may read a file, by the first bytes of it; None for other files than pictures."""
+    with reading(path), path.open("rb") as opened:
+        head = opened.read(8)
+    return next((driver for start, driver in _SIGNATURES.items() if head.startswith(start)), None)
+
+
+def open_file(path: str | PathLike[str], driver: str) -> Any:
+    """A raster opened by one driver, inside `raster_settings`; raises `DataError` for what is refused."""
     import rasterio
 
     path = Path(path)
-    path.stat()  # GDAL has many messages for a file that is not there
-    driver = _DRIVERS[path.suffix.lower()]
-    source = io.BytesIO(_mosaic_text(path)) if driver == "VRT" else path.absolute()
-    file = _without_others(rasterio.open(source, driver=driver), path)
-    if max(file.width, file.height) > MOST_SIDE:
-        got = f"{file.width} × {file.height}"
-        file.close()
-        raise DataError(f"{path}: expected at most {MOST_SIDE:,} pixels along a side, got {got}; divide it")
-    return file
-
-
-def _mosaic_text(path: Path) -> bytes:
-    """GDAL's text of a mosaic, made anew of what is known in it; its sources are pictures in its folder or below."""
+    held = path.stat().st_size  # GDAL has many messages for a file that is not there
+    file = rasterio.open(path.absolute(), driver=driver)
     try:
-        root = XML.fromstring(read_bytes(path, most=_MOST_BYTES))
-    except (XML.ParseError, ValueError, LookupError, RecursionError) as error:
-        raise DataError(f"{path}: expected the XML text of a mosaic, got none that can be read ({error})") from None
-    check_data(root.tag == "VRTDataset", path, "a mosaic, a VRTDataset", repr(root.tag[:40]))
-    checked: dict[str, str] = {}
-    for part in _kept(root, _DATASET, path):
-        system = part.tag != "SRS" or _SYSTEM.fullmatch((part.text or "").strip())
-        check_data(bool(system), path, "a reference system as EPSG:number or as WKT", f"{part.text!r:.80}")
-        for source in _kept(part, (*_BAND, *_SOURCES), path) if part.tag == "VRTRasterBand" else ():
-            for name in _kept(source, _SOURCE, path) if source.tag in _SOURCES else ():
-                if name.tag == "SourceFilename":
-                    text, relative = name.text or "", name.attrib.get("relativeToVRT") == "1"
-                    if (given := f"{relative} {text}") not in checked:
-                        checked[given] = _source(path, text if relative else str(Path(text).absolute()))
-                    name.text, name.attrib, name[:] = checked[given], {"relativeToVRT": "0"}, []
-    return XML.tostring(root)
-
-
-def _kept(element: XML.Element, known: tuple[str, ...], path: Path) -> list[XML.Element]:
-    """The known parts of an element, from which those that are not needed are taken; others are refused."""
-    kind = next((value for name, value in element.attrib.items() if name.lower() == "subclass"), element.tag)
-    plain, files = kind in (element.tag, "VRTSourcedRasterBand"), "a mosaic of files"
-    check_data(plain, path, files, f"a part of the kind {kind!r:.60}")
-    for part in [*element]:
-        if part.tag in _LEFT_OUT:
-            element.remove(part)
-        else:
-            check_data(part.tag in known, path, files, f"a part of the kind {part.tag!r:.60}")
-    return [*element]
-
-
-def _source(path: Path, name: str) -> str:
-    """The absolute path of a source of a mosaic, which is a picture in its folder or below."""
-    try:
-        file = inside(path.parent, name).resolve()
+        check_size((file.width, file.height), held, path)
+        check_data(file.count <= _MOST_BANDS, path, f"at most {_MOST_BANDS:,} bands", file.count)
+        names = {key.upper() for key in file.tags(ns="OVERVIEWS")}
+        alone = "OVERVIEW_FILE" not in names
+        check_data(alone, path, "a raster with overviews of its own", "one that names another file")
+        block = max(math.prod(shape) for shape in file.block_shapes) * file.count * np.dtype(file.dtypes[0]).itemsize
+        got = f"{block:,}; convert it to a tiled TIFF"
+        check_data(block <= _MOST_BLOCK, path, f"tiles of at most {_MOST_BLOCK:,} bytes", got)
     except DataError:
-        raise DataError(f"{path}: expected sources in the folder of the mosaic or below, got {name!a:.200}") from None
-    check_data(file.is_file() and "<" not in str(file), path, "sources that are files", f"{name!a:.200}")
-    with reading(file), file.open("rb") as opened:
-        head = opened.read(8)
-    kind = next((kind for start, kind in _SIGNATURES.items() if head.startswith(start)), None)
-    check_data(kind is not None, path, "sources that are TIFF, JPEG 2000, PNG or JPEG files", f"{name!a:.200}")
-    if kind in _DRIVERS:
-        import rasterio
-
-        with rasterio.open(file, driver=_DRIVERS[kind]) as raster:
-            _without_others(raster, file)
-    return str(file)
-
-
-def _without_others(file: Any, path: Path) -> Any:
-    """The opened raster; refuses one that names another file, or an address, as its reduced copies."""
-    if "OVERVIEW_FILE" in {key.upper() for key in file.tags(ns="OVERVIEWS")}:
         file.close()
-        raise DataError(f"{path}: expected a raster with overviews of its own, got one that names another file")
+        raise
     return file
+
+
+def check_system(words: str, name: object) -> None:
+    """Raise `DataError` for a reference system that names a file, such as a grid, which PROJ would open."""
+    check_data(not _PATH.search(words), name, "a reference system that names no file", f"{words!r:.200}")
+
+
+def check_size(size: tuple[int, int], held: int, path: Path) -> None:
+    """Raise `DataError` for a raster that claims a longer side, or more pixels, than its bytes may hold."""
+    got = f"{size[0]} × {size[1]}; divide it"
+    check_data(max(size) <= MOST_SIDE, path, f"at most {MOST_SIDE:,} pixels along a side", got)
+    check_proportion(size, held, path)

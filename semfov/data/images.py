@@ -80,7 +80,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     """
     check_white(white)
     with opening(Path(path), "decoded"), open_pillow(path) as image:
-        _check_proportion(image, path)
+        check_proportion(image.size, Path(path).stat().st_size, path)
         _check_pixels(image.size, f"image {Path(path)}")
         wide = image.mode in _SIXTEEN_BITS and white is None
         array = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
@@ -184,11 +184,12 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
         yield image
 
 
-def _check_proportion(image: Any, path: str | PathLike[str]) -> None:
-    """Raise `DataError` for a large Pillow image that claims more pixels than its file may hold."""
-    pixels, size = math.prod(image.size), Path(path).stat().st_size
-    got, fits = f"{pixels:,} in {size:,} bytes; replace it", pixels <= max(_SMALL, _MOST_A_BYTE * size)
-    check_data(fits, f"image {Path(path)}", f"at most {MAX_PIXELS:,} pixels, in proportion to the file", got)
+def check_proportion(size: tuple[int, int], held: int, path: str | PathLike[str]) -> None:
+    """Raise `DataError` for a large picture that claims more pixels than the bytes of its files may hold."""
+    most = max(_SMALL, _MOST_A_BYTE * held)
+    pixels = math.prod(size)
+    got = f"{pixels:,} in {held:,} bytes; replace it"
+    check_data(pixels <= most, f"image {Path(path)}", f"at most {most:,} pixels, in proportion to the file", got)
 
 
 def check_tile(size: int, stored: int, name: str) -> None:
@@ -273,7 +274,7 @@ class PhotographPicture(LargePicture):
         self.path, self._white = Path(path), white
         self._array: NDArray[np.uint8] | None = None
         with opening(self.path, "opened"), open_pillow(self.path) as image:
-            _check_proportion(image, self.path)
+            check_proportion(image.size, self.path.stat().st_size, self.path)
             self.size = upright_size(image)
 
     def pixels(self, box: tuple[int, int, int, int]) -> NDArray[np.uint8]:

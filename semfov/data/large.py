@@ -8,6 +8,7 @@ import weakref
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -18,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.gdal import MOST_SIDE, open_raster, raster_settings
+from semfov.data.gdal import check_size, raster_settings
 from semfov.data.images import (
     PhotographPicture,
     check_tile,
@@ -31,6 +32,7 @@ from semfov.data.images import (
 )
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
+from semfov.data.vrt import Mosaic, open_raster
 from semfov.data.windowed import BY_WINDOWS, RASTERS, ChosenBands, LargePicture
 from semfov.errors import DataError, check, check_data, lookup, needing
 from semfov.io.files import check_regular
@@ -115,18 +117,36 @@ class _TiffPicture(LargePicture):
         if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
             packed = f"{page.compression.name} compression with predictor {int(page.predictor)}"
             raise DataError(f"{self.path}: expected imagecodecs for {packed}; pip install imagecodecs")
-        fits, got = max(self.size) <= MOST_SIDE, f"{self.size[0]} × {self.size[1]}"
-        check_data(fits, self.path, f"at most {MOST_SIDE:,} pixels along a side", got)
+        check_size(self.size, self.path.stat().st_size, self.path)
 
     def pixels(self, box: _Box) -> NDArray[np.uint8]:
         with opening(self.path, "decoded"):
             return self._bytes(self._values(box))
 
+    @cached_property
+    def _tile_size(self) -> tuple[int, int]:
+        """Width and height of a tile, or of a strip."""
+        page = self.page
+        return (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
+
+    @cached_property
+    def _held(self) -> NDArray[np.bool_]:
+        """Which tiles are stored in the file, `(rows, columns)`."""
+        across, down = (-(-length // side) for length, side in zip(self.size, self._tile_size, strict=True))
+        counts = np.asarray(self.page.databytecounts, np.int64)
+        planes = max(len(counts) // (across * down), 1)
+        return counts[: planes * across * down].reshape(planes, down, across).any(0)
+
+    def holds(self, box: _Box) -> bool:
+        x1, y1, x2, y2 = box
+        wide, high = self._tile_size
+        return bool(self._held[y1 // high : -(-y2 // high), x1 // wide : -(-x2 // wide)].any())
+
     def _values(self, box: _Box) -> NDArray[Any]:
         """The values of the channels in a window, the alpha last, `(h, w, C)`."""
         x1, y1, x2, y2 = box
         page, channels = self.page, self._channels
-        wide, high = (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
+        wide, high = self._tile_size
         across, down = -(-self.size[0] // wide), -(-self.size[1] // high)
         planes = page.planarconfig == _PLANES and page.samplesperpixel > 1
         size = wide * high * (1 if planes else page.samplesperpixel) * page.dtype.itemsize
@@ -252,6 +272,18 @@ class _RasterPicture(LargePicture):
         elif nodata is not None:
             grey = int(bytes_between(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]), self._tone)[0])
             self.nothing = grey, grey, grey
+
+    def holds(self, box: _Box) -> bool:
+        if isinstance(self._file, Mosaic):
+            return self._file.holds(box)
+        if self._file.driver != "GTiff":
+            return True
+        high, wide = self._file.block_shapes[0]
+        rows = range(box[1] // high, -(-box[3] // high))
+        columns = range(box[0] // wide, -(-box[2] // wide))
+        sizes = (f"BLOCK_SIZE_{column}_{row}" for row in rows for column in columns)
+        with self._lock:
+            return any(self._file.get_tag_item(size, "TIFF", bidx=self._bands[0]) for size in sizes)
 
     def _reduced(self, box: _Box, reduction: int) -> Tensor:
         """A window from the overviews of the file, or from a copy where it has none."""

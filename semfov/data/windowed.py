@@ -1,8 +1,9 @@
 """Pictures that are read window by window: their base, and what their files have in common."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from semfov.errors import check
 _Box = tuple[int, int, int, int]
 
 _STRIP = 1 << 23  # pixels that are read at once for a copy
+_PIECE = 1 << 11  # columns of a strip of which it is asked whether they are stored
 
 _FIRST = 4
 """Least factor by which a copy is reduced. All copies together take a twelfth of the memory of the picture."""
@@ -83,6 +85,10 @@ class LargePicture(ABC):
     def pixels(self, box: _Box) -> NDArray[np.uint8]:
         """Read a window, in one thread at a time but not always the same one (`zoom.episode`); → `(h, w, 3)`."""
 
+    def holds(self, box: _Box) -> bool:
+        """Tell whether anything of a window is stored: one colour is shown where nothing is."""
+        return True
+
     def reduction(self, ratio: float, oversampling: float = _OVERSAMPLING) -> int:
         """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
         many = self.size[0] * self.size[1] > _LARGE
@@ -137,17 +143,38 @@ class LargePicture(ABC):
         return self._copies[reduction]
 
     def _largest(self) -> Tensor:
-        """The largest copy, made strip by strip."""
+        """The largest copy, made strip by strip; what is not stored is not read."""
         first = self._first
         wide, high = (max(1, length // first) for length in self.size)
-        width, height = (min(length, count * first) for length, count in zip(self.size, (wide, high), strict=True))
         rows = max(1, _STRIP // self.size[0] // first)
         copy = torch.empty(high, wide, 3, dtype=torch.uint8)
         for top in range(0, high, rows):
             bottom = min(top + rows, high)
-            # The filter reaches over the borders of a strip by less than one pixel of the copy.
-            low, end = max(top - 1, 0), min(bottom + 1, high)
-            strip = _bytes_of(self._given((0, low * first, width, min(end * first, height))))
-            part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
-            copy[top:bottom] = part.permute(1, 2, 0)
+            for left, right, held in self._runs(top, bottom, wide, high):
+                # One pixel is the colour of all that is not stored.
+                end = (right, bottom) if held else (left + 1, top + 1)
+                copy[top:bottom, left:right] = self._part((left, top, *end), (wide, high))
         return copy.permute(2, 0, 1)
+
+    def _runs(self, top: int, bottom: int, wide: int, high: int) -> Iterator[tuple[int, int, bool]]:
+        """First and end of the columns of a strip of the largest copy that are stored, and of those that are not."""
+        step = max(1, _PIECE // self._first)
+        lefts = range(0, wide, step)
+        held = [self.holds(self._around((left, top, min(left + step, wide), bottom), (wide, high))) for left in lefts]
+        for stored, run in groupby(zip(lefts, held, strict=True), lambda piece: piece[1]):
+            pieces = [left for left, _ in run]
+            yield pieces[0], min(pieces[-1] + step, wide), stored
+
+    def _around(self, box: _Box, size: tuple[int, int]) -> _Box:
+        """The window of a part of the largest copy, with what the filter reaches: less than one pixel of the copy."""
+        (x1, y1, x2, y2), (wide, high), first = box, size, self._first
+        right, bottom = min(x2 + 1, wide) * first, min(y2 + 1, high) * first
+        return max(x1 - 1, 0) * first, max(y1 - 1, 0) * first, min(right, self.size[0]), min(bottom, self.size[1])
+
+    def _part(self, box: _Box, size: tuple[int, int]) -> Tensor:
+        """A part of the largest copy, `(h, w, 3)`."""
+        (x1, y1, x2, y2), (wide, high) = box, size
+        left, top, right, bottom = max(x1 - 1, 0), max(y1 - 1, 0), min(x2 + 1, wide), min(y2 + 1, high)
+        pixels = _bytes_of(self._given(self._around(box, size)))
+        part = resized(pixels, (bottom - top, right - left))[0, :, y1 - top : y2 - top, x1 - left : x2 - left]
+        return part.permute(1, 2, 0)

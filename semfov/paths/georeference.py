@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.gdal import open_raster, raster_settings
+from semfov.data.gdal import check_system, raster_settings
 from semfov.data.images import quiet_decoders
+from semfov.data.vrt import open_raster
 from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, needing
 from semfov.io.files import check_regular
+
+_GEO_TEXTS = 34737  # tag of the texts of a GeoTIFF, of which some programs make a reference system
 
 
 def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
@@ -56,12 +59,13 @@ def _is_referenced(source: str) -> bool:
 
     check_regular(source)
     try:
-        with Path(source).open("rb") as file:
+        with quiet_decoders, Path(source).open("rb") as file:
             head = file.read(8)
             # The head of a BigTIFF is twice as long.
             tags = ImageFileDirectory_v2(head + file.read(8) if head[2:3] == b"+" or head[3:4] == b"+" else head)
             file.seek(tags.next)
             tags.load(file)
+            check_system(str(tags.get(_GEO_TEXTS, "")), source)
             return 34735 in tags  # the directory of GeoKeys, which every GeoTIFF has (OGC GeoTIFF 1.1, section 7.1.2)
     except (OSError, SyntaxError, struct.error) as error:
         raise DataError(f"{source}: expected a readable TIFF, got: {error}") from None

@@ -10,6 +10,7 @@ from torch import Tensor
 from semfov.errors import check
 
 CELLS = 8  # cells along a side of the closest window
+MOST = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte in all
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,9 @@ class Lattice:
         Returns:
             The lattice.
 
+        Raises:
+            InputError: the picture has more cells than a belief may have, or no pixels.
+
         >>> lattice = Lattice.over((2560, 1920), (416, 416))
         >>> lattice.levels, lattice.columns, lattice.rows, len(lattice)
         (3, 32, 24, 579)
@@ -58,7 +62,11 @@ class Lattice:
         steps = [min(canvas[0] / size[0], canvas[1] / size[1])]
         while steps[-1] * 2 <= finest * (1 + 1e-9):
             steps.append(steps[-1] * 2)
-        return cls(size, canvas, tuple(steps))
+        lattice = cls(size, canvas, tuple(steps))
+        cells = lattice.columns * lattice.rows
+        got = f"{cells:,} in {size[0]} × {size[1]} px; divide the picture, or look less closely, finest={finest / 2:g}"
+        check(cells <= MOST, "picture", f"at most {MOST:,} cells of a belief", got)
+        return lattice
 
     def __post_init__(self) -> None:
         check(len(self.magnifications) >= 1, "magnifications", "at least one", self.magnifications)

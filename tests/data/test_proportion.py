@@ -92,6 +92,8 @@ def test_a_tile_that_claims_more_than_is_stored(tmp_path):
             size = {3: 2, 4: 4}[int(tag.dtype)]
             content[tag.valueoffset : tag.valueoffset + size] = (32_768).to_bytes(size, "little")
     path.write_bytes(bytes(content))
+    unusable(r"in proportion to the file, got 1,073,741,824 in \d+ bytes", open_large, path)
+    path.write_bytes(bytes(content) + bytes(600_000))
     unusable("out of proportion", open_large(path).read, (0, 0, 1, 1))
 
 
