@@ -4,9 +4,8 @@ python -m benchmarks.detector_ap --detector yolov3-tiny --root DIR --annotations
 """
 
 import argparse
-import contextlib
-import io
 from collections.abc import Iterable, Iterator, Sequence
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from semfov.data.annotations import read_annotations
 from semfov.data.images import read_image
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress
 from semfov.errors import lookup
+from semfov.metrics.average_precision import average_precision as coco_ap
 
-# COCOeval limits the boxes itself: it counts at most 100 boxes of each class in an image, at any confidence.
+COCO_LIMIT = 100  # boxes of each class in an image that COCO counts, at any confidence
+# The selections have no limit of their own.
 SELECTIONS = {
     "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=10_000, per_class=True),
     "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=10_000),
@@ -70,37 +72,20 @@ def average_precision(
     *,
     multilabel: bool = False,
 ) -> list[tuple[float, float]]:
-    """AP and AP50 by COCOeval for each of `selections`, over all images of the annotation file."""
-    from pycocotools.coco import COCO
-
-    with contextlib.redirect_stdout(io.StringIO()):
-        truth = COCO(str(annotations))
-    category = {entry["name"]: entry["id"] for entry in truth.dataset["categories"]}
-    for name in detector.classes:
-        lookup(name, category, "category of the annotations")
-    ids = torch.tensor([category[name] for name in detector.classes])
+    """AP and AP50 by COCOeval for each of `selections`, over all images of the annotation file; NaN without objects."""
+    truth = read_annotations(annotations)
+    ids = {entry["name"]: number for number, entry in truth.categories.items()}
+    categories = [ids[lookup(name, ids, "category of the annotations")] for name in detector.classes]
     results: list[list[dict[str, Any]]] = [[] for _ in selections]
-    for image_id in tqdm(sorted(truth.imgs), desc=detector.name, unit="image"):
+    for image_id in tqdm(sorted(truth.images), desc=detector.name, unit="image"):
         # In the stored orientation, to which COCO's annotations refer.
-        image = read_image(root / truth.imgs[image_id]["file_name"], oriented=False)[None]
+        image = read_image(root / truth.images[image_id]["file_name"], oriented=False)[None]
         by_selection = detect(detector, image, selections, multilabel=multilabel)
         for result, (boxes, scores, labels) in zip(results, by_selection, strict=True):
             sizes = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1)
-            for box, score, label in zip(sizes.tolist(), scores.tolist(), ids[labels].tolist(), strict=True):
-                result.append({"image_id": image_id, "category_id": label, "bbox": box, "score": score})
-    return [evaluate(truth, result) for result in results]
-
-
-def evaluate(truth: Any, result: list[dict[str, Any]]) -> tuple[float, float]:
-    """AP and AP50 of one list of results."""
-    from pycocotools.cocoeval import COCOeval
-
-    with contextlib.redirect_stdout(io.StringIO()):
-        evaluation = COCOeval(truth, truth.loadRes(result), "bbox")
-        evaluation.evaluate()
-        evaluation.accumulate()
-        evaluation.summarize()
-    return float(evaluation.stats[0]), float(evaluation.stats[1])
+            for box, score, label in zip(sizes.tolist(), scores.tolist(), labels.tolist(), strict=True):
+                result.append({"image_id": image_id, "category_id": categories[label], "bbox": box, "score": score})
+    return [coco_ap(truth, result, limit=COCO_LIMIT) or (nan, nan) for result in results]
 
 
 def main() -> None:

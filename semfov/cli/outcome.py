@@ -192,12 +192,13 @@ def _result_row(
     elif truth is not None:
         sought = picture["targets"] or record.classes[1:]
         row["image_id"] = truth.image_id(name, (picture["width"], picture["height"]))
-        row["categories"] = truth.categories(sought)
-        ids = {canonical_name(each["name"]): each["id"] for each in row["categories"]}
-        # Objects of other classes cannot be judged; their number is not that of a category.
-        numbers = [ids.get(canonical_name(each), -1) for each in record.classes[1:]]
-        results = record.to_coco(row["image_id"], numbers)
-        row["parts"] = [each for each in results if each["category_id"] != -1]
+        categories = truth.categories(sought)
+        row["classes"] = list(categories)
+        # Objects of other classes cannot be judged.
+        names = [canonical_name(each) for each in record.classes]
+        numbered = record.to_coco(row["image_id"], range(1, len(names)))
+        results = ((each, names[each["category_id"]]) for each in numbered)
+        row["parts"] = [{**each, "category_id": categories[name]} for each, name in results if name in categories]
     elif kind == ".coco.json":
         row["categories"] = coco_categories()
         known = {canonical_name(each["name"]) for each in row["categories"]}

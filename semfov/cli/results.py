@@ -78,10 +78,9 @@ class ResultsFile:
         """AP and AP50 of the objects against the annotations, in words."""
         assert self.truth is not None
         rows = [row for row in self._rows.values() if "error" not in row["picture"]]
-        categories = {each["id"] for row in rows for each in row["categories"]}
-        results, images = [part for row in rows for part in row["parts"]], [row["image_id"] for row in rows]
-        ap, ap50 = self.truth.precision(results, images, [*categories])
-        return f"AP {ap:.3f}, AP50 {ap50:.3f} against {self.truth.path} ({len(rows)} pictures, {len(results)} boxes)"
+        classes = {name for row in rows for name in row["classes"]}
+        results = [part for row in rows for part in row["parts"]]
+        return self.truth.judge(results, [row["image_id"] for row in rows], classes)
 
     def _text(self) -> str:
         every = [self._rows[number] for number in sorted(self._rows)]

@@ -36,6 +36,7 @@ from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfin
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data import WordVectors, class_index, spread
+from semfov.data.large import picture_size
 from semfov.data.sources import embedded_picture
 from semfov.errors import DataError, InputError, SemfovError, check, check_options, lookup
 from semfov.head.scenes import World
@@ -57,6 +58,7 @@ class _PictureJob(ABC):
 
     title: str
     target: str | None = None
+    targets: Sequence[str] | None = None
     weights: dict[str, float] | None = None
     drawings: tuple[Drawing, ...] = ALL_DRAWINGS
     every = False
@@ -80,6 +82,8 @@ class _PictureJob(ABC):
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
         self.aim(self.agent.classes[1:])
+        if self.truth is not None:
+            self.truth.categories(self.targets or self.agent.classes[1:])
         if not self.sources:
             scene = embedded_picture(self.agent.classes[1:], self.target, options.seed)
             self.sources = [PictureSource("embedded scene", scene=scene)]
@@ -117,6 +121,8 @@ class _PictureJob(ABC):
             with torch.inference_mode():
                 options: PictureOptions = self.options
                 picture = source.opened(options.how)
+                if self.truth is not None:
+                    self.truth.image_id(source.name, picture_size(source.opened("auto")))
                 how: How = "auto" if isinstance(picture, World) else options.how
                 shared: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
                 shared |= {"shifts": options.shifts, "duration": options.duration}
@@ -316,6 +322,7 @@ class _SearchJob(_PictureJob):
         if classes is not None and self.weights is None:
             self.weights = _meant(options, classes)
             self.target = next(iter(self.weights))
+            self.targets = [self.target]
             self.title = f"search for “{self.target}”"
 
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:

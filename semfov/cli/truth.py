@@ -1,7 +1,6 @@
 """Annotations in COCO's format whose ids results take, and the average precision against them."""
 
-import contextlib
-import io
+import warnings
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
@@ -9,9 +8,10 @@ from typing import Any
 
 import torch
 
+from semfov.data.annotations import Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name
-from semfov.data.coco import read_annotations, warn_of_form
 from semfov.errors import DataError, check
+from semfov.metrics.average_precision import average_precision
 
 
 class Truth:
@@ -19,21 +19,36 @@ class Truth:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.coco, self.digest = read_annotations(path)
-        self._images: dict[str, list[dict[str, Any]]] = defaultdict(list)
-        for image in self.coco.imgs.values():
-            self._images[_parts(image["file_name"])[-1]].append(image)
-        entries = self.coco.dataset["annotations"]
-        sizes = [[self.coco.imgs[each["image_id"]][side] for side in ("width", "height")] * 2 for each in entries]
-        boxes, limits = torch.tensor([each["bbox"] for each in entries]), torch.tensor(sizes)
-        warn_of_form(boxes.view(-1, 4).double(), limits.view(-1, 4).double(), path)
+        self.annotations = read_annotations(path)
+        self._images: dict[str, list[Id]] = defaultdict(list)
+        for image, entry in self.annotations.images.items():
+            self._images[_parts(entry["file_name"])[-1]].append(image)
+        self._warn_of_boxes()
 
-    def image_id(self, name: str, size: tuple[int, int] | None = None) -> int | str:
+    @property
+    def digest(self) -> str:
+        """The sha256 of the file."""
+        return self.annotations.digest
+
+    def _warn_of_boxes(self) -> None:
+        """Warn of boxes that are written in another form, and of those without area, which are not judged."""
+        boxes, sizes, empty = [], [], 0
+        for image, entries in self.annotations.objects.items():
+            size = self.annotations.size(image)
+            empty += sum(min(each["bbox"][2:]) == 0 for each in entries)
+            if size is not None:
+                boxes += [each["bbox"] for each in entries]
+                sizes += [size * 2] * len(entries)
+        warn_of_form(torch.tensor(boxes).view(-1, 4).double(), torch.tensor(sizes).view(-1, 4).double(), self.path)
+        if empty:
+            warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
+
+    def image_id(self, name: str, size: tuple[int, int] | None = None) -> Id:
         """The id of a picture of `(width, height)`; of several of one name that whose folders agree best."""
         parts = _parts(name)
 
-        def agreement(image: dict[str, Any]) -> int:
-            own = _parts(image["file_name"])
+        def agreement(image: Id) -> int:
+            own = _parts(self.annotations.images[image]["file_name"])
             pairs = zip(reversed(own), reversed(parts), strict=False)
             return next((count for count, (one, other) in enumerate(pairs) if one != other), min(len(own), len(parts)))
 
@@ -42,36 +57,30 @@ class Truth:
             raise DataError(
                 f"annotations {self.path}: expected one image with the file_name of {name}, got {len(found)}"
             )
-        wanted = int(found[-1]["width"]), int(found[-1]["height"])
-        if size not in (None, wanted):
+        wanted = self.annotations.size(found[-1])
+        if size is not None and wanted not in (None, size):
             raise DataError(
                 f"annotations {self.path}: expected {name} to have {wanted[0]} × {wanted[1]} px, got {size[0]} × "
                 f"{size[1]}; its boxes are in another frame"
             )
-        return found[-1]["id"]
+        return found[-1]
 
-    def categories(self, classes: Collection[str]) -> list[dict[str, Any]]:
-        """The categories of the file that are among some classes."""
+    def categories(self, classes: Collection[str]) -> dict[str, Id]:
+        """The categories of the file that are among some classes: their canonical names, and the first id of each."""
         names = {canonical_name(name) for name in classes}
-        found = [each for each in self.coco.dataset["categories"] if canonical_name(each["name"]) in names]
-        own = ", ".join(each["name"] for each in self.coco.dataset["categories"][:5])
+        categories = [(canonical_name(each["name"]), id_) for id_, each in self.annotations.categories.items()]
+        found = {name: id_ for name, id_ in reversed(categories) if name in names}
+        own = ", ".join(each["name"] for each in [*self.annotations.categories.values()][:5])
         check(bool(found), "annotations", f"some of the classes {', '.join([*classes][:5])} as categories", own)
         return found
 
-    def precision(
-        self, results: list[dict[str, Any]], images: Sequence[int | str], categories: Sequence[int]
-    ) -> tuple[float, float]:
-        """AP and AP50 of results by pycocotools, over some images and categories; -1 where there are no objects."""
-        from pycocotools.cocoeval import COCOeval
-
-        with contextlib.redirect_stdout(io.StringIO()):
-            found = self.coco.loadRes(results) if results else type(self.coco)()
-            judge = COCOeval(self.coco, found, "bbox")
-            judge.params.imgIds, judge.params.catIds = sorted(images), sorted(categories)
-            judge.evaluate()
-            judge.accumulate()
-            judge.summarize()
-        return float(judge.stats[0]), float(judge.stats[1])
+    def judge(self, results: Sequence[dict[str, Any]], images: Sequence[Id], classes: Collection[str]) -> str:
+        """AP and AP50 of results over some images and classes, in words."""
+        precision = average_precision(self.annotations, results, images=images, classes=classes)
+        counts = f"({len(images)} pictures, {len(results)} boxes)"
+        if precision is None:
+            return f"no AP: {self.path} has no boxes of these classes in these pictures {counts}"
+        return "AP {:.3f}, AP50 {:.3f} against {} {}".format(*precision, self.path, counts)
 
 
 def _parts(name: str) -> tuple[str, ...]:

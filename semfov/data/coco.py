@@ -1,100 +1,20 @@
-"""Data sets in COCO's format as scenes for visual search; every entry of their files is checked before it is used."""
+"""Data sets in COCO's format as scenes for visual search."""
 
-import contextlib
-import io
 import logging
 import os
-import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
+from semfov.data.annotations import Annotations, Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.images import read_image
 from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check, check_data
-from semfov.io.files import check_regular, inside, json_sha256, read_json, sha256
-from semfov.io.schema import excerpt, is_number, is_plain
-
-_LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
-_BEYOND = 0.2  # share of boxes that leave their pictures from which on they may be corners
-
-
-def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
-    """Read and check a COCO instances file; ids are integers or strings; its index and the sha256 of the file."""
-    name = f"annotations {Path(path)}"
-    data = read_json(path, name=name)
-    expected = "an object with images, annotations and categories"
-    check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
-    images = _checked_ids_of(data, "images", name, {"id": _ID, "file_name": _TEXT, "width": _SIDE, "height": _SIDE})
-    check_data(
-        len({type(i) for i in images}) < 2, f"{name}: images", "ids of one kind", f"integers and strings; {_WAY}"
-    )
-    categories = _checked_ids_of(data, "categories", name, {"id": _ID, "name": _TEXT})
-    fields: dict[str, _Field] = {
-        "id": _ID,
-        "image_id": (lambda value: _ID[0](value) and value in images, "the id of one of the images"),
-        "category_id": (lambda value: _ID[0](value) and value in categories, "the id of one of the categories"),
-        "bbox": _BOX,
-        "iscrowd": (lambda value: value in (0, 1), "0 or 1"),
-    }
-    _checked_ids_of(data, "annotations", name, fields)
-    from pycocotools.coco import COCO
-
-    coco = COCO()
-    coco.dataset = data
-    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-        coco.createIndex()
-    return coco, sha256(path)
-
-
-_Field = tuple[Callable[[Any], object], str]  # whether a value of an entry fits, and what it is expected to be
-
-_ID: _Field = (
-    lambda value: type(value) is int or (isinstance(value, str) and is_plain(value)),
-    "an integer or a string without control characters",
-)
-_TEXT: _Field = (
-    lambda value: isinstance(value, str) and value and is_plain(value),
-    "a string without control characters",
-)
-_SIDE: _Field = (
-    lambda value: is_number(value) and 1 <= value <= _LARGEST and value == int(value),
-    "a whole number of pixels",
-)
-_BOX: _Field = (
-    lambda value: isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) >= 0,
-    "[x, y, width, height] with finite numbers and a size of at least 0",
-)
-_WAY = "correct or replace the file"
-
-
-def _checked_ids_of(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> set[int | str]:
-    """The ids of the entries of a list, which are unique; fields but `iscrowd` are needed in each."""
-    entries, ids = data.get(key), set()
-    if not isinstance(entries, list):
-        raise DataError(f"{name}: expected {key} to be a list, got {_show(data, key)}; {_WAY}")
-    for place, entry in enumerate(entries):  # of which there are many, so that messages are made where they are needed
-        if not isinstance(entry, dict):
-            raise DataError(f"{name}: {key}[{place}]: expected an object, got {excerpt(entry)}; {_WAY}")
-        for field, (fits, expected) in fields.items():
-            if not fits(entry.get(field, 0 if field == "iscrowd" else None)):
-                fault = f"expected {field} to be {expected}, got {_show(entry, field)}; {_WAY}"
-                raise DataError(f"{name}: {key}[{place}]: {fault}")
-        if entry["id"] in ids:
-            fault = f"expected unique ids, got id {_show(entry, 'id')} more than once; {_WAY}"
-            raise DataError(f"{name}: {key}[{place}]: {fault}")
-        ids.add(entry["id"])
-    return ids
-
-
-def _show(entry: dict[str, Any], key: str) -> str:
-    return excerpt(entry[key]) if key in entry else "nothing"
-
+from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 _log = logging.getLogger(__name__)
 
@@ -162,8 +82,8 @@ class CocoScenes(Scenes):
         check(coverage in ("sum", "union"), "coverage", "'sum' or 'union'", repr(coverage))
         check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
         self.classes = tuple(classes)
-        coco, digest = read_annotations(annotations)
-        packed = _Packed(coco, _match(coco, self.classes, annotations), annotations, drop_crowds=crowd == "drop")
+        file = read_annotations(annotations)
+        packed = _Packed(file, _match(file, self.classes, annotations), annotations, drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
             first = ", ".join(f"{what}: {n}" for what, n in self.repairs.most_common(8))
@@ -198,7 +118,7 @@ class CocoScenes(Scenes):
         if missing := [path for path in self._files if not os.path.exists(path)]:  # also names that are too long
             counts = f"{len(missing)} of {len(names)} are missing"
             raise DataError(f"image {missing[0]}: no such file ({counts}); check data.root")
-        settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
+        settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
         self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
 
     def __getitem__(self, index: int) -> Scene:
@@ -266,16 +186,21 @@ def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotatio
 class _Packed:
     """The objects of all images of a file, concatenated in a few tensors, which are cheap to send to workers."""
 
-    def __init__(self, coco: Any, labels: dict[int | str, int], path: object, *, drop_crowds: bool) -> None:
-        self.ids: list[Any] = sorted(coco.imgs)
-        self.names: list[str] = [coco.imgs[i]["file_name"] for i in self.ids]
-        self.sizes = [(int(coco.imgs[i]["width"]), int(coco.imgs[i]["height"])) for i in self.ids]
+    def __init__(self, file: Annotations, labels: dict[Id, int], path: object, *, drop_crowds: bool) -> None:
+        self.ids: list[Any] = sorted(file.images)
+        self.names: list[str] = [file.images[i]["file_name"] for i in self.ids]
+        self.sizes: list[tuple[int, int]] = []
+        for image in self.ids:
+            size = file.size(image)
+            if size is None:
+                raise DataError(f"annotations {path}: expected width and height of image {image!r}, got none")
+            self.sizes.append(size)
         self.repairs: Counter[str] = Counter()
 
-        entries = [(row, entry) for row, i in enumerate(self.ids) for entry in coco.imgToAnns.get(i, ())]
+        entries = [(row, entry) for row, i in enumerate(self.ids) for entry in file.objects[i]]
         rows = torch.tensor([row for row, _ in entries], dtype=torch.int64)
         label = torch.tensor([labels[entry["category_id"]] for _, entry in entries], dtype=torch.int64)
-        crowd = torch.tensor([bool(entry.get("iscrowd", 0)) for _, entry in entries], dtype=torch.bool)
+        crowd = torch.tensor([bool(entry["iscrowd"]) for _, entry in entries], dtype=torch.bool)
         bboxes = torch.tensor([[float(v) for v in entry["bbox"]] for _, entry in entries], dtype=torch.float64)
         limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
 
@@ -298,7 +223,7 @@ class _Packed:
             if which.any():
                 self.repairs[f"boxes {what}"] = int(which.sum())
         for at in (valid & ~labelled).nonzero()[:, 0].tolist():
-            name = coco.cats[entries[at][1]["category_id"]]["name"]
+            name = file.categories[entries[at][1]["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
         self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
@@ -311,25 +236,11 @@ class _Packed:
         return Annotation(boxes.clone(), labels.clone(), crowd.clone(), self.sizes[row])
 
 
-def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, stacklevel: int = 3) -> None:
-    """Warn of boxes `(N, 4)` in pictures of sizes `(N, 4)` that look like no [x, y, width, height] in pixels."""
-    if not len(boxes):
-        return
-    corners = bool(((boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)).all())
-    beyond = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1).double().mean()
-    seems = "corners [x1, y1, x2, y2]" if corners and float(beyond) >= _BEYOND else None
-    if float(boxes.max()) <= 1 and float(limits.min()) > 2:
-        seems = "fractions of the picture"
-    if seems is not None:
-        said = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}"
-        warnings.warn(said, stacklevel=stacklevel)
-
-
-def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[int | str, int]:
+def _match(file: Annotations, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[Id, int]:
     """Index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
-    labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in coco.cats.items()}
-    names = ", ".join(ascii(category["name"]) for category in list(coco.cats.values())[:5]) or "none"
+    labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in file.categories.items()}
+    names = ", ".join(ascii(category["name"]) for category in list(file.categories.values())[:5]) or "none"
     some = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
     check_data(any(labels.values()), f"annotations {path}", some, names)
     return labels

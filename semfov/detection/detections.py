@@ -234,8 +234,8 @@ class Detections:
 
     def to_coco(
         self,
-        image_id: int,
-        categories: Sequence[int] | Sequence[Mapping[str, Any]],
+        image_id: int | str,
+        categories: Sequence[int | str] | Sequence[Mapping[str, Any]],
         classes: Sequence[str] | None = None,
     ) -> list[dict[str, Any]]:
         """Convert the detections of one image to COCO results, for `pycocotools.COCO.loadRes`.

@@ -29,12 +29,11 @@ def named_detections(
 
 
 def coco_results(
-    image_id: int | str, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int]
+    image_id: int | str, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int | str]
 ) -> list[dict[str, Any]]:
     """COCO results of boxes (corners), with the category id of each class 1..K from `ids`."""
-    if not isinstance(image_id, str):
-        check(_is_whole(image_id), "image_id", "the whole number of an image, or text", repr(image_id))
-        image_id = index(image_id)
+    check(_is_id(image_id), "image_id", "the whole number of an image, or text", repr(image_id))
+    image_id = _plain_id(image_id)
     size = boxes[:, 2:] - boxes[:, :2]
     placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
     return [
@@ -44,21 +43,27 @@ def coco_results(
 
 
 def category_ids(
-    categories: Sequence[int] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
-) -> list[int]:
+    categories: Sequence[int | str] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
+) -> list[int | str]:
+    """The category id of each class: ids as they are, or those of a file's categories, the first of each name."""
     named = [category for category in categories if isinstance(category, Mapping)]
     if not named:
-        check(all(map(_is_whole, categories)), "categories", "whole numbers, or categories of a file", categories[:3])
-        return [index(each) for each in categories if not isinstance(each, Mapping)]
+        ids = [each for each in categories if not isinstance(each, Mapping)]
+        check(all(map(_is_id, ids)), "categories", "whole numbers or texts, or categories of a file", categories[:3])
+        return [_plain_id(each) for each in ids]
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
-    by_name = {canonical_name(str(category["name"])): int(category["id"]) for category in named}
+    by_name = {canonical_name(str(category["name"])): _plain_id(category["id"]) for category in reversed(named)}
     names = class_indices(classes)
     missing = [name for name in names if name not in by_name]
     check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")
     return [by_name[name] for name in names]
 
 
-def _is_whole(value: object) -> bool:
-    """Whether a value is a whole number of any library."""
-    return hasattr(value, "__index__") and not isinstance(value, bool)
+def _is_id(value: object) -> bool:
+    """Whether a value is text, or a whole number of any library."""
+    return isinstance(value, str) or (hasattr(value, "__index__") and not isinstance(value, bool))
+
+
+def _plain_id(value: Any) -> int | str:
+    return value if isinstance(value, str) else index(value)

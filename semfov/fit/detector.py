@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from semfov.agent import ActivePerception
-from semfov.data.coco import read_annotations
+from semfov.data.annotations import read_annotations
 from semfov.detection.class_names import UnnamedClasses
 from semfov.errors import DataError, InputError
 from semfov.fit.evidence import EvidenceFit
@@ -250,8 +250,8 @@ def _with_classes(config: FitDetectorConfig) -> FitDetectorConfig:
         check_sources(config.data, config.detector)
         make_detector(config.detector)
     except UnnamedClasses as error:
-        coco = None if config.data.annotations is None else read_annotations(config.data.annotations)[0]
-        names = () if coco is None else tuple(each["name"] for each in coco.loadCats(sorted(coco.getCatIds())))
+        categories = {} if config.data.annotations is None else read_annotations(config.data.annotations).categories
+        names = tuple(categories[each]["name"] for each in sorted(categories))
         if len(names) != error.count:
             known = f"; the annotations have {len(names)} categories" if names else ""
             raise InputError(f"{error}{known}") from None

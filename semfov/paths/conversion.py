@@ -228,7 +228,7 @@ class Conversion(Outcome):
         return {"boxes": objects.boxes.clone(), "labels": objects.labels.clone(), "scores": objects.scores.clone()}
 
     def to_coco(
-        self, image_id: int | str = 1, categories: Sequence[int] | Sequence[Mapping[str, Any]] | None = None
+        self, image_id: int | str = 1, categories: Sequence[int | str] | Sequence[Mapping[str, Any]] | None = None
     ) -> list[dict[str, Any]]:
         """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
 

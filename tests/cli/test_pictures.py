@@ -184,6 +184,55 @@ def test_results_have_the_ids_of_annotations_and_are_judged_by_pycocotools(run, 
     assert (code, "to have 120 × 160 px, got 160 × 120" in printed.err) == (1, True)
 
 
+def test_ids_may_be_texts_and_what_the_file_leaves_out_is_not_needed(run, photo, tmp_path):
+    """Results have the first id of a name that stands twice; without objects of the classes there is no AP."""
+    truth = {
+        "images": [{"id": "p-0", "file_name": f"upload\\1\\{photo.name}"}],
+        "categories": [{"id": "a", "name": "red"}, {"id": "b", "name": "Red"}, {"id": "c", "name": "wine glass"}],
+        "annotations": [{"id": "x", "image_id": "p-0", "category_id": "b", "bbox": [8, 8, 20, 20], "area": None}],
+    }
+    file, out = tmp_path / "gt.json", tmp_path / "boxes.coco.json"
+    file.write_text(json.dumps(truth))
+    code, printed = run("find", photo, "--out", out, "--annotations", file)
+    assert (code, "AP50 1.000 against" in printed.out) == (0, True)
+    (found,) = json.loads(out.read_text())
+    assert (found["image_id"], found["category_id"]) == ("p-0", "a")
+    code, printed = run("find", photo, "--target", "wine glass", "--out", out, "--annotations", file)
+    assert code == 0
+    assert re.search(
+        r"no AP: \S*gt\.json has no boxes of these classes in these pictures \(1 pictures, 0 boxes", printed.out
+    )
+
+
+def test_annotations_that_cannot_judge_are_refused_before_the_first_look(run, photo, tmp_path, agent, monkeypatch):
+    monkeypatch.setattr(type(agent), "find_all", lambda *_, **__: pytest.fail("a picture was looked at"))
+    truth = {
+        "images": [{"id": 1, "file_name": photo.name, "width": 160, "height": 120}],
+        "categories": [{"id": 1, "name": "gull"}],
+        "annotations": [],
+    }
+    file = tmp_path / "gt.json"
+    with_annotations = ("find", photo, "--out", tmp_path / "boxes.coco.json", "--annotations", file)
+    for change, message in (
+        ({}, "annotations: expected some of the classes red, wine glass as categories, got gull"),
+        ({"annotations": [{"image_id": 1, "category_id": 1, "bbox": [5, 5, -3, 4]}]}, "a size of at least 0"),
+        ({"categories": [{"id": 1, "name": "red"}], "images": [{**truth["images"][0], "width": 99}]}, "99 × 120 px"),
+    ):
+        file.write_text(json.dumps(truth | change))
+        code, printed = run(*with_annotations)
+        assert (code, message in printed.err) == (1, True)
+
+
+def test_boxes_without_area_are_told(make_truth, tmp_path):
+    make_truth("x.jpg")
+    path = tmp_path / "truth.json"
+    data = json.loads(path.read_text())
+    data["annotations"] = [{"image_id": 1, "category_id": 1, "bbox": [2, 2, 0, 4]}]
+    path.write_text(json.dumps(data))
+    with pytest.warns(UserWarning, match=r"truth\.json: 1 boxes have no area, and are not judged"):
+        Truth(path)
+
+
 def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth):
     truth = make_truth("a/x.jpg", "b\\x.jpg", "y.jpg")
     assert truth.image_id("/photos/b/x.jpg") == 2

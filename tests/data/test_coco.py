@@ -14,7 +14,8 @@ import torch
 from PIL import Image
 
 from semfov import CocoScenes, DataError, read_image
-from semfov.data.coco import _Packed, read_annotations, warn_of_form
+from semfov.data.annotations import read_annotations, warn_of_form
+from semfov.data.coco import _Packed
 from tests.refusals import refused, unusable
 
 CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
@@ -29,10 +30,10 @@ ALL = {"min_instances": 0, "max_target_area": None}
 
 def test_index_and_digest(make_coco, capsys):
     path = make_coco(BOXES)
-    index, digest = read_annotations(path)
-    assert digest == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert sorted(index.getImgIds()) == [10, 20, 30]
-    assert [a["bbox"] for a in index.loadAnns(index.getAnnIds(imgIds=[10]))] == [
+    file = read_annotations(path)
+    assert file.digest == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert sorted(file.images) == [10, 20, 30]
+    assert [each["bbox"] for each in file.objects[10]] == [
         [1, 2, 3, 4],
         [5, 6, 20, 20],
         [30.5, 20.25, 4, 4],
@@ -46,8 +47,31 @@ def test_ids_may_be_strings(make_coco, coco_dict):
         image["id"] = str(image["id"])
     for annotation in data["annotations"]:
         annotation["image_id"] = str(annotation["image_id"])
-    index, _ = read_annotations(make_coco(data=data))
-    assert sorted(index.imgs) == ["10", "20", "30"]
+    file = read_annotations(make_coco(data=data))
+    assert sorted(file.images) == ["10", "20", "30"]
+
+
+def test_what_nothing_depends_on_is_not_needed(make_coco, coco_dict):
+    """Ids of objects, areas, `iscrowd` and sizes of images; whole numbers may be written as 7.0, names as in LVIS."""
+    data = coco_dict(BOXES)
+    whole = read_annotations(make_coco(data=data))
+    for entry in data["annotations"]:
+        entry |= {"area": None, "iscrowd": None, "image_id": float(entry["image_id"])}
+        del entry["id"]
+    for image in data["images"]:
+        image |= {"id": float(image["id"]), "coco_url": f"http://localhost/val/{image['file_name']}", "width": None}
+        del image["file_name"], image["height"]
+    file = read_annotations(make_coco(data=data))
+    assert file.objects == whole.objects
+    assert {type(each) for each in file.objects} == {int}
+    assert [each["file_name"] for each in file.images.values()] == ["30.png", "10.png", "20.png"]
+    assert [file.size(10), whole.size(10)] == [None, (40, 30)]
+
+
+def test_scenes_need_the_sizes_of_images(photographs, make_coco, coco_dict):
+    data = coco_dict(BOXES)
+    del data["images"][1]["width"]
+    unusable("expected width and height of image 10", CocoScenes, photographs, make_coco(data=data), CLASSES, **ALL)
 
 
 MISSING = object()
@@ -63,7 +87,7 @@ FAULTS = [
         r"images\[1\]: expected id to be an integer or a string .*, got nothing",
     ),
     (("images", 1, "id"), True, "expected id to be an integer or a string without control characters, got True"),
-    (("images", 1, "id"), 1.0, "expected id to be an integer or a string without control characters, got 1.0"),
+    (("images", 1, "id"), 1.5, "expected id to be an integer or a string without control characters, got 1.5"),
     (("images", 1, "id"), 30, r"images\[1\]: expected unique ids, got id 30 more than once"),
     (("images", 2, "id"), "twenty", "expected ids of one kind"),
     (
@@ -82,8 +106,8 @@ FAULTS = [
         r"categories\[0\]: expected name to be a string .*, got None",
     ),
     (("categories", 1, "id"), 3, r"categories\[1\]: expected unique ids, got id 3 more than once"),
-    (("annotations", 1, "id"), 0, r"annotations\[1\]: expected unique ids, got id 0 more than once"),
-    (("annotations", 1, "id"), MISSING, r"annotations\[1\]: expected id"),
+    (("categories", 1, "id"), "three", "categories: expected ids of one kind"),
+    (("images", 0, "neg_category_ids"), [3, None], "expected neg_category_ids to be a list of ids of categories"),
     (("annotations", 0, "image_id"), 99, "expected image_id to be the id of one of the images, got 99"),
     (("annotations", 0, "image_id"), [10], r"expected image_id to be the id of one of the images, got \[10\]"),
     (("annotations", 0, "category_id"), MISSING, "expected category_id to be the id of one of the categories"),
@@ -326,6 +350,6 @@ def test_a_warning_says_that_boxes_are_corners(make_coco):
         "categories": [{"id": 1, "name": "cup"}],
         "annotations": [{"id": n, "image_id": 1, "category_id": 1, "bbox": box} for n, box in enumerate(boxes)],
     }
-    index, _ = read_annotations(make_coco(data=data))
+    file = read_annotations(make_coco(data=data))
     with pytest.warns(UserWarning, match=r"gt\.json: bbox is .* these look like fractions of the picture"):
-        _Packed(index, {1: 1}, "gt.json", drop_crowds=False)
+        _Packed(file, {1: 1}, "gt.json", drop_crowds=False)
