@@ -12,12 +12,12 @@ from tqdm import tqdm
 from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import detector_options
 from semfov.cli.options import GazeOptions
-from semfov.cli.results import tell_written, unfinished
+from semfov.cli.results import held_outputs, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.data.fixations import Fixations, write_table
 from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
-from semfov.errors import SemfovError, check
+from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.files import check_writable, plain_name
 from semfov.paths.gaze import GazePrediction
@@ -35,25 +35,8 @@ _Outcome = dict[str, Any]
 def predict_gaze(options: GazeOptions) -> int:
     """Predict where people look in all pictures; returns the exit code, 1 if a picture was left out."""
     job = _GazeJob(options)
-    sources, outcomes = job.sources, job.outcomes
-    if outcomes:
-        print(f"continuing: {len(outcomes)} of {len(sources)} pictures were looked at before")
-    left, complete = [number for number in range(len(sources)) if number not in outcomes], False
-    hidden = not job.several or options.quiet or not sys.stderr.isatty()
-    try:
-        for number in tqdm(left, unit="picture", leave=False, disable=hidden):
-            try:
-                job.look(number)
-            except SemfovError as error:
-                if not job.several:
-                    raise
-                tqdm.write(f"skipped {sources[number].name}: {error}", file=sys.stderr)
-            else:
-                tqdm.write(outcomes[number]["text"], file=sys.stdout)
-        complete = True
-    finally:  # a command that is stopped has written the pictures so far
-        job.write(complete=complete)
-    return 1 if len(outcomes) < len(sources) else 0
+    with held_outputs(options):
+        return _look_at_pictures(job)
 
 
 class _GazeJob:
@@ -117,8 +100,11 @@ class _GazeJob:
             name = f"{number:03d}-{name}" if self.several else name
             outcome["density"] = str(prediction.save_density(out if self.kind else out / name))
         self.outcomes[number] = outcome
+
+    def keep(self, number: int) -> None:
+        """Keep what was predicted of a picture for the same command, until all pictures are looked at."""
         if self.finished is not None:
-            self.finished.save(number, [outcome], {})
+            self.finished.save(number, [self.outcomes[number]], {})
 
     def write(self, *, complete: bool) -> None:
         """Write scanpaths and page of the pictures so far, and list all files."""
@@ -143,3 +129,29 @@ class _GazeJob:
                 part["picture"]["name"] = names[number]
             written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
+
+
+def _look_at_pictures(job: _GazeJob) -> int:
+    """Predict where people look; no other command writes the same files meanwhile."""
+    options = job.options
+    sources, outcomes = job.sources, job.outcomes
+    if outcomes:
+        print(f"continuing: {len(outcomes)} of {len(sources)} pictures were looked at before")
+    left, complete = [number for number in range(len(sources)) if number not in outcomes], False
+    hidden = not job.several or options.quiet or not sys.stderr.isatty()
+    try:
+        for number in tqdm(left, unit="picture", leave=False, disable=hidden):
+            try:
+                job.look(number)
+            except Exception as error:
+                fault = sources[number].fault(error, several=job.several)
+                if not job.several:
+                    raise
+                tqdm.write(f"skipped {sources[number].name}: {fault}", file=sys.stderr)
+            else:
+                job.keep(number)
+                tqdm.write(outcomes[number]["text"], file=sys.stdout)
+        complete = True
+    finally:  # a command that is stopped has written the pictures so far
+        job.write(complete=complete)
+    return 1 if len(outcomes) < len(sources) else 0

@@ -10,6 +10,7 @@ from time import perf_counter
 from semfov.agents.fovea import cell_at
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, start_of, white_of
+from semfov.cli.results import held_outputs
 from semfov.data.classes import class_index
 from semfov.data.sources import Stream, open_stream
 from semfov.errors import InputError, check
@@ -25,7 +26,7 @@ _WARM_UP = 3
 
 
 def look_live(options: LiveOptions) -> int:
-    """Look at the frames of a video, a camera or a stream."""
+    """Look at the frames of a video, a camera or a stream; returns the exit code, 1 if a frame was left out."""
     check(options.source is None or options.camera is None, "camera", "a video or a camera, not both", options.camera)
     if options.source is None and options.camera is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
@@ -43,10 +44,11 @@ def look_live(options: LiveOptions) -> int:
     settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
     first = cell_at(start, (agent.columns, agent.rows))
     running = agent.live(_sought(options, agent.classes[1:]), start=first, **settings)
-    written = _watch(running, stream, options.out)
+    with held_outputs(options):
+        written = _watch(running, stream, options.out)
     if written is not None:
         print(f"written:\n  {written}")
-    return 0
+    return int("skipped" in stream.gaps)
 
 
 def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:

@@ -5,14 +5,15 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
-from semfov.errors import check
+from semfov.errors import DataError, check
 from semfov.io.code import package_digest
-from semfov.io.files import write_text
+from semfov.io.files import write_text, written_alone
 from semfov.io.tables import csv_text
 from semfov.paths.conversion import COLUMNS
 from semfov.runs.results import SceneResults
@@ -22,10 +23,11 @@ _RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")  # ends of
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
 STDOUT = Path("-")  # standard output in place of a file of results, which takes JSON lines
 
-_DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", "x1", "y1", "x2", "y2", "passes", "seconds")
+_BOX = ("x1", "y1", "x2", "y2")
+_DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", *_BOX, "passes", "seconds", "error")
 
 _EXPECTED = ("expected", "expected_error")
-_OBJECTS = ("picture", "width", "height", *COLUMNS, *_EXPECTED)
+_OBJECTS = ("picture", "width", "height", *COLUMNS, *_EXPECTED, "error")
 
 
 def kind_of(path: Path) -> str | None:
@@ -58,12 +60,15 @@ class ResultsFile:
                 self.write()
             return
         line = json.dumps(row["picture"], ensure_ascii=self._stream is not None) + "\n"
-        if self._stream is None:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line)
-        else:  # which may have another encoding
+        if self._stream is not None:  # which may have another encoding
             self._stream.write(line)
             self._stream.flush()
+            return
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(line)
+        except OSError as error:
+            raise DataError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def write(self) -> None:
         """Write the file, atomically."""
@@ -84,18 +89,20 @@ class ResultsFile:
 
     def _text(self) -> str:
         every = [self._rows[number] for number in sorted(self._rows)]
-        rows, skipped = ([row for row in every if ("error" in row["picture"]) == wrong] for wrong in (False, True))
+        rows = [row for row in every if "error" not in row["picture"]]
         pictures = [row["picture"] for row in rows]
-        whole: dict[str, Any] = {"pictures": pictures, "skipped": [row["picture"] for row in skipped]}
+        skipped = [row["picture"] for row in every if "error" in row["picture"]]
+        whole: dict[str, Any] = {"pictures": pictures, "skipped": skipped}
         if self.kind == ".csv":
-            table = pictures if self.searched else [row for each in pictures for row in _object_rows(each)]
+            listed = [row["picture"] for row in every]
+            table = listed if self.searched else [row for each in listed for row in _object_rows(each)]
             turned = ("pan", "tilt") if any("pan" in row for row in table) else ()
             columns = _DECISIONS if self.searched else (*_OBJECTS, *turned)
             return csv_text([columns, *([row.get(name) for name in columns] for row in table)])
         if self.kind == ".geojson":
             unit = rows[0]["coordinates"] if rows else ""
             features = [each for row in rows for each in row["parts"]]
-            whole = {"type": "FeatureCollection", "coordinates": unit, "features": features}
+            whole = {"type": "FeatureCollection", "coordinates": unit, "features": features, "skipped": skipped}
         elif self.truth is not None:
             return json.dumps([each for row in rows for each in row["parts"]], indent=1) + "\n"
         elif self.kind == ".coco.json":
@@ -106,12 +113,14 @@ class ResultsFile:
             objects = [{**each, "image_id": number} for number, row in enumerate(rows, 1) for each in row["parts"]]
             annotations = [{"id": number, **each} for number, each in enumerate(objects, 1)]
             categories = rows[0]["categories"] if rows else []
-            whole = {"images": images, "annotations": annotations, "categories": categories}
+            whole = {"images": images, "annotations": annotations, "categories": categories, "skipped": skipped}
         return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
 def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
     """A row for each object, and one without an object for each class that has none, or for a picture without any."""
+    if "error" in picture:
+        return [picture]
     rows = picture["objects"]
     seen = {row["class"] for row in rows}
     missing = [name for name in picture["targets"] if name not in seen] or ([] if rows else [None])
@@ -121,6 +130,14 @@ def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
         {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
         for row in [*rows, *({"class": name} for name in missing)]
     ]
+
+
+def held_outputs(options: Any) -> AbstractContextManager[None]:
+    """Hold all that the options name to write, in a block that is refused while another command writes any of it."""
+    named = [getattr(options, name, None) for name in ("out", "report", "crops", "labels")]
+    outputs = [path for path in named if path is not None and path != STDOUT]
+    folders = [path for path in outputs if path.is_dir() or not path.suffix]
+    return written_alone([path for path in outputs if path not in folders], folders)
 
 
 def unfinished(file: Path, depends_on: Mapping[str, Any], sources: Sequence[PictureSource]) -> SceneResults:

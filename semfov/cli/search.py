@@ -32,13 +32,13 @@ from semfov.cli.options import (
     start_of,
 )
 from semfov.cli.outcome import PictureOutcome
-from semfov.cli.results import STDOUT, ResultsFile, kind_of, tell_written, unfinished
+from semfov.cli.results import STDOUT, ResultsFile, held_outputs, kind_of, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data import WordVectors, class_index, spread
 from semfov.data.large import picture_size
 from semfov.data.sources import embedded_picture
-from semfov.errors import DataError, InputError, SemfovError, check, check_options, lookup
+from semfov.errors import InputError, SemfovError, check, check_options, lookup
 from semfov.head.scenes import World
 from semfov.io.files import check_writable, plain_name, sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
@@ -133,14 +133,8 @@ class _PictureJob(ABC):
                 record = self.look(picture, shared, source)
                 seconds = time.perf_counter() - began
                 return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
-        except SemfovError as error:
-            return error
         except Exception as error:
-            if not self.several:
-                raise
-            # One picture of many, whatever is wrong with it, is not the end of the command.
-            reason = " ".join(str(error).split()) or "no message"
-            return DataError(f"{source.name}: cannot be looked at ({type(error).__name__}: {reason})")
+            return source.fault(error, several=self.several)
 
 
 def _make_again(kind: type[_PictureJob], options: PictureOptions) -> _PictureJob:
@@ -153,7 +147,7 @@ def _check_places(files: Sequence[Path | None]) -> None:
     """Raise `InputError` where only some of the pictures have a place on earth, as one collection has one unit."""
     kinds: dict[bool, Path | None] = {}
     for file in files:
-        with suppress(DataError):  # it is skipped when it is opened
+        with suppress(Exception):  # it is skipped when it is opened
             kinds.setdefault(file is not None and georeference(str(file)) is not None, file)
     got = f"{kinds.get(True)} with one and {kinds.get(False)} without; look at them apart, or write .json"
     check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
@@ -182,19 +176,32 @@ class _PictureFiles:
         if self.job.several and out != STDOUT:
             self.finished = unfinished(file, self.job.depends_on(), self.job.sources)
 
+    def write_figures(self, number: int, outcome: PictureOutcome | SemfovError) -> PictureOutcome | SemfovError:
+        """Write the crops, the labels and the figures of a picture; return its outcome, or why they cannot be written.
+
+        If an earlier command finished the picture, they exist already.
+        """
+        if isinstance(outcome, SemfovError):
+            return outcome
+        source = self.job.sources[number]
+        try:
+            for path, content in outcome.files.items():
+                write_bytes(path, content)
+            if self.folder is not None:
+                name = plain_name(Path(source.name).name)
+                folder = self.folder / f"{number:03d}-{name}" if self.job.several else self.folder
+                for file, content in outcome.figures.items():
+                    write_bytes(folder / file, content)
+                self.written += [folder / file for file in outcome.names]
+        except Exception as error:
+            return source.fault(error, several=self.job.several)
+        return outcome
+
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
-        """Write the row and the figures of a picture; if an earlier command finished it, its figures exist already."""
+        """Write the row of a picture, and keep it for the same command, unless it was finished `before`."""
         self.rows[number] = outcome.row["picture"]
         if self.results is not None:
             self.results.add(number, outcome.row)
-        for path, content in outcome.files.items():
-            write_bytes(path, content)
-        if self.folder is not None:
-            name = Path(self.job.sources[number].name).name
-            folder = self.folder / f"{number:03d}-{plain_name(name)}" if self.job.several else self.folder
-            for file, content in outcome.figures.items():
-                write_bytes(folder / file, content)
-            self.written += [folder / file for file in outcome.names]
         if outcome.episode is not None:
             self.episodes[number] = outcome.episode
         if self.finished is not None and not before:
@@ -203,7 +210,7 @@ class _PictureFiles:
             self.finished.save(number, [kept], {})
 
     def skip(self, number: int, reason: str) -> None:
-        """Note a picture that could not be read, and the reason."""
+        """Note a picture that is left out, and the reason."""
         self.rows[number] = {"picture": self.job.sources[number].name, "error": reason}
         if self.results is not None:
             self.results.add(number, {"picture": self.rows[number]})
@@ -224,20 +231,36 @@ class _PictureFiles:
         tell_written(written, self.finished, None if complete else f"{len(self.rows)} of {len(self.job.sources)}")
 
 
-def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
-    """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream."""
+def _check_drawings(job: _PictureJob) -> None:
+    """Raise `InputError` where a picture is looked at in a way that has no figure of a kind that is wanted."""
     wanted = job.options.draw or ()
-    for source in job.sources if not set(wanted) <= set(OF_ANY_LOOK) else ():
-        kind = job.agent.kind_of_look(source.opened("auto"), job.options.how, every=job.every)
+    if set(wanted) <= set(OF_ANY_LOOK):
+        return
+    for source in job.sources:
+        try:
+            kind = job.agent.kind_of_look(source.opened("auto"), job.options.how, every=job.every)
+        except Exception:
+            continue  # it is told when the picture is looked at
         have = job.drawings if kind == "fovea" else OF_ANY_LOOK
         missing = ", ".join(name for name in wanted if name not in have)
         expected = f"{' or '.join(have)} for {source.name}, which is looked at by {kind!r}"
         check(not missing, "draw", expected, missing)
+
+
+def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
+    """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream."""
+    _check_drawings(job)
+    with held_outputs(job.options):
+        return _look_and_write(job, stream)
+
+
+def _look_and_write(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
+    """Look at all pictures; no other command writes the same files meanwhile."""
     sources, several = job.sources, job.several
     if not job.options.pictures:
         print("no picture was given: looking at an embedded scene")
     outputs = _PictureFiles(job, stream)
-    complete, endings = False, Counter[str]()
+    complete, endings, faults = False, Counter[str](), list[SemfovError]()
     before: dict[int, PictureOutcome] = {}
     if outputs.finished is not None:  # by an interrupted command with the same options and models
         stored = outputs.finished.items(len(sources))
@@ -245,14 +268,14 @@ def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     if before:
         print(f"continuing: {len(before)} of {len(sources)} pictures were looked at before")
     try:
-        for number, outcome in _outcomes(job, before):
-            name = sources[number].name
+        for number, seen in _outcomes(job, before):
+            outcome = outputs.write_figures(number, seen)
             if isinstance(outcome, SemfovError):
-                # A wrong argument is not the fault of a picture.
-                if not several or (isinstance(outcome, InputError) and not endings):
+                if not several:
                     raise outcome
-                tqdm.write(f"skipped {name}: {outcome}", file=sys.stderr)
+                tqdm.write(f"skipped {sources[number].name}: {outcome}", file=sys.stderr)
                 outputs.skip(number, str(outcome))
+                faults.append(outcome)
                 continue
             outputs.add(number, outcome, before=number in before)
             endings[outcome.ended] += 1
@@ -266,10 +289,12 @@ def _look_at_pictures(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     finally:
         if outputs.rows:
             outputs.finish(complete=complete)
-    skipped = len(sources) - endings.total()
+    if not endings and all(isinstance(fault, InputError) for fault in faults):
+        raise faults[0]  # what no picture can be looked at with is a wrong argument
     if several:
         counts = ", ".join(f"{count} {name}" for name, count in endings.items())
-        print(f"{len(sources)} pictures: {'; '.join(filter(None, [counts, f'{skipped} skipped' if skipped else '']))}")
+        skipped = f"{len(faults)} skipped" if faults else ""
+        print(f"{len(sources)} pictures: {'; '.join(filter(None, [counts, skipped]))}")
     return [outputs.rows[number] for number in range(len(sources))]
 
 
@@ -414,8 +439,8 @@ def run(
 ) -> list[dict[str, Any]]:
     """Look at many pictures and write files, as the command `semfov search`, `find` or `explore` does.
 
-    A picture that cannot be read is left out, with its `error`. With `out=`, a call that was stopped continues where it
-    was when the same call is made again.
+    A picture at which anything fails is left out, with its `error`. With `out=`, a call that was stopped continues
+    where it was when the same call is made again.
 
     Args:
         pictures: a picture, a folder, a pattern such as `"flight/*.jpg"`, or a list of these.

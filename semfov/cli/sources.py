@@ -1,6 +1,7 @@
 """Pictures that a command names: files, those of folders, or an embedded scene."""
 
 import os
+import traceback
 from collections.abc import Mapping
 from glob import glob
 from pathlib import Path
@@ -11,8 +12,11 @@ from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import GazeOptions, PictureOptions, white_of
 from semfov.data.large import open_large, picture_size
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
-from semfov.errors import InputError, check, printable
+from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.head import Flat, Panorama
+from semfov.io.files import disk_is_full
+
+_DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in the code a picture has failed
 
 
 class PictureSource(NamedTuple):
@@ -43,6 +47,19 @@ class PictureSource(NamedTuple):
         except OSError:  # a link to nothing is skipped when it is opened
             return [self.name]
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
+
+    def fault(self, error: Exception, *, several: bool) -> SemfovError:
+        """Return what is wrong with this picture, which is not the end of `several`; raise what ends a command."""
+        if os.environ.get(_DEBUG):
+            traceback.print_exception(error)
+        if disk_is_full(error):
+            raise DataError(f"{error}; make room, and give the same command again") from error
+        if isinstance(error, SemfovError):
+            return error
+        if not several:
+            raise error
+        reason = " ".join(str(error).split()) or "no message"
+        return DataError(f"{self.name}: cannot be looked at ({type(error).__name__}: {reason})")
 
 
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:

@@ -18,7 +18,7 @@ from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.errors import DataError, InputError, check, check_data, needing, printable
+from semfov.errors import DataError, InputError, SemfovError, check, check_data, needing, printable
 from semfov.io.files import reading
 
 PHOTOGRAPHS = (
@@ -101,7 +101,7 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
 
 
 class Stream(NamedTuple):
-    """A video or a camera; `gaps` counts the frames that were `lost` and how often it was `reconnected`."""
+    """A video or a camera; `gaps` counts frames that were `lost` or `skipped`, and how often it was `reconnected`."""
 
     name: str
     rate: float | None
@@ -117,8 +117,8 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         source = Path(source)
     name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
     if isinstance(source, Path) and source.is_dir():
-        files = picture_files(source, frames=True)[:most]
-        return Stream(name, None, (Picture(file.name, read_image(file, white=white)) for file in files))
+        skips: Counter[str] = Counter()
+        return Stream(name, None, _read_frames(picture_files(source, frames=True)[:most], skips, white), skips)
     with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
     if isinstance(source, Path):
@@ -138,6 +138,27 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     frames = _record(cv2, recorder, source, name, most, gaps, white)
     first = next(frames)
     return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
+
+
+def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
+    """Frames of files; one that cannot be read, or is not as large as the first, is skipped with a warning."""
+    size, passed = None, 1.0
+    for file in files:
+        try:
+            image = read_image(file, white=white)
+            size = size or image.shape[-2:]
+            first, here = (f"{width} × {height}" for height, width in (size, image.shape[-2:]))
+            remedy = "`semfov search`, `find` and `explore` take pictures of any size, each by itself"
+            check_data(first == here, file.name, f"{first} px, the size of the first frame", f"{here}; {remedy}")
+        except Exception as error:
+            reason = error if isinstance(error, SemfovError) else f"{type(error).__name__}: {error}"
+            warnings.warn(f"skipped {file.name}: {reason}", stacklevel=2)
+            gaps["skipped"] += 1
+            passed += 1
+            continue
+        yield Picture(file.name, image, passed=passed)
+        passed = 1.0
+    check_data(size is not None, "source", "a frame that can be read", f"{len(files)} that cannot")
 
 
 def _name(address: str) -> str:

@@ -1,5 +1,6 @@
 """Atomic writes, checksums and checks of paths."""
 
+import errno
 import hashlib
 import json
 import os
@@ -7,11 +8,13 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from semfov.errors import DataError, check_data
 
@@ -37,7 +40,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path.parent.resolve())
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+        temporary = _beside(path, f"{secrets.token_hex(4)}.part")
         # Known before it exists: a signal may end the process while the file is created.
         _unfinished.add(temporary)
         temporary.touch(0o600, exist_ok=False)
@@ -53,6 +56,50 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             with suppress(OSError):
                 temporary.unlink()
             _unfinished.discard(temporary)
+
+
+def _beside(path: Path, end: str) -> Path:
+    """Name a hidden file beside another one, with as much of its name as every file system has room for."""
+    start = path.name.encode(errors="ignore")[:120].decode(errors="ignore")
+    return path.with_name(f".{start}.{end}")
+
+
+def disk_is_full(error: BaseException) -> bool:
+    """Tell whether an error, or its cause, is that of a full disk, on which no other file can be written either."""
+    cause = error.__cause__ or error
+    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def written_alone(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> Iterator[None]:
+    """Hold files, and folders of files, in a block; `DataError` where another command holds one of them."""
+    places = {_beside(path, f"{json_sha256(path.name)[:8]}.lock"): path for path in map(Path.resolve, files)}
+    places |= {folder / ".lock": folder for folder in map(Path.resolve, folders)}
+    with ExitStack() as held:
+        for place, path in places.items():
+            held.enter_context(_locked(place, path))
+        yield
+
+
+@contextmanager
+def _locked(place: Path, path: Path) -> Iterator[None]:
+    """Hold a lock of the system, which lets go of it when the process ends in any way; what is left holds nobody up."""
+    lock = FileLock(place)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        remedy = "wait until it has ended, or name another"
+        raise DataError(f"cannot write {path}: another command is writing it; {remedy}") from None
+    except OSError as error:
+        raise DataError(f"cannot write {path}: {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        # While it is held: a process that has opened it meanwhile sees that it is gone, and makes another one.
+        with suppress(OSError):
+            place.unlink()
+        lock.release()
 
 
 @cache

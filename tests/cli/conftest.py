@@ -37,6 +37,18 @@ def photo(tmp_path):
 
 
 @pytest.fixture
+def folder(photo, tmp_path):
+    """Three pictures, each with a red square at another place."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, name in enumerate("abc"):
+        picture = Image.new("RGB", (160, 120), (100, 100, 100))
+        picture.paste((230, 20, 20), (8 + 40 * number, 8, 28 + 40 * number, 28))
+        picture.save(folder / f"{name}.png")
+    return folder
+
+
+@pytest.fixture
 def large(tmp_path):
     ground = Image.linear_gradient("L").point(lambda value: 90 + value // 8)  # not blank, so that it is searched
     picture = ground.resize((1280, 960)).convert("RGB")

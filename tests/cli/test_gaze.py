@@ -165,6 +165,20 @@ def test_a_damaged_picture_of_several_is_skipped(run, photos, tmp_path):
     assert out.count("entropy") == 2
 
 
+def test_a_fault_at_one_picture_of_several_is_not_the_end(run, photos, tmp_path, monkeypatch):
+    scanpaths = GazePrediction.scanpaths
+
+    def fails(prediction, *arguments, **options):
+        if prediction.name.endswith("1.png"):
+            raise KeyError("a fault of the code")
+        return scanpaths(prediction, *arguments, **options)
+
+    monkeypatch.setattr(GazePrediction, "scanpaths", fails)
+    code, out, err = run(photos, "--out", tmp_path / "gaze.csv")
+    assert (code, out.count("entropy")) == (1, 1)
+    assert "1.png: cannot be looked at (KeyError: 'a fault of the code')" in err
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

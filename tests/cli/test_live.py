@@ -99,12 +99,20 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert "written:" not in printed.out
 
 
-def test_a_picture_of_another_size_than_the_first_is_named(run, tmp_path):
-    for name, size in (("a.png", (60, 40)), ("b.png", (60, 40)), ("c.png", (40, 60))):
+def test_a_frame_that_is_none_or_of_another_size_is_skipped(run, tmp_path):
+    for name, size in (("b.png", (60, 40)), ("c.png", (40, 60)), ("e.png", (60, 40))):
         Image.new("RGB", size).save(tmp_path / name)
+    for name in ("a.png", "d.png"):
+        (tmp_path / name).write_bytes(b"no picture")
     code, printed = run("live", tmp_path, "--target", "red")
     assert code == 1
-    assert "error: c.png: expected 60 × 40 px, the size of the first frame, got 40 × 60; `semfov search`" in printed.err
+    assert "skipped c.png: c.png: expected 60 × 40 px, the size of the first frame, got 40 × 60; `sem" in printed.err
+    assert re.findall(r"skipped ([ad])\.png", printed.err) == ["a", "d"]
+    assert "2 frames, 3 skipped" in printed.out
+    for name in "bce":
+        (tmp_path / f"{name}.png").unlink()
+    code, printed = run("live", tmp_path, "--target", "red")
+    assert (code, "error: source: expected a frame that can be read, got 2 that cannot" in printed.err) == (1, True)
 
 
 def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):

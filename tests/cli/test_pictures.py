@@ -355,8 +355,14 @@ def test_any_fault_of_one_picture_is_a_skip_with_its_reason(run, photo, tmp_path
         "a.png", "b\\udcff.png", "c\\x1b[31m.png", "d\n.png",
     ]  # fmt: skip
     assert len(result["skipped"]) == 3
-    for kind in ("csv", "geojson", "coco.json"):
+    for kind in ("geojson", "coco.json"):
         assert run("find", folder, "--out", tmp_path / f"boxes.{kind}", "--passes", 1)[0] == 1
+        assert json.loads((tmp_path / f"boxes.{kind}").read_text())["skipped"] == result["skipped"]
+    assert run("find", folder, "--out", tmp_path / "boxes.csv", "--passes", 1)[0] == 1
+    table = pd.read_csv(tmp_path / "boxes.csv")
+    assert table.error.dropna().tolist() == [each["error"] for each in result["skipped"]]
+    assert run("search", folder, "--target", "red", "--out", tmp_path / "found.csv", "--passes", 1)[0] == 1
+    assert pd.read_csv(tmp_path / "found.csv").error.notna().tolist() == [False] * 5 + [True] * 2
 
 
 def test_folders_have_pictures_of_all_formats_that_are_read_alone(tmp_path):
@@ -394,13 +400,17 @@ def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_
 
 
 def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_path):
-    """A picture without objects has a row for each class, one that cannot be read has none."""
+    """A picture without objects has a row for each class, one that cannot be read a row that is of no class."""
     Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "d.png")
     (folder / "e.png").write_bytes(b"no picture")
     code, _ = run("find", folder, "--target", "red,wine glass", "--out", tmp_path / "found.csv")
     assert code == 1
     table = pd.read_csv(tmp_path / "found.csv")
-    assert set(table.picture) == {str(folder / f"{name}.png") for name in "abcd"}
+    assert set(table.picture) == {str(folder / f"{name}.png") for name in "abcde"}
+    (wrong,) = table[table.error.notna()].to_dict("records")
+    assert Path(wrong["picture"]).name == "e.png"
+    assert wrong["error"].startswith(f"{folder / 'e.png'}: ")
+    assert pd.isna(wrong["class"])
     counts = table.groupby(["picture", "class"]).object.count().unstack()
     assert counts["red"].tolist() == [1, 1, 1, 0]
     assert counts["wine glass"].tolist() == [0, 0, 0, 0]
@@ -453,18 +463,6 @@ def test_files_that_cannot_be_written_are_told_before_the_first_look(run, photo,
         assert code == 1
         assert "is not a folder" in printed.err or "expected a file, got a folder" in printed.err
         assert not printed.out
-
-
-@pytest.fixture
-def folder(photo, tmp_path):
-    """Three pictures, each with a red square at another place."""
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for number, name in enumerate("abc"):
-        picture = Image.new("RGB", (160, 120), (100, 100, 100))
-        picture.paste((230, 20, 20), (8 + 40 * number, 8, 28 + 40 * number, 28))
-        picture.save(folder / f"{name}.png")
-    return folder
 
 
 def untimed(file):

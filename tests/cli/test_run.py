@@ -1,6 +1,8 @@
 """Many pictures by one call of Python: what the command writes, with files of each object."""
 
 import csv
+import errno
+import json
 import os
 import shutil
 import signal
@@ -14,9 +16,11 @@ from PIL import Image
 
 import semfov
 from semfov import DataError, InputError, read_image
+from semfov.cli import outcome, search
 from semfov.cli.options import FindOptions
 from semfov.cli.search import _FindJob
 from semfov.gaze.policies import Policy
+from semfov.paths import Record
 from semfov.runs.command import run_command
 from semfov.runs.scene_run import digest_of
 from semfov.runs.settings import Settings
@@ -63,6 +67,126 @@ def test_a_call_that_was_stopped_continues(agent, flight, tmp_path, monkeypatch)
     assert len(semfov.run(flight, "red", **wanted)) == 2
     assert len(seen) == 3
     assert list(tmp_path.glob("*.unfinished")) == []
+
+
+@pytest.mark.parametrize(
+    ("where", "name"),
+    [
+        (semfov.ActivePerception, "find_all"), (Record, "to_dict"), (Record, "crops"), (Record, "to_yolo"),
+        (Record, "page_data"), (outcome, "save_figure"), (search, "write_bytes"), (outcome, "_outcome_text"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_fault_at_one_picture_is_a_row_with_its_reason(
+    agent, folder, number, where, name, tmp_path, monkeypatch, capsys
+):
+    """Whatever fails at it, at the first picture or a later one, the others are written, and the code is in reach."""
+    inner, doors = getattr(where, name), []
+    opened = semfov.cli.sources.PictureSource.opened
+
+    def at(source, how):
+        doors.append(source.place.stem)
+        return opened(source, how)
+
+    def fails(*arguments, **options):
+        if doors[-1] == "abc"[number]:
+            raise KeyError("a fault of the code")
+        return inner(*arguments, **options)
+
+    monkeypatch.setattr(semfov.cli.sources.PictureSource, "opened", at)
+    monkeypatch.setattr(where, name, fails)
+    monkeypatch.setenv("SEMFOV_DEBUG", "1")
+    wanted = {"crops": tmp_path / "crops", "labels": tmp_path / "labels", "report": tmp_path / "page.html"}
+    rows = semfov.run(folder, "red", agent=agent, passes=1, out=tmp_path / "out", **wanted)
+    assert [row.get("error", "").partition(": cannot be looked at ")[2] for row in rows] == [
+        "(KeyError: 'a fault of the code')" * (each == number) for each in range(3)
+    ]
+    written = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [len(written[each]) for each in ("pictures", "skipped")] == [2, 1]
+    assert {path.stem for path in (tmp_path / "labels").iterdir()} >= {"abc"[each] for each in {0, 1, 2} - {number}}
+    printed = capsys.readouterr().err
+    assert f"skipped {folder / 'abc'[number]}.png" in printed
+    assert 'raise KeyError("a fault of the code")' in printed
+
+
+def test_pictures_with_long_names_end_no_command(run, photo, tmp_path):
+    """A crop has a longer name than its picture, and may have none."""
+    names = [f"{'n' * (length - 4)}.png" for length in (200, 240, 241, 250, 251, 252, 255)]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        shutil.copy(photo, tmp_path / "in" / name)
+    command = ["find", tmp_path / "in", "--target", "red", "--out", tmp_path / "out.jsonl", "--passes", 1]
+    code, printed = run(*command, "--labels", tmp_path / "labels", "--crops", tmp_path / "crops")
+    assert code == 1
+    rows = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    skipped = [len(os.path.basename(row["picture"])) for row in rows if "error" in row]
+    assert skipped == [252, 255]
+    assert [len(row["objects"]) for row in rows if "error" not in row] == [1] * 5
+    assert {row["error"].rpartition(": ")[2] for row in rows if "error" in row} == {os.strerror(errno.ENAMETOOLONG)}
+    assert f"{len(names)} pictures: 5 looked at; 2 skipped" in printed.out
+    code, _ = run(*command, "--labels", tmp_path / "more")
+    assert code == 0
+    assert {path.stem for path in (tmp_path / "more").iterdir()} == {name.removesuffix(".png") for name in names}
+
+
+def test_a_full_disk_ends_a_command_that_then_continues(agent, folder, tmp_path, monkeypatch, capsys):
+    find_all, write, seen = agent.find_all, search.write_bytes, []
+
+    def full(path, content):
+        if path.endswith("b.txt"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, content)
+
+    monkeypatch.setattr(agent, "find_all", lambda *given, **named: seen.append(given) or find_all(*given, **named))
+    monkeypatch.setattr(search, "write_bytes", full)
+    wanted = {"agent": agent, "passes": 1, "out": tmp_path / "found.jsonl", "labels": tmp_path / "labels"}
+    with pytest.raises(DataError, match="make room, and give the same command again"):
+        semfov.run(folder, "red", **wanted)
+    assert "the same command continues" in capsys.readouterr().err
+    monkeypatch.setattr(search, "write_bytes", write)
+    rows = semfov.run(folder, "red", **wanted)
+    assert ["error" in row for row in rows] == [False] * 3
+    assert len(seen) == 4  # the second picture twice
+    assert len((tmp_path / "found.jsonl").read_text().splitlines()) == 3
+
+
+def test_a_second_command_with_the_same_output_is_refused(run, agent, folder, tmp_path, monkeypatch):
+    find_all, refused = agent.find_all, []
+    command = ["find", folder, "--target", "red", "--out", tmp_path / "found.jsonl", "--passes", 1]
+
+    def looks(picture, *arguments, **options):
+        monkeypatch.setattr(agent, "find_all", find_all)
+        refused.append(run(*command))
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", looks)
+    assert run(*command)[0] == 0
+    ((code, printed),) = refused
+    assert code == 1
+    assert printed.err.endswith(
+        f"error: cannot write {tmp_path / 'found.jsonl'}: another command is writing it; wait until it has ended, or "
+        "name another\n"
+    )
+    assert len((tmp_path / "found.jsonl").read_text().splitlines()) == 3
+
+
+def test_an_argument_that_no_picture_can_be_looked_at_with_is_refused(agent, folder, photo, monkeypatch):
+    """A picture that takes no such argument is left out alone."""
+    find_all = agent.find_all
+
+    def refuses(picture, *arguments, **options):
+        if not picture.endswith(last):
+            raise InputError("passes: expected other ones")
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", refuses)
+    last = "c.png"
+    rows = semfov.run(folder, "red", agent=agent, passes=1)
+    assert [row.get("error") for row in rows] == ["passes: expected other ones"] * 2 + [None]
+    last = "d.png"
+    with pytest.raises(InputError, match="other ones"):
+        semfov.run(folder, "red", agent=agent, passes=1)
 
 
 def test_only_outcomes_of_the_same_agent_are_continued(agent, flight):
