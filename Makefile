@@ -21,7 +21,7 @@ NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 .PHONY: help setup search test numeric library lab app test-all test-quick gpu coverage mutation docs lint types constraints clean
 
 help:
-	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
+	@echo "make search      set up, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types and the tests of the library"
 	@echo "make lab         the tests of studies, whole fits, benchmarks and the site"
 	@echo "make app         the page on which to try an agent out, in Chromium"

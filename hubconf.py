@@ -1,4 +1,4 @@
-"""Entry points of `torch.hub`: `torch.hub.load("OWNER/semfov", "yolov3_tiny_eye")`."""
+"""Entry points of `torch.hub`: `torch.hub.load("OWNER/semfov", "eye")`."""
 
 from typing import Any
 
@@ -20,40 +20,43 @@ def foveation(sigma: float = 100.0, **options: Any) -> _semfov.Foveation:
     return _semfov.Foveation(sigma, **options)
 
 
-def yolov3_tiny_detector(**options: Any) -> _semfov.Detector:
-    """Load YOLOv3-tiny with full score vectors; the weights are downloaded once.
+def detector(name: str = "yolox-nano", **options: Any) -> _semfov.Detector:
+    """Load a detector with full score vectors.
 
     Args:
+        name: name of the detector; the default one needs no network.
         options: options of `semfov.load_detector`.
 
     Returns:
         The detector.
     """
-    return _semfov.load_detector("yolov3-tiny", **options)
+    return _semfov.load_detector(name, **options)
 
 
-def yolov3_tiny_observation() -> _semfov.FovealObservationModel:
-    """Load the observation model that is shipped for YOLOv3-tiny and a fovea of 100 pixels."""
-    return _semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
+def observation(name: str = "yolox-nano") -> _semfov.FovealObservationModel:
+    """Load the observation model that is shipped for a detector and a fovea of 100 pixels."""
+    return _semfov.FovealObservationModel.from_pretrained(name)
 
 
-def yolov3_tiny_eye(sigma: float = 100.0, **options: Any) -> _semfov.Eye:
+def eye(name: str = "yolox-nano", sigma: float = 100.0, **options: Any) -> _semfov.Eye:
     """Make sensor and detector as one module: `eye(image, fixations) -> semfov.Detections`.
 
     Args:
+        name: name of the detector.
         sigma: width of the fovea, in pixels of an image whose longer side is 640.
         options: options of `semfov.load_detector`.
 
     Returns:
         The eye, in `eval` mode.
     """
-    return _semfov.Eye(foveation(sigma), yolov3_tiny_detector(**options)).eval()
+    return _semfov.Eye(foveation(sigma), detector(name, **options)).eval()
 
 
-def yolov3_tiny_agent(kind: str = "recommended", **options: Any) -> _semfov.ActivePerception:
+def agent(name: str = "yolox-nano", kind: str = "recommended", **options: Any) -> _semfov.ActivePerception:
     """Make an agent that searches: `agent.search(image, "cup") -> semfov.Scanpath`.
 
     Args:
+        name: a detector with shipped models; with `raw`, any detector.
         kind: `recommended`, `published` or `raw`.
         options: options of `semfov.ActivePerception.recommended`, `.published` or `.raw`.
 
@@ -70,4 +73,4 @@ def yolov3_tiny_agent(kind: str = "recommended", **options: Any) -> _semfov.Acti
     }
     if kind not in agents:
         raise _semfov.InputError(f"kind: expected {', '.join(agents)}, got {kind!r}")
-    return agents[kind]("yolov3-tiny", **options)
+    return agents[kind](name, **options)

@@ -202,7 +202,7 @@ def main() -> None:
     parser.add_argument("--annotations", type=Path, help="annotation file of the photographs, in the COCO format")
     parser.add_argument("--count", type=int, default=8, help="number of photographs")
     parser.add_argument("--fixations", type=int, default=5, help="number of fixations in each photograph")
-    parser.add_argument("--detector", default="yolov3-tiny", help="name or file of the detector")
+    parser.add_argument("--detector", default="yolox-nano", help="name or file of the detector")
     parser.add_argument("--weights", help="file of the detector's weights (none: the registered weights)")
     parser.add_argument("--fovea", type=float, default=60.0, help="eccentricity in pixels at which acuity is halved")
     parser.add_argument("--spacing", type=float, default=1.0, help="distance of receptors at the fixation, in pixels")

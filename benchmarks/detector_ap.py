@@ -91,7 +91,7 @@ def average_precision(
 def main() -> None:
     """Measure, and print the table."""
     parser = argparse.ArgumentParser(description="COCO average precision of a detector, without foveation")
-    parser.add_argument("--detector", default="yolov3-tiny", help="name or file, as load_detector takes it")
+    parser.add_argument("--detector", default="yolox-nano", help="name or file, as load_detector takes it")
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--root", type=Path, required=True, help="folder of the photographs")
     parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")

@@ -101,7 +101,7 @@ _RECORDS = ("episodes.jsonl", "summary.csv")
 COMMANDS = (
     Command("store", search, (*_ALONE, *_SEARCH), (*_RECORDS, "cumulative_performance.png")),
     Command("evaluation", explore, (*_ALONE, *_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
-    Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
+    Command("fit", fit, tuple(_FIT), ("yolox-nano.safetensors", "report.md", "counts.csv")),
     Command("workers", search, (*_SEARCH, "--workers", "2"), _RECORDS),
     Command("reports", explore, (*_ALONE, *_EXPLORE), (*_RECORDS, "report.html"), stored=True, finished=True),
 )

@@ -65,13 +65,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30, help="steps of Adam (default: 30)")
     arguments = parser.parse_args()
 
-    detector = semfov.load_detector("yolov3-tiny")
+    detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(semfov.Foveation(100.0), detector).requires_grad_(False)
     train, test = (
         looks_at(semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=seed), eye, arguments.starts)
         for seed in (1, 2)
     )
-    published = semfov.FovealObservationModel.from_pretrained("yolov3-tiny-published")
+    published = semfov.FovealObservationModel.from_pretrained("yolox-nano-published")
     model = copy.deepcopy(published).train()
     optimiser = torch.optim.Adam([model.log_alpha], lr=0.02)
     for step in range(arguments.steps):

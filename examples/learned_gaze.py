@@ -120,7 +120,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=120, help="steps of Adam (default: 120)")
     arguments = parser.parse_args()
     torch.manual_seed(0)
-    detector = semfov.load_detector("yolov3-tiny")
+    detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("gradual"), detector).requires_grad_(False)
     observer = semfov.observers.Semantic(len(detector.classes) + 1, tempering=0.25, footprint="box_centre")
     train, test = (

@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the panorama of embedded scenes (default: 0)")
     arguments = parser.parse_args()
 
-    agent = HeadAgent.recommended("yolov3-tiny")
+    agent = HeadAgent.recommended()
     if arguments.panorama:
         image = semfov.read_image(arguments.panorama)
     else:

@@ -67,7 +67,7 @@ class BestScore(semfov.observers.Observer):
 
 def main() -> None:
     """Search an embedded scene for a cup."""
-    detector = semfov.load_detector("yolov3-tiny")
+    detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
     scene = semfov.EmbeddedScenes(detector.classes)[1]
     image, grid, cup = scene.image[None], semfov.Grid(10, 10, scene.size), detector.classes.index("cup") + 1

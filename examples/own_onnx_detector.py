@@ -1,18 +1,16 @@
 """Plug in your own detector as an ONNX file, and fit an observation model to its scores away from the fovea.
 
 Run it from a checkout: python -m examples.own_onnx_detector MODEL.onnx --out model.safetensors
-Without a file, it exports YOLOv3-tiny and uses that. For real use, fit on thousands of photographs with
+Without a file, it uses that of YOLOX-nano. For real use, fit on thousands of photographs with
 `train.fit_fom`.
 """
 
 import argparse
-import tempfile
-from pathlib import Path
 
 import torch
 
 import semfov
-from semfov.detection.export import export_onnx
+from semfov.detection.weights import fetch
 from semfov.observation.matching import match
 
 EDGES = [n * 50 / 640 for n in range(1, 8)]  # borders between levels of distance, in units of the image's longer side
@@ -36,18 +34,13 @@ def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> l
 def main() -> None:
     """Fit on some embedded scenes, evaluate on others, and search with the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("model", nargs="?", help="ONNX detector (default: an export of YOLOv3-tiny)")
+    parser.add_argument("model", nargs="?", help="ONNX detector (default: YOLOX-nano)")
     parser.add_argument("--scenes", type=int, default=8, help="scenes to fit on (default: 8)")
     parser.add_argument("--looks", type=int, default=6, help="fixations in each scene (default: 6)")
     parser.add_argument("--out", default="model.safetensors", help="file to write (default: model.safetensors)")
     arguments = parser.parse_args()
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = arguments.model
-        if path is None:
-            path = Path(folder) / "own.onnx"
-            export_onnx(semfov.load_detector("yolov3-tiny"), path)
-        detector = semfov.load_detector(path)
+    detector = semfov.load_detector(arguments.model or fetch("yolox-nano"))
     print(f"{detector.name} knows {len(detector.classes)} classes and takes pictures of {detector.input_size}")
 
     eye = semfov.Eye(semfov.Foveation(sigma=100.0), detector).eval()

@@ -40,7 +40,7 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
 
 def main() -> None:
     """Search embedded scenes for all their classes, without the wide inhibition and with it."""
-    detector = semfov.load_detector("yolov3-tiny")
+    detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
     observer = semfov.observers.Semantic(len(detector.classes) + 1)
     scenes = semfov.EmbeddedScenes(detector.classes, count=4)

@@ -55,7 +55,7 @@ class MagnifyingGlass(Sensor):
 
 def main() -> None:
     """Fixate every object of two mosaics, in which objects are small, and count those that are recognised."""
-    detector = semfov.load_detector("yolov3-tiny")
+    detector = semfov.load_detector("yolox-nano")
     mosaics = Mosaics(semfov.EmbeddedScenes(detector.classes, count=8), 2, 2, tile=(320, 240), count=2)
     sensors = {"published fovea": named_sensor("published"), "magnifying glass": MagnifyingGlass(power=3.0)}
     for name, sensor in sensors.items():

@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--out", default="pan_tilt.png", help="figure to write (default: pan_tilt.png)")
     arguments = parser.parse_args()
 
-    agent = semfov.ActivePerception.recommended("yolov3-tiny")
+    agent = semfov.ActivePerception.recommended()
     picture = arguments.panorama
     if picture is None:
         scenes = semfov.EmbeddedScenes(agent.classes[1:], count=12)

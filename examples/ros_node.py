@@ -19,7 +19,7 @@ class GazeNode(Node):
     def __init__(self) -> None:
         super().__init__("semfov_gaze")
         target = self.declare_parameter("target", "cup").value
-        detector = self.declare_parameter("detector", "yolov3-tiny").value
+        detector = self.declare_parameter("detector", "yolox-nano").value
         self.agent = semfov.ActivePerception.recommended(detector)
         self.target, self.live = target, self.agent.live(target)
         self.detections = self.create_publisher(Detection2DArray, "detections", 1)

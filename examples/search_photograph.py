@@ -20,7 +20,7 @@ def main() -> None:
     # The agent consists of an eye (a sensor followed by a detector), an observer that turns looks into a belief, and a
     # policy that chooses where to look next. `.published` gives the agent of the paper; `semfov.ActivePerception(...)`
     # combines your own parts.
-    agent = semfov.ActivePerception.recommended("yolov3-tiny")
+    agent = semfov.ActivePerception.recommended()
 
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image
     scanpath = agent.search(image, arguments.target, start=0)

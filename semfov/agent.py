@@ -66,7 +66,7 @@ class ActivePerception(nn.Module):
 
     Example::
 
-        agent = ActivePerception.recommended("yolov3-tiny")
+        agent = ActivePerception.recommended()
         agent.search("kitchen.jpg", "cup").decision
         agent.find_all("harbour.jpg", "boat", passes=16).objects
         agent.search(semfov.Panorama("street.jpg"), "bicycle").plot()
@@ -98,7 +98,7 @@ class ActivePerception(nn.Module):
     @classmethod
     def recommended(
         cls,
-        name: str = "yolov3-tiny",
+        name: str = "yolox-nano",
         *,
         sigma: float = 100.0,
         growth: float = 2.0,
@@ -108,7 +108,7 @@ class ActivePerception(nn.Module):
         """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
 
         Args:
-            name: a detector with shipped models: `yolov3-tiny`, `yolox-nano`, `nanodet-plus-m-1.5x` (with `weights=`).
+            name: a detector with shipped models: `yolox-nano`, `yolov3-tiny`, `nanodet-plus-m-1.5x` (with `weights=`).
             sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
             growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
@@ -124,7 +124,7 @@ class ActivePerception(nn.Module):
         return cls._of(recommended_arguments, name, sigma, growth, grid, **options)
 
     @classmethod
-    def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
+    def from_pretrained(cls, name: str | PathLike[str] = "yolox-nano", **options: Any) -> Self:
         """The agent from a folder that `semfov.fit_detector` wrote, or the recommended agent for a detector.
 
         Args:
@@ -144,7 +144,7 @@ class ActivePerception(nn.Module):
     @classmethod
     def published(
         cls,
-        name: str | PathLike[str] = "yolov3-tiny",
+        name: str | PathLike[str] = "yolox-nano",
         *,
         sensor: str | None = None,
         search: str = "predictive",
@@ -161,7 +161,7 @@ class ActivePerception(nn.Module):
         grid and observation model are those of the folder.
 
         Args:
-            name: a detector that models are shipped for, `yolov3-tiny` or `yolox-nano`, or a folder of models.
+            name: a detector that models are shipped for, `yolox-nano` or `yolov3-tiny`, or a folder of models.
             sensor: `published`, the wide fovea, or `published-narrow`; None is the wide one, or that of the folder.
             search: `predictive` or `non-predictive`.
             calibrated: whether scores are calibrated by the observation model before fusion ("Modified Kaplan").
@@ -177,7 +177,7 @@ class ActivePerception(nn.Module):
         return cls._of(published_arguments, name, sensor, search, calibrated, **options)
 
     @classmethod
-    def raw(cls, name: DetectorLike = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
+    def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:
         """An agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
 
         Args:

@@ -48,7 +48,7 @@ class Eye(StatedModule):
 
     Example::
 
-        eye = semfov.Eye(semfov.Foveation(100.0), semfov.load_detector("yolov3-tiny"))
+        eye = semfov.Eye(semfov.Foveation(100.0), semfov.load_detector("yolox-nano"))
         view = eye.open("kitchen.jpg")
         detections = eye.look(view, [(320.0, 240.0), (100.0, 50.0)])  # a batch of two looks
     """

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "semfov"
-DATA = {".safetensors", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
+DATA = {".safetensors", ".onnx", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
 
 CODE = """
 import sys
@@ -32,9 +32,9 @@ home = Path(semfov.__file__).parent
 assert Path(sys.prefix) in home.parents, home
 models = sorted(path for path in home.rglob("*.safetensors"))
 assert len(models) > 15, models
-semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
-semfov.TargetEvidence.from_pretrained("yolov3-tiny")
-semfov.MapEvidence.from_pretrained("yolov3-tiny")
+semfov.FovealObservationModel.from_pretrained("yolox-nano")
+semfov.TargetEvidence.from_pretrained("yolox-nano")
+semfov.MapEvidence.from_pretrained("yolox-nano")
 assert "<script" in page_html("a page", [])
 view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
 print(semfov.__version__, view.shape[-1])
@@ -105,7 +105,7 @@ def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
     (site / "dependencies.pth").write_text("\n".join(sorted(libraries)) + "\n", encoding="utf-8")
     printed = run(python, "-W", "error", "-c", CODE, cwd=tmp_path)
     assert printed.split()[:2] == [semfov.__version__, "8"]
-    assert "yolov3-tiny" in printed
+    assert "yolox-nano" in printed
     assert "--give_up" in printed
     command = home / "bin" / "semfov"
     assert run(command, "--version", cwd=tmp_path) == f"semfov {semfov.__version__}\n"

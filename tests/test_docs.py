@@ -22,7 +22,6 @@ from eval.figures import _FIGURES
 from eval.page.figures import PAGE_FIGURES
 from semfov.cli.main import main
 from semfov.cli.main import main as semfov_command
-from semfov.detection.weights import fetch
 from tests.colours import SMALL, write_network, write_photographs
 from tests.small import once
 
@@ -31,7 +30,6 @@ GUIDES = [*sorted(DOCS.glob("guides/*.md")), DOCS / "pan-tilt.md"]
 PAGES = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 
 
-@pytest.mark.weights
 @pytest.mark.filterwarnings("ignore:levels with fewer than")
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_guides_run(guide, tmp_path, monkeypatch):
@@ -223,24 +221,18 @@ def test_commands_are_covered_and_programs_exist():
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    """A cache with only the weights of the default detector."""
-    try:
-        kept = fetch("yolov3-tiny")
-    except semfov.DataError as error:
-        pytest.skip(f"the default detector's weights are missing: {error}")
-    cache = tmp_path_factory.mktemp("cache")
-    (cache / kept.name).symlink_to(kept)
-    return cache
+def cache(tmp_path_factory):
+    """An empty cache: the default detector is in the package."""
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture
-def given(tmp_path, monkeypatch, weights, reader):
+def given(tmp_path, monkeypatch, cache, reader):
     """What code of a reader takes as given; the present folder is a copy of the reader's."""
     filled, given = reader
     shutil.copytree(filled, tmp_path, symlinks=True, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SEMFOV_CACHE", str(weights))
+    monkeypatch.setenv("SEMFOV_CACHE", str(cache))
     return given
 
 
@@ -275,7 +267,6 @@ def written_files(printed):
     return names
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize("line", SEMFOV)
 def test_command_runs_as_printed(line, folder, run):
@@ -311,7 +302,6 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
     assert written_files(run(once([*study, "--data.min_instances", "0", "--data.limit", "1"])))
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_code_runs_as_printed(given, capsys):
     """The blocks in their order, with frames of the video and with a file of people's fixations."""
@@ -330,7 +320,7 @@ def test_code_runs_as_printed(given, capsys):
 TASKS = Path(__file__).parents[1] / "docs" / "tasks"
 TASK_PAGES = sorted(TASKS.glob("*.md"))
 SHORTER = {
-    "yolox-nano|nanodet-plus-m-1.5x": "yolov3-tiny",
+    "yolov3-tiny|nanodet-plus-m-1.5x": "yolox-nano",
     "(?<=passes[= ])16": "3",
     "(?<=shifts=)(5|10)": "2",
     "(?<=duration=)10": "3",
@@ -355,7 +345,6 @@ def kept_level():
     log.setLevel(level)
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.usefixtures("kept_level")
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)

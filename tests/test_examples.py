@@ -9,7 +9,7 @@ from PIL import Image
 
 import semfov
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture

@@ -188,22 +188,20 @@ def test_published_models_are_fitted_at_other_thresholds_too(detector, threshold
     assert not model.log_prior.any()
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
 def test_published_agent_searches_and_explores(sensor):
-    agent = semfov.ActivePerception.published("yolov3-tiny", sensor=sensor, search="non-predictive")
+    agent = semfov.ActivePerception.published(sensor=sensor, search="non-predictive")
     assert float(agent.eye.sensor.sigma) == pytest.approx(SENSORS[sensor].settings["sigma"])
     assert agent.eye.sensor.growth == 1
     scene = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)[0]
     assert len(agent.search(scene.image, "person", start=0, shifts=2)) <= 3
     assert len(agent.explore(scene.image, start=0, shifts=2)) == 3
     with pytest.raises(semfov.InputError, match="published sensor 'gradual'"):
-        semfov.ActivePerception.published("yolov3-tiny", sensor="gradual")
+        semfov.ActivePerception.published(sensor="gradual")
 
 
-@pytest.mark.weights
 def test_recommended_agent_searches_and_explores():
-    agent = semfov.ActivePerception.from_pretrained("yolov3-tiny")
+    agent = semfov.ActivePerception.from_pretrained()
     scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)
     scene = scenes[0]
     target = scenes.targets(0)[0]

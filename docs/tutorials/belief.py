@@ -13,8 +13,8 @@ import semfov
 from semfov.sensor import named_sensor
 
 torch.set_grad_enabled(False)
-detector = semfov.load_detector("yolov3-tiny")
-model = semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
+detector = semfov.load_detector("yolox-nano")
+model = semfov.FovealObservationModel.from_pretrained("yolox-nano")
 eye = semfov.Eye(named_sensor("gradual"), detector).eval()
 
 scene = semfov.EmbeddedScenes(detector.classes)[1]  # made of photographs that come with installed packages

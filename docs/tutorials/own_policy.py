@@ -36,7 +36,7 @@ print(policies.policy_names("exploration"))
 # recommended agent for the published fovea, and combine them with the new policy.
 
 # %% alt="The scanpath over a collage of photographs by the new policy, with the foveated views and the classes of the map"
-recommended = semfov.ActivePerception.recommended("yolov3-tiny", sigma=100, growth=1)
+recommended = semfov.ActivePerception.recommended(sigma=100, growth=1)
 search = recommended.searching.observer, recommended.searching.policy
 mapper, closer = recommended.exploring.observer, recommended.exploring.policy
 agents = {

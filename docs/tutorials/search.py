@@ -8,7 +8,7 @@
 import semfov
 from semfov import viz
 
-agent = semfov.ActivePerception.recommended("yolov3-tiny")
+agent = semfov.ActivePerception.recommended()
 scene = semfov.EmbeddedScenes(agent.classes[1:])[6]
 # The image can also be a path, a Pillow image, a NumPy array or a tensor.
 scanpath = agent.search(scene.image, "cat", start=99)

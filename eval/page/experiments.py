@@ -232,7 +232,11 @@ def experiments(config: ResultsConfig) -> dict[str, Experiment]:
 
 def detector(name: str, config: ResultsConfig) -> DetectorConfig:
     """Settings of a detector of the page."""
-    return DetectorConfig(name="yolox-nano", weights=config.yolox) if name == "nano" else DetectorConfig()
+    return (
+        DetectorConfig(name="yolox-nano", weights=config.yolox)
+        if name == "nano"
+        else DetectorConfig(name="yolov3-tiny")
+    )
 
 
 def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:

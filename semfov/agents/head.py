@@ -63,11 +63,11 @@ class HeadAgent(nn.Module):
         self.target_evidence, self.map_evidence = search, explore
 
     @classmethod
-    def recommended(cls, name: str = "yolov3-tiny", **options: Any) -> Self:
+    def recommended(cls, name: str = "yolox-nano", **options: Any) -> Self:
         """Make the agent with the models that are shipped for a detector, as `ActivePerception.recommended` does.
 
         Args:
-            name: `yolov3-tiny`, `yolox-nano`, or `nanodet-plus-m-1.5x` with `weights=`.
+            name: `yolox-nano`, `yolov3-tiny`, or `nanodet-plus-m-1.5x` with `weights=`.
             options: options of `semfov.load_detector`.
 
         Returns:

@@ -75,7 +75,7 @@ class ZoomAgent(nn.Module):
         self.classes = ("background", *eye.detector.classes)
 
     @classmethod
-    def recommended(cls, name: str = "yolov3-tiny", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
+    def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
         """Create the agent with the evidence that is shipped for a detector.
 
         Args:

@@ -6,7 +6,7 @@ from semfov.belief import MapEvidence, TargetEvidence, Verification
 from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
 from semfov.detection.load import check_detector, load_detector
-from semfov.detection.weights import WEIGHTS, cache_folder
+from semfov.detection.weights import WEIGHTS, cache_folder, weights_path
 from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
@@ -39,11 +39,11 @@ def show(options: DetectorsOptions) -> int:
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
         elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
-        there = "here" if (cache_folder() / weights.file).is_file() else elsewhere
+        there = "here" if weights_path(name).is_file() else elsewhere
         models = [what for what, kind in _PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
         rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
     print("\n".join(table_lines(rows)))
-    print(f"\nWeights are kept in {cache_folder()}.")
+    print(f"\nDownloaded weights are kept in {cache_folder()}.")
     print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")
     print("A detector without shipped models runs with --agent raw, or after semfov fit.")
     return 0

@@ -29,7 +29,7 @@ Without a picture, search, find, explore and gaze take an embedded scene, so `se
 """
 
 _AGENT = """\
-  --detector NAME      yolov3-tiny (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
+  --detector NAME      yolox-nano (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
   --models FOLDER      models of your own detector, from semfov fit; --classes cat,dog: names that its file lacks
   --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
 
@@ -138,7 +138,7 @@ semfov gaze: where people look in a picture that they view freely
 usage: semfov gaze [PICTURE ...] [options]
 
   PICTURE              photographs, or folders of them (none: an embedded scene)
-  --detector NAME      the detector whose features are read: yolov3-tiny (default), yolox-nano, nanodet-plus-m-1.5x
+  --detector NAME      the detector whose features are read: yolox-nano (default), yolov3-tiny, nanodet-plus-m-1.5x
   --weights FILE       its weights, where they are not downloaded
   --model FILE         a model for your own detector or of your own fixations, from semfov fit
   --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
@@ -231,8 +231,8 @@ usage: semfov detectors [NAME]
 
   NAME                 name or file of a detector, as for semfov.load_detector, or a folder of models
 
-Weights are downloaded when a detector is first used, into $SEMFOV_CACHE or the user's cache folder. A detector without
-shipped models runs with --agent raw, or after semfov fit.
+Weights of the default, yolox-nano, are in the package. Those of others are downloaded when they are first used, into
+$SEMFOV_CACHE or the user's cache folder. A detector without shipped models runs with --agent raw, or after semfov fit.
 """,
 }
 """The help of the command, and that of each subcommand: one screen."""

@@ -44,7 +44,7 @@ class AgentOptions(Settings):
     """
 
     agent: Literal["recommended", "published", "raw"] = "recommended"
-    detector: str = "yolov3-tiny"
+    detector: str = "yolox-nano"
     weights: Path | None = None
     models: Path | None = None
     classes: tuple[str, ...] | None = None

@@ -282,10 +282,6 @@ def _look_and_write(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
             if number not in before:
                 tqdm.write(outcome.text, file=sys.stdout)
         complete = True
-        longest = max((max(row["width"], row["height"]) for row in outputs.rows.values() if "width" in row), default=0)
-        detector, by_windows = job.agent.eye.detector, job.options.how in ("auto", "windows")
-        if by_windows and detector.settings()["name"] == "yolov3-tiny" and longest > 2 * max(detector.input_size):
-            print("in large pictures yolox-nano finds more small objects: --detector yolox-nano")
     finally:
         if outputs.rows:
             outputs.finish(complete=complete)

@@ -96,7 +96,7 @@ def chosen(layers: Iterable[str] | None, have: Sequence[str], detector: str) -> 
 def no_features(detector: str) -> InputError:
     """The error of a detector that hides its feature maps."""
     return InputError(
-        f"detector: expected one that gives access to its feature maps, such as yolov3-tiny, yolox-nano or a model of "
+        f"detector: expected one that gives access to its feature maps, such as yolox-nano, yolov3-tiny or a model of "
         f"torchvision or transformers, got {detector}"
     )
 

@@ -60,7 +60,8 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
       and `UltralyticsDetector` in the modules of these names in `semfov.detection`.
     - A `Detector`: returned as it is.
 
-    The weights of a named detector are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
+    `yolox-nano`, the default detector, is in the package. The weights of others are downloaded once
+    (`semfov.detection.weights`); `weights=` reads a file instead.
     Names are the same in upper and lower case.
 
     Args:

@@ -1,4 +1,4 @@
-"""Named weights: their files, the sources that they are fetched from, and the cache that keeps them."""
+"""Named weights: the file in the package, the sources of the others, and the cache that keeps them."""
 
 import os
 import shutil
@@ -103,7 +103,7 @@ class _SourceDistribution(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """A weights file that is downloaded by name."""
+    """A weights file that is found by name: in the package, in the cache, or at one of its sources."""
 
     file: str
     size: int
@@ -114,6 +114,9 @@ class _Weights(NamedTuple):
 
 
 _DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
+_YOLOX_LICENCE = "Apache-2.0 (YOLOX, Megvii)"
+_YOLOX_RELEASE = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
+_PACKAGED = Path(__file__).parent / "models"
 
 
 def _official(file: str) -> tuple[_Address, ...]:
@@ -121,8 +124,7 @@ def _official(file: str) -> tuple[_Address, ...]:
 
 
 def _yolox(file: str, size: int, digest: str) -> _Weights:
-    release = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
-    return _Weights(file, size, digest, "Apache-2.0 (YOLOX, Megvii)", (_Address(f"{release}/{file}"),))
+    return _Weights(file, size, digest, _YOLOX_LICENCE, (_Address(f"{_YOLOX_RELEASE}/{file}"),))
 
 
 WEIGHTS: dict[str, _Weights] = {
@@ -155,8 +157,14 @@ WEIGHTS: dict[str, _Weights] = {
         _DARKNET_LICENCE,
         _official("yolov3-spp.weights"),
     ),
-    "yolox-nano": _yolox(
-        "yolox_nano.onnx", 3_659_407, "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d"
+    # The file is in the package (semfov/detection/models/README.md).
+    "yolox-nano": _Weights(
+        "yolox_nano_416.onnx",
+        3_660_092,
+        "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14",
+        _YOLOX_LICENCE,
+        (),
+        f"it is a part of semfov, so install semfov again; {_YOLOX_RELEASE}/yolox_nano.onnx is the same network",
     ),
     "yolox-tiny": _yolox(
         "yolox_tiny.onnx", 20_219_662, "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7"
@@ -190,10 +198,17 @@ def cache_folder() -> Path:
     return folder
 
 
-def fetch(name: str) -> Path:
-    """Find named weights in the cache, and download them if they are missing."""
+def weights_path(name: str) -> Path:
+    """Name the place of named weights: in the package, or else in the cache, where they may be missing."""
     entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
-    path = cache_folder() / entry.file
+    packaged = _PACKAGED / entry.file
+    return packaged if packaged.is_file() else cache_folder() / entry.file
+
+
+def fetch(name: str) -> Path:
+    """Find named weights in the package or in the cache, and download them if they are missing."""
+    path = weights_path(name)
+    entry = WEIGHTS[name]
     if path.exists():
         if sha256(path) == entry.sha256:
             return path

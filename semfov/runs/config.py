@@ -49,7 +49,7 @@ class DetectorConfig(Settings):
     """The detector, which is applied to each foveated view.
 
     Args:
-        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, `nanodet-plus-m-1.5x`, a
+        name: `yolox-nano`, `yolox-tiny`, `yolox-s`, `yolov3-tiny`, `yolov3`, `yolov3-spp`, `nanodet-plus-m-1.5x`, a
             Darknet cfg file, an ONNX model, or `torchvision:<model>`.
         weights: file with the weights (None: the weights registered for the name).
         background: how the background score is computed (`semfov.detection.scores`; None: the policy that suits the
@@ -67,7 +67,7 @@ class DetectorConfig(Settings):
         head: output format of an ONNX model whose format is not recognised (docs/detectors.md).
     """
 
-    name: str = "yolov3-tiny"
+    name: str = "yolox-nano"
     weights: Path | None = None
     background: BackgroundPolicy | None = None
     threshold: Share = 0.02

@@ -40,7 +40,6 @@ def read(path):
         frames.append(frame[..., ::-1])
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_path, capsys):
     """The target is found, is followed to the edge, and is absent once it has left the view."""

@@ -620,12 +620,6 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     assert "All 3 passes were used. 3 passes" in printed.out
     _, printed = run("explore", large, "--worth", 1000)
     assert "1 pass in" in printed.out
-    assert "yolox-nano" not in printed.out
-    agent.eye.detector.name = "yolov3-tiny"  # which finds fewer small objects
-    _, printed = run("explore", large, "--worth", 1000)
-    assert "--detector yolox-nano" in printed.out
-    _, printed = run("explore", large, "--how", "fovea", "--shifts", 1)
-    assert "--detector yolox-nano" not in printed.out
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):
@@ -666,7 +660,6 @@ def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monke
     assert options["duration"] == 5
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",

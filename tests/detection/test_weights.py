@@ -5,14 +5,20 @@ import io
 import sys
 import tarfile
 from dataclasses import dataclass, field
+from inspect import signature
 from pathlib import Path
 
 import pytest
 
+import semfov
+from semfov import ActivePerception, HeadAgent, ZoomAgent
+from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.detection import weights
 from semfov.detection.weights import _Address, _SourceDistribution, _Weights, cache_folder, fetch
+from semfov.envs.scenery import open_scenery
 from semfov.errors import DataError
 from semfov.io.files import write_text
+from semfov.runs.config import DetectorConfig
 from tests.refusals import refused, unusable
 
 CONTENT = b"numbers" * 100
@@ -97,6 +103,40 @@ def test_files_that_cannot_be_fetched_name_the_remedy(cache):
     for part in ("no source", "RangiLyu/nanodet/releases", "nanodet-plus-m-1.5x_416.onnx", "weights=", str(cache)):
         assert part in str(caught.value)
     refused("did you mean 'yolov3-tiny'", fetch, "yolo3-tiny")
+
+
+def test_the_file_in_the_package_comes_first_and_needs_no_cache(cache, monkeypatch):
+    path = fetch("yolox-nano")
+    assert path.is_relative_to(Path(semfov.__file__).parent)
+    assert path.stat().st_size == weights.WEIGHTS["yolox-nano"].size
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == weights.WEIGHTS["yolox-nano"].sha256
+    assert not cache.exists()
+    assert "Apache License" in (path.parent / "LICENSE.txt").read_text(encoding="utf-8")
+
+
+def test_a_damaged_file_in_the_package_is_never_used(cache, tmp_path, monkeypatch):
+    (tmp_path / "yolox_nano_416.onnx").write_bytes(b"damaged")
+    monkeypatch.setattr(weights, "_PACKAGED", tmp_path)
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(DataError, match="install semfov again"):
+        fetch("yolox-nano")
+
+
+def test_one_detector_is_the_default_everywhere():
+    takers = [
+        ActivePerception.recommended,
+        ActivePerception.from_pretrained,
+        ActivePerception.published,
+        ActivePerception.raw,
+        HeadAgent.recommended,
+        ZoomAgent.recommended,
+        open_scenery,
+        AgentOptions,
+        GazeOptions,
+        DetectorConfig,
+    ]
+    for taker in takers:
+        given = signature(taker).parameters
+        assert (given.get("detector") or given["name"]).default == "yolox-nano", taker
 
 
 def test_cache_folder(cache, monkeypatch):

@@ -16,7 +16,7 @@ from semfov.envs.registration import _IDS
 from tests.envs.agents import MaskedRandom, run_agent
 from tests.refusals import refused, unusable
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 KINDS = {"search": GazeSearch, "exploration": GazeExplore}
 TASKS = list(KINDS)

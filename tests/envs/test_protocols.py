@@ -9,7 +9,7 @@ from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, open_scenery
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from tests.envs.agents import PolicyAgent, run_agent
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow, pytest.mark.lab]
+pytestmark = [pytest.mark.slow, pytest.mark.lab]
 
 SEARCHES = [
     "recommended",

@@ -50,7 +50,6 @@ def test_an_action_selects_the_nearest_window_and_converts_back(size, place, num
     assert _window_of(lattice, share.astype(np.float64)) == same
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize("task", KINDS)
 def test_environments_pass_the_checker_of_gymnasium(cache, task):
@@ -59,7 +58,6 @@ def test_environments_pass_the_checker_of_gymnasium(cache, task):
     check_env(env.unwrapped)
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
     """Window by window, until an object is found by its box."""
@@ -84,7 +82,6 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
     assert min(lengths) >= 2
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
     refused("unknown task 'explore'", ZoomEnv, "explore", zoom_scenery, price=0.5)
@@ -103,7 +100,6 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
     assert info["result"] > before
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_observations_and_infos_follow_the_windows(zoom_scenery):
     env = ZoomEnv("exploration", zoom_scenery, **EVERYTHING)
@@ -127,7 +123,6 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     refused(r"action: expected \(x, y, magnification\)", env.step, np.array([0.0, 1.5, 0.0]))
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, cache, tmp_path):
     """Targets detected with a score of at least 0.3 count as found; pictures may have any size."""
@@ -161,7 +156,6 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
         ZoomEnv("search", open_zoom_scenery(tmp_path, cache=cache)).reset(seed=0)
 
 
-@pytest.mark.weights
 @pytest.mark.slow
 def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch):
     """A second environment with the same pictures needs no detector for looks that the first has made."""

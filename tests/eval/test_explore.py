@@ -17,8 +17,6 @@ from semfov.io.code import _closure
 from semfov.runs.config import DetectorConfig
 from tests.small import run_settings
 
-pytestmark = pytest.mark.weights
-
 
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):

@@ -65,7 +65,6 @@ def test_scanpaths_are_compared_with_those_of_others():
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_searches_of_people_models_random_draws_and_policies_are_compared(pictures):
     out = pictures / "search"
     code = main(

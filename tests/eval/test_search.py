@@ -12,8 +12,6 @@ from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
 from tests.small import run_settings
 
-pytestmark = pytest.mark.weights
-
 
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):

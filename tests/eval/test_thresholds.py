@@ -74,7 +74,6 @@ def test_what_passes_a_higher_threshold_is_part_of_what_passes_a_lower_one(dtype
         assert torch.equal(low.scores[0, kept], high.scores[0])
 
 
-@pytest.mark.weights
 def test_a_run_finds_the_looks_of_its_threshold_stored(tmp_path):
     config = ThresholdLooksConfig(
         data=DataConfig(limit=1),

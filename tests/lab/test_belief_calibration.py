@@ -54,7 +54,7 @@ def run(config):
 
 def probabilities_along(run, target, path, detections, grid):
     """Probabilities of the target `(looks, X·Y)` after every look of a path, by belief."""
-    model = FovealObservationModel.from_pretrained("yolov3-tiny")
+    model = FovealObservationModel.from_pretrained("yolox-nano")
     observers = {
         "raw": Semantic(81),
         "calibrated": Semantic(81, model),
@@ -72,7 +72,6 @@ def probabilities_along(run, target, path, detections, grid):
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_sums_match_beliefs_updated_step_by_step(run):
     assert list(run.observers) == BELIEFS
     assert run.left_out == {}
@@ -132,7 +131,6 @@ def test_sums_match_beliefs_updated_step_by_step(run):
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_path, monkeypatch):
     for kind in (TargetEvidence, MapEvidence):
         monkeypatch.setattr(kind, "shipped", tmp_path)

@@ -83,7 +83,6 @@ def test_quarters_cover_every_pixel_once():
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_a_run_compares_gaze_and_beliefs_at_the_given_thresholds(config):
     run = DecisionRun(replace(config, confirm=0.6))
     assert list(run.compared) == ["target-evidence", "random gaze", *FUSED]
@@ -101,7 +100,6 @@ def detects_at_the_gaze(step, grid, target, least=0.5):
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_records_match_searches_run_step_by_step(run):
     outcomes, evidence = set(), run.models.evidence
     for index in range(3):
@@ -162,7 +160,6 @@ def test_records_match_searches_run_step_by_step(run):
     assert {"found", "absent"} <= outcomes
 
 
-@pytest.mark.weights
 def test_a_model_without_thresholds_still_decides(config, folder):
     path = write_evidence(folder / "none.safetensors", None)
     run = DecisionRun(replace(config, belief=replace(config.belief, target_model=str(path))))
@@ -170,7 +167,6 @@ def test_a_model_without_thresholds_still_decides(config, folder):
     assert len(records) == 8
 
 
-@pytest.mark.weights
 def test_the_published_belief_is_left_out_without_an_observation_model(config, monkeypatch):
     monkeypatch.setattr(FovealObservationModel, "shipped", config.out / "none")
     assert list(DecisionRun(config).compared) == ["target-evidence", "random gaze"]

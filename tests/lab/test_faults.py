@@ -24,7 +24,7 @@ SEARCH = [
 ]  # fmt: skip
 RESULTS = ("episodes.jsonl", "summary.csv")
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 def start(out: Path, cache: Path, *more: str, **options: Any) -> subprocess.Popen[str]:

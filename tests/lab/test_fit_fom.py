@@ -12,7 +12,7 @@ from semfov.runs.seeds import generator_for
 from train.fit_fom import FitFomConfig, fit_fom, main
 from train.samples import Sampler
 
-pytestmark = [pytest.mark.weights, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 SMALL = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--shard", "2", "--method", "newton", "--workers"]
 
@@ -26,7 +26,7 @@ def fitted(tmp_path_factory):
 
 
 def test_fit_writes_a_model_and_a_report(fitted):
-    model = FovealObservationModel.from_pretrained(fitted / "yolov3-tiny.safetensors")
+    model = FovealObservationModel.from_pretrained(fitted / "yolox-nano.safetensors")
     counts = torch.tensor(model.metadata["counts"])
     assert counts.shape == (81, 8)
     assert counts.sum() == model.metadata["samples"] > 30
@@ -59,7 +59,7 @@ def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, 
 
 def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted, tmp_path):
     assert main([*SMALL, "1", "--out", str(tmp_path), "--cache", str(fitted), "--most", "40"]) == 0
-    whole, drawn = (FovealObservationModel.from_pretrained(at / "yolov3-tiny.safetensors") for at in (fitted, tmp_path))
+    whole, drawn = (FovealObservationModel.from_pretrained(at / "yolox-nano.safetensors") for at in (fitted, tmp_path))
     for name, value in whole.state_dict().items():
         assert torch.equal(value, drawn.state_dict()[name]), name
     judged = [
@@ -83,7 +83,7 @@ def test_detections_are_drawn_evenly(fitted):
 
 
 def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
-    model = fitted / "yolov3-tiny.safetensors"
+    model = fitted / "yolox-nano.safetensors"
     arguments = ["--data.limit", "3", "--fixations", "2", "--model", str(model), "--out", str(tmp_path)]
     assert calibrate([*arguments, "--beliefs", "false", "--workers", "1"]) == 0
     assert "classwise ECE" in capsys.readouterr().out

@@ -12,7 +12,6 @@ CASES = 8
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 @pytest.mark.shared
 def test_presence_is_estimated_equally_well_on_other_grids(shared):
     """Compare squared errors of the probability of presence, for present and absent targets."""

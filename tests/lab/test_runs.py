@@ -23,8 +23,6 @@ from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolC
 from tests.refusals import refused
 from tests.small import run_settings
 
-pytestmark = pytest.mark.weights
-
 GUIDED = PolicyConfig("predictive", saliency="vocus2")
 
 

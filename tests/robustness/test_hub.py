@@ -23,7 +23,7 @@ def test_entry_points_are_listed_and_have_docstrings():
     spec.loader.exec_module(module)
     entries = {n for n, value in vars(module).items() if callable(value) and not n.startswith("_") and n != "Any"}
     assert entries == {
-        "foveation", "yolov3_tiny_agent", "yolov3_tiny_detector", "yolov3_tiny_eye", "yolov3_tiny_observation",
+        "foveation", "agent", "detector", "eye", "observation",
     }  # fmt: skip
     assert names is None or entries <= set(names)
     for name in entries:
@@ -37,7 +37,7 @@ def test_sensor_and_observation_model_load_without_detector_weights():
     image = torch.rand(1, 3, 40, 40)
     expected = semfov.foveate(image, torch.tensor([8.0, 9.0]), sigma=20.0, levels=3)
     torch.testing.assert_close(sensor(image, torch.tensor([8.0, 9.0])), expected)
-    assert load("yolov3_tiny_observation").classes[0] == "person"
+    assert load("observation").classes[0] == "person"
 
 
 AGENTS = {
@@ -47,11 +47,10 @@ AGENTS = {
 }
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize("kind", AGENTS)
 def test_agents_are_those_of_the_package(kind):
     options, observer, search, explore = AGENTS[kind]
-    agent = load("yolov3_tiny_agent", kind=kind, **options)
+    agent = load("agent", kind=kind, **options)
     assert type(agent.searching.observer) is observer
     assert agent.searching.policy.name == search
     assert type(agent.exploring.observer) is (observers.LearnedMap if kind == "recommended" else observers.Semantic)
@@ -59,8 +58,7 @@ def test_agents_are_those_of_the_package(kind):
     assert (agent.columns, agent.rows) == options.get("grid", (10, 10))
 
 
-@pytest.mark.weights
 def test_the_recommended_agent_is_the_default():
-    assert type(load("yolov3_tiny_agent").searching.observer) is observers.Target
+    assert type(load("agent").searching.observer) is observers.Target
     with pytest.raises(semfov.InputError, match="kind: expected recommended, published, raw, got 'best'"):
-        load("yolov3_tiny_agent", kind="best")
+        load("agent", kind="best")

@@ -40,27 +40,25 @@ def test_a_sensor_is_chosen_by_name_and_may_be_changed(settings, sigma, growth, 
     assert SensorConfig(levels=3, convention="opencv").make().convention == "opencv"
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize("sensor", ["published", "published-narrow"])
 def test_published_means_the_same_for_sensor_model_and_agent(sensor):
     """A run with a published sensor that names no model has the eye and the model of the published agent."""
     eye, agent = make_eye(DetectorConfig(), SensorConfig(sensor)), ActivePerception.published(sensor=sensor)
     model = make_observation(None, eye)
-    assert observation_name(eye) == f"yolov3-tiny-{sensor}"
+    assert observation_name(eye) == f"yolox-nano-{sensor}"
     assert eye.settings() == agent.eye.settings()
     assert model.digest() == agent.searching.observer.observation.digest()
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize(
     ("settings", "name"),
     [
-        ({}, "yolov3-tiny"),
-        ({"sigma": 50}, "yolov3-tiny"),
-        ({"name": "published", "sigma": 80}, "yolov3-tiny-sharp"),
-        ({"name": "published", "growth": 2}, "yolov3-tiny"),
-        ({"name": "published", "reference": 320}, "yolov3-tiny-sharp"),
-        ({"growth": 1}, "yolov3-tiny-published"),
+        ({}, "yolox-nano"),
+        ({"sigma": 50}, "yolox-nano"),
+        ({"name": "published", "sigma": 80}, "yolox-nano-sharp"),
+        ({"name": "published", "growth": 2}, "yolox-nano"),
+        ({"name": "published", "reference": 320}, "yolox-nano-sharp"),
+        ({"growth": 1}, "yolox-nano-published"),
     ],
 )
 def test_a_sensor_that_is_not_published_has_a_model_of_our_own(settings, name):

@@ -25,8 +25,6 @@ from tests.small import run_settings
 
 ROOT = Path(__file__).parents[2]
 
-pytestmark = pytest.mark.weights
-
 
 def outcomes(results, index):
     """The outcomes of a scene; None if they are missing or damaged."""

@@ -17,10 +17,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from semfov.detection.weights import fetch
 from semfov.errors import InputError, SemfovError
 from semfov.runs import workers
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, LookingConfig
+from semfov.runs.config import BeliefConfig, DataConfig, LookingConfig
 from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 from semfov.runs.workers import run_tasks, shared_processes
@@ -145,7 +144,6 @@ def test_an_early_interrupt_of_a_study_prints_no_traceback(tmp_path, seconds):
 
 
 @pytest.mark.slow
-@pytest.mark.weights
 def test_a_closed_output_pipe_prints_no_traceback():
     """As in `semfov detectors | head -0`."""
     call = [sys.executable, "-m", "semfov", "detectors"]
@@ -364,19 +362,16 @@ def test_a_cluster_that_loses_a_worker_and_its_scheduler_gives_what_one_process_
 
 @pytest.mark.slow
 @pytest.mark.lab
-@pytest.mark.weights
 @pytest.mark.filterwarnings("ignore")
 def test_looks_of_a_cluster_come_back_and_are_the_same_to_the_bit(tmp_path, monkeypatch):
     """The worker has another cache, which this process does not read."""
     port = free_port()
-    weights = fetch("yolov3-tiny")
     looked = {}
     with scheduler(port, tmp_path), worker(port, tmp_path, cache=tmp_path / "far"):
         for name, where in (("alone", {"workers": 1}), ("near", {"scheduler": f"tcp://127.0.0.1:{port}"})):
             monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / name))
             config = LookingConfig(
                 data=DataConfig(limit=2),
-                detector=DetectorConfig(weights=weights),
                 belief=BeliefConfig(columns=2, rows=1),
                 out=tmp_path / name,
                 **where,

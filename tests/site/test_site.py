@@ -107,7 +107,6 @@ def test_formulas_are_converted_and_no_markup_is_left(site):
     assert drawn > 100
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
 def test_tutorials_have_pictures_with_content_and_alt_text(site, can_run, source):
     if not can_run:

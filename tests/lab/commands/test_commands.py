@@ -160,7 +160,6 @@ def test_the_same_bits_from_two_ranks(finished, tmp_path):
 WRONG = [(name, *each) for name, command in COMMANDS.items() for each in command.refused]
 
 
-@pytest.mark.weights
 @pytest.mark.parametrize(("name", "wrong", "message"), WRONG, ids=[f"{name} {' '.join(w)}" for name, w, _ in WRONG])
 def test_wrong_settings_are_refused_in_one_line(name, wrong, message, tmp_path, capsys):
     assert run(name, *name.split()[1:], *wrong, "--out", str(tmp_path / "out")) == 1
