@@ -7,8 +7,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from html import escape
+from ipaddress import ip_address
 from itertools import cycle
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import torch
 from PIL import Image, ImageDraw
@@ -19,8 +21,9 @@ from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
-from semfov.data import EmbeddedScenes, as_image, class_index
-from semfov.errors import DataError, InputError, SemfovError, check
+from semfov.data import EmbeddedScenes, class_index, read_image
+from semfov.data.images import PhotographPicture
+from semfov.errors import DataError, InputError, SemfovError, check, check_data
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
 from semfov.report.episode import pillow
@@ -35,6 +38,9 @@ _EVERY = "all classes"
 _EXAMPLES = 16  # embedded scenes
 _VIEWERS = 15  # whose scanpaths the page of a prediction has
 _HEIGHT = 820  # pixels of the screen for the page of a record
+_MOST_BYTES = 2**26  # of a file that is uploaded
+_MOST_PIXELS = 2**25  # of a picture: on this page it is decoded as a whole
+_SECONDS = 60.0  # longest time of a search, for which others wait
 _LONGEST = 1600  # longer side in pixels of the picture that is clicked on
 
 _PICTURE, _CLASS = "one, or an example", "one to search for"  # what is expected
@@ -71,14 +77,59 @@ def serve(options: AppOptions) -> int:
 def _launched(page: Any, host: str, port: int | None) -> str:
     """Serve a page, with one look at a time; returns its address."""
     import gradio
+    from starlette.middleware import Middleware
 
     look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
     page.queue(default_concurrency_limit=1)
     _, address, _ = page.launch(
         server_name=host, server_port=port, prevent_thread_lock=True, share=False, quiet=True,
-        show_error=True, css=_STYLE, theme=look,
+        show_error=True, css=_STYLE, theme=look, max_file_size=_MOST_BYTES,
+        app_kwargs={"middleware": [Middleware(_Doorkeeper, host=host)]},
     )  # fmt: skip
     return str(address)
+
+
+class _Doorkeeper:
+    """A layer of the server that answers requests of its own page alone, under an address that it was given."""
+
+    # Another page in the same browser can send requests here, also under a name of its own for this address.
+
+    def __init__(self, app: Any, host: str) -> None:
+        self._app, self._host = app, host
+
+    async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
+        headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope.get("headers", ())}
+        if scope["type"] == "lifespan" or self.admits(headers.get("host", ""), headers.get("origin")):
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            words = b"semfov app: expected the address that the command prints, and its own page\n"
+            kind = [(b"content-type", b"text/plain; charset=utf-8")]
+            await send({"type": "http.response.start", "status": 403, "headers": kind})
+            await send({"type": "http.response.body", "body": words})
+
+    def admits(self, address: str, origin: str | None) -> bool:
+        """Whether a request may enter, by the address that it was sent to and the page that it comes from."""
+        try:
+            name = urlsplit(f"//{address}").hostname or ""
+            own = origin is None or urlsplit(origin).netloc.lower() == address.lower()
+        except ValueError:
+            return False
+        if not own:
+            return False
+        if name in ("localhost", self._host.lower()):
+            return True
+        try:
+            number = ip_address(name)
+        except ValueError:
+            return self._everywhere and name == socket.gethostname().lower()
+        return number.is_loopback or self._everywhere
+
+    @property
+    def _everywhere(self) -> bool:
+        """Whether the page is served under all addresses of this machine."""
+        return self._host in ("0.0.0.0", "::")
 
 
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> "_OwnLooks":
@@ -103,6 +154,7 @@ class _Calls:
         with suppress(InputError):  # the detector knows none of their classes
             self.scenes = EmbeddedScenes(self.classes, count=_EXAMPLES, seed=seed)
         self._numbers = cycle(range(_EXAMPLES))
+        self._stops: dict[str, threading.Event] = {}
 
     def take(self) -> tuple[Image.Image, str]:
         """The next embedded scene, and a class that it holds."""
@@ -110,35 +162,44 @@ class _Calls:
         index = next(self._numbers)
         return pillow(self.scenes[index].image), self.scenes.classes[self.scenes.targets(index)[0] - 1]
 
-    def look(self, picture: Any, target: str, task: str, passes: float) -> tuple[str, str]:
-        """Words about a record of the picture, and its page in a frame."""
+    def look(self, path: str | None, target: str, task: str, passes: float, visitor: str = "") -> tuple[str, str]:
+        """Words about a record of a picture, and its page in a frame; `stop` of the same visitor ends the search."""
         with _told():
-            agent, passes = self.agent, int(passes)
-            check(picture is not None, "picture", _PICTURE, "none")
+            agent, picture = self.agent, _read(path)
             check(task != "search" or target in self.classes, "class", _CLASS, target)
+            stop = self._stops[visitor] = threading.Event()
+            limits: dict[str, Any] = {
+                "passes": int(passes),
+                "seconds": _SECONDS,
+                "on_look": lambda _: not stop.is_set(),
+            }
             if task == "gaze":
                 prediction = agent.gaze(picture)
                 part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
                 words, page = prediction.describe(), gaze_page_html("Where people look", [part])
             else:
                 if task == "search":
-                    record = agent.search(picture, target, passes=passes)
+                    record = agent.search(picture, target, **limits)
                 elif task == "find all":
-                    record = agent.find_all(picture, None if target == _EVERY else target, passes=passes)
+                    record = agent.find_all(picture, None if target == _EVERY else target, **limits)
                 else:
-                    record = agent.explore(picture, passes=passes)
+                    record = agent.explore(picture, **limits)
                 data = record.page_data(picture if record.how == "windows" else None)
                 words, page = record.summary(), page_html(record.describe(), [data])
             # A frame that shares nothing with the page around it.
             source = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'
             return words, f'<iframe title="The looks" {source}></iframe>'
 
-    def click(self, picture: Any, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
+    def stop(self, visitor: str = "") -> None:
+        """End a visitor's search after the look that it is at; what was found is shown."""
+        if visitor in self._stops:
+            self._stops[visitor].set()
+
+    def click(self, path: str | None, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
         """The cells with that of the click, and what they show."""
         with _told():
-            check(picture is not None, "picture", _PICTURE, "none")
+            image = _read(path)
             check(target in self.classes, "class", _CLASS, target)
-            image = as_image(picture, argument="picture")
             scale = image.shape[-1] / _reduced(image).width
             point = torch.tensor([[side * scale for side in event.index]])
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
@@ -161,11 +222,20 @@ class _Calls:
             draw.circle((x, y), radius, outline=TARGET, width=4)
             return cells, drawn, seen, believed, looked.describe()
 
-    def fresh(self, picture: Any) -> tuple[Any, ...]:
+    def fresh(self, path: str | None) -> tuple[Any, ...]:
         """No cells, and the picture to click on."""
         with _told():
-            shown = None if picture is None else _reduced(as_image(picture, argument="picture"))
-            return [], shown, None, None, _CLICK
+            return [], None if path is None else _reduced(_read(path)), None, None, _CLICK
+
+
+def _read(path: str | None) -> Tensor:
+    """The picture in a file that was uploaded, `(3, H, W)`; larger ones than a page should wait for are refused."""
+    check(path is not None, "picture", _PICTURE, "none")
+    assert path is not None
+    width, height = PhotographPicture(path).size
+    got = f"{width} × {height}; reduce it, or give it to semfov find"
+    check_data(width * height <= _MOST_PIXELS, "picture", f"at most {_MOST_PIXELS:,} pixels", got)
+    return read_image(path)
 
 
 @contextmanager
@@ -185,22 +255,35 @@ def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
 
     calls = _Calls(agent, seed)
 
-    def click(picture: Any, target: str, cells: list[int], event: gradio.SelectData) -> tuple[Any, ...]:
-        return calls.click(picture, target, cells, event)
+    def look(path: Any, target: str, task: str, passes: float, request: gradio.Request) -> tuple[str, str]:
+        return calls.look(path, target, task, passes, request.session_hash)
 
-    click.__annotations__["event"] = gradio.SelectData  # by which Gradio knows it
+    def stop(request: gradio.Request) -> None:
+        calls.stop(request.session_hash)
+
+    def click(path: Any, target: str, cells: list[int], event: gradio.SelectData) -> tuple[Any, ...]:
+        return calls.click(path, target, cells, event)
+
+    # Gradio knows them by their annotations, which are texts here.
+    look.__annotations__["request"] = stop.__annotations__["request"] = gradio.Request
+    click.__annotations__["event"] = gradio.SelectData
     fixed: dict[str, Any] = {"interactive": False, "format": "jpeg", "buttons": ["fullscreen", "download"]}
     with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=(60, 300), fill_width=True) as page:
         gradio.Markdown("# semfov\nWhere does it look, what does it see there, and what does it believe?")
         with gradio.Row():
             with gradio.Column(scale=1, min_width=300):
                 sources = ["upload", "clipboard"]
-                picture = gradio.Image(label="Picture", type="pil", sources=sources, height=300, buttons=["fullscreen"])
+                picture = gradio.Image(
+                    label="Picture", type="filepath", format="png", sources=sources, height=300, buttons=["fullscreen"]
+                )
+                # Gradio would open the file with any of Pillow's decoders, of which some start programs.
+                picture.preprocess = lambda payload: payload and payload.path
                 example = gradio.Button("Take an example", visible=calls.scenes is not None)
                 target = gradio.Dropdown([_EVERY, *calls.classes], value=_EVERY, label="Class", filterable=True)
                 task = gradio.Radio(list(_TASKS), value=_TASKS[0], label="What to do")
                 passes = gradio.Slider(1, 64, value=16, step=1, label="Passes of the detector at most")
                 go = gradio.Button("Look", variant="primary")
+                end = gradio.Button("Stop")
             with gradio.Column(scale=2, min_width=300), gradio.Tabs():
                 with gradio.Tab("Its looks"):
                     words = gradio.Markdown("Give it a picture or take an example, and press *Look*.")
@@ -215,7 +298,8 @@ def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
                         believed = gradio.Image(label="What is believed", **fixed)
         outputs = [cells, own, seen, believed, about]
         example.click(calls.take, [], [picture, target], api_visibility="private")
-        go.click(calls.look, [picture, target, task, passes], [words, shown], api_visibility="private")
+        go.click(look, [picture, target, task, passes], [words, shown], api_visibility="private")
+        end.click(stop, [], [], api_visibility="private", queue=False)
         for changed in (picture.change, again.click, target.change):
             changed(calls.fresh, [picture], outputs, api_visibility="private")
         own.select(click, [picture, target, cells], outputs, api_visibility="private")

@@ -14,6 +14,7 @@ from torch import Tensor
 from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
+from semfov.detection.onnx_check import check_file
 from semfov.detection.onnx_file import check_canvas, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, Signature, misplaced
 from semfov.detection.onnx_session import OnnxSession
@@ -210,6 +211,8 @@ def load_onnx(
     options["name"] = published_name
     chosen = stored | {key: value for key, value in options.items() if value is not None}
     size = _canvas_size(session, chosen.get("input_size"))
+    if None in session.shape[2:]:
+        check_file(path, size)
     outputs = session.probe(size)
     names = chosen.get("classes")
     if "head" not in chosen:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from semfov.detection.onnx_check import check_file
 from semfov.detection.onnx_heads import STRIDES, cells
-from semfov.detection.onnx_session import check_file
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
 from semfov.io.files import read_text, sha256, write_bytes

@@ -1,9 +1,10 @@
 """An ONNX model, checked before memory is allocated, in onnxruntime, called with torch tensors."""
 
-import math
+import atexit
 import re
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from functools import cache, partial
 from os import PathLike, fspath
 from pathlib import Path
@@ -13,9 +14,9 @@ import torch
 from torch import Tensor
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
-from semfov.errors import DataError, check, check_data
-from semfov.io.files import check_regular, inside, reading
-from semfov.io.schema import excerpt
+from semfov.detection.onnx_budget import check_elements, dims, without_weights
+from semfov.detection.onnx_check import check_file
+from semfov.errors import DataError, check
 
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
@@ -26,12 +27,9 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
 }
 
-_MOST_ELEMENTS = 2**28  # largest number of elements of a tensor in a model; 1 GiB as float32
-_MOST_METADATA = 2**20  # largest number of characters of a model's metadata
-_USUAL_SIDE = 640  # side of a picture with which open sizes are tried out
-_WITH_GRAPHS = {"Loop", "Scan", "If"}  # operations with graphs of their own, whose steps are not counted
 _MOST_MEMORY = 2**29  # bytes for the tensors of models whose sizes depend on values, all together
-_MOST_SECONDS = 10.0  # longest pass of such a model for one image
+_MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest time until it is loaded
+_LAST_SECONDS = 5.0  # for which the end of the process waits for an operation that was given up
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 
 _Provider = str | tuple[str, Mapping[str, Any]]
@@ -92,7 +90,11 @@ class OnnxSession:
                 model = wider.SerializeToString()
                 folder = "session.model_external_initializers_file_folder_path"
                 options.add_session_config_entry(folder, fspath(self.path.parent))
-            self._session = ort.InferenceSession(model, options, providers=chosen, disable_fallback=1)
+            load = partial(ort.InferenceSession, model, options, providers=chosen, disable_fallback=1)
+            # What it computes of stored values alone, when a model is loaded, is stopped by nothing.
+            self._session = (
+                _in_time(partial(load, disabled_optimizers=["ConstantFolding"])) if self.open_ended else load()
+            )
         except Exception as error:  # onnxruntime's own exceptions share no base class
             raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
         try:
@@ -141,9 +143,7 @@ class OnnxSession:
             arrays = self._limited(names, feed) if self.open_ended else self._session.run(names, feed)
         except Exception as error:  # as above
             reason = _reason(error)
-            if "terminate flag" in reason:
-                reason = f"not done after {_MOST_SECONDS:.0f} s, as with a loop that does not end"
-            elif "Available memory" in reason:
+            if "Available memory" in reason:
                 reason = f"its tensors need more than {_MOST_MEMORY >> 20} MiB, as with too many boxes; {reason}"
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         for name, array in zip(names, arrays, strict=True):
@@ -157,13 +157,10 @@ class OnnxSession:
 
         options = ort.RunOptions()
         options.log_severity_level = 4
-        timer = threading.Timer(_MOST_SECONDS * len(feed[self.image]), setattr, (options, "terminate", True))
-        timer.daemon = True
-        timer.start()
         try:
-            return self._session.run(names, feed, options)
+            return _in_time(partial(self._session.run, names, feed, options), len(feed[self.image]))
         finally:
-            timer.cancel()
+            options.terminate = True  # read between two operations; the last one goes on
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(self._again, further=self._further), ()
@@ -176,7 +173,7 @@ class OnnxSession:
         """Outputs in their shapes for one canvas: zeros where the model states all, else the outputs of a run."""
         stated = {name: [n for n in shape[1:] if n is not None] for name, shape in self.outputs}
         for name, sizes in stated.items():
-            _check_elements(f"{self.path.name}: output {name!r}", sizes)
+            check_elements(f"{self.path.name}: output {name!r}", sizes)
         if not self.open_ended and all(shape and len(stated[name]) == len(shape) - 1 for name, shape in self.outputs):
             return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
         return self(torch.zeros(1, 3, size[1], size[0]))
@@ -185,12 +182,12 @@ class OnnxSession:
         """The steps of a model in order, with the strides of the maps of a canvas `(width, height)`."""
         import onnx
 
-        model = _without_weights(onnx.load(self.path, load_external_data=False))
+        model = without_weights(onnx.load(self.path, load_external_data=False))
         sides = next(value for value in model.graph.input if value.name == self.image).type.tensor_type.shape.dim
         for side, size in zip(sides, (1, 3, canvas[1], canvas[0]), strict=True):
             side.dim_value = size
         graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
-        shapes = {value.name: _dims(value) for value in [*graph.value_info, *graph.output]}
+        shapes = {value.name: dims(value) for value in [*graph.value_info, *graph.output]}
         steps, reached = [], {self.image}  # stored weights are no maps
         for node in graph.node:
             reached.update(node.output if reached.intersection(node.input) else ())
@@ -202,73 +199,25 @@ class OnnxSession:
         return steps
 
 
-def check_file(path: Path) -> bool:
-    """Check that tensors are not too large and that weights lie in the model's folder, by shape inference alone."""
-    import onnx
+def _in_time(call: Callable[[], Any], passes: int = 1) -> Any:
+    """What a call returns, unless it takes longer than a number of passes may."""
+    # No operation can be stopped from outside: one that does not end goes on in its thread, for which none waits.
+    future: Future[Any] = Future()
 
-    name = f"ONNX model {str(path)!r}"
-    with reading(path, name):
-        path.stat()
+    def work() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:  # raised again where the result is asked for
+            future.set_exception(error)
+
+    seconds = _MOST_SECONDS * passes
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
     try:
-        model = onnx.load(path, load_external_data=False)
-        stored = [*model.graph.initializer]
-        for tensor in stored:
-            for entry in tensor.external_data:
-                if entry.key == "location":
-                    check_regular(inside(path.parent, entry.value))
-        for tensor in stored:
-            _check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
-        length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
-        check_data(length <= _MOST_METADATA, name, f"at most {_MOST_METADATA:,} characters of metadata", f"{length:,}")
-        slim = _without_weights(model)
-        for value in slim.graph.input:  # sizes that a model leaves open follow from those of the picture
-            for place, side in enumerate(value.type.tensor_type.shape.dim):
-                if not side.dim_value:
-                    side.dim_value = _USUAL_SIDE if place > 1 else 1
-        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=True).graph
-    except DataError:
-        raise
-    except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
-        reason = " ".join(str(error).split())[-400:]
-        raise DataError(f"cannot load the {name}: {reason}") from None
-    values = [*inferred.value_info, *inferred.input, *inferred.output]
-    for value in values:
-        _check_elements(f"{name}: tensor {excerpt(value.name)}", _dims(value))
-    known = {
-        value.name for value in values if all(each.HasField("dim_value") for each in value.type.tensor_type.shape.dim)
-    }
-    steps = {node.op_type for node in model.graph.node}
-    made = {output for node in model.graph.node for output in node.output if output}
-    return not made <= known or bool(steps & _WITH_GRAPHS) or bool(model.functions)
-
-
-def _check_elements(name: str, sizes: Iterable[int]) -> None:
-    """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
-    sizes = list(sizes)
-    fits = min(sizes, default=0) >= 0 and math.prod(sizes) <= _MOST_ELEMENTS
-    check_data(fits, name, f"at most {_MOST_ELEMENTS:,} numbers", f"sizes {excerpt(sizes)}")
-
-
-def _dims(value: Any) -> list[int]:
-    """Sizes of a value; unknown sizes count as 1."""
-    return [d.dim_value if d.HasField("dim_value") else 1 for d in value.type.tensor_type.shape.dim]
-
-
-def _without_weights(model: Any) -> Any:
-    """The model without its large tensors: shapes may depend on values of small tensors only."""
-    import onnx
-
-    slim = onnx.ModelProto()
-    slim.CopyFrom(model)
-    stored = [*slim.graph.initializer]
-    del slim.graph.initializer[:]
-    for tensor in stored:
-        if math.prod(tensor.dims) <= 1024:
-            slim.graph.initializer.append(tensor)
-        else:
-            shape = onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, list(tensor.dims))
-            slim.graph.input.append(shape)
-    return slim
+        return future.result(seconds)
+    except TimeoutError:
+        atexit.register(thread.join, _LAST_SECONDS)  # one that returns while Python ends would abort the process
+        raise DataError(f"not done after {seconds:.0f} s, as with a loop that does not end") from None
 
 
 @cache

@@ -1,17 +1,20 @@
 """The page on which to try an agent out: looks at given cells, and the page in Chromium."""
 
+import asyncio
 import os
 import re
 import shutil
 import socket
 import sys
+import urllib.error
+import urllib.request
 from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
-from PIL import Image
 
-from semfov.cli.app import _Calls, _look_at_cells
+from semfov.cli import app
+from semfov.cli.app import _Calls, _Doorkeeper, _look_at_cells
 from semfov.cli.main import main
 from semfov.data import read_image
 from tests.pretended import a_gpu
@@ -60,35 +63,138 @@ def test_what_cannot_be_served_is_told_before_anything_is_loaded(monkeypatch, ca
     assert re.fullmatch(rf"error: app: cannot be served on 127.0.0.1:{port}: .*\n", capsys.readouterr().err)
 
 
-def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, photo, monkeypatch):
-    class Error(Exception):
-        def __init__(self, message, *, print_exception):
-            super().__init__(message)
+class Told(Exception):
+    """What the page shows of an error."""
 
+    def __init__(self, message, *, print_exception):
+        super().__init__(message)
+
+
+@pytest.fixture
+def calls(agent, monkeypatch):
+    """What the page calls, without Gradio."""
     gradio = ModuleType("gradio")
-    monkeypatch.setattr(gradio, "Error", Error, raising=False)
+    monkeypatch.setattr(gradio, "Error", Told, raising=False)
     monkeypatch.setitem(sys.modules, "gradio", gradio)
-    calls, picture = _Calls(agent, seed=0), Image.open(photo)
-    refused = {"picture: expected one": (None, "red"), "class: expected one to search for": (picture, "all classes")}
+    return _Calls(agent, seed=0)
+
+
+def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, calls, photo):
+    path, (_, height, width) = str(photo), read_image(photo).shape
+    refused = {"picture: expected one": (None, "red"), "class: expected one to search for": (path, "all classes")}
     for said, given in refused.items():
-        with pytest.raises(Error, match=said):
+        with pytest.raises(Told, match=said):
             calls.look(*given, "search", 3.0)
-        with pytest.raises(Error, match=said):
+        with pytest.raises(Told, match=said):
             calls.click(*given, [], SimpleNamespace(index=(1, 1)))
     for task, target in (("search", "red"), ("find all", "all classes")):
-        words, page = calls.look(picture, target, task, 3.0)
+        words, page = calls.look(path, target, task, 3.0)
         assert words
         assert page.startswith('<iframe title="The looks" sandbox="allow-scripts" srcdoc="&lt;!DOCTYPE html')
     cells: list[int] = []
-    for x, y in ((5, 5), (picture.width - 5, picture.height - 5)):
-        cells, clicked, seen, believed, words = calls.click(picture, "red", cells, SimpleNamespace(index=(x, y)))
-        assert clicked.size == picture.size
+    for x, y in ((5, 5), (width - 5, height - 5)):
+        cells, clicked, seen, believed, words = calls.click(path, "red", cells, SimpleNamespace(index=(x, y)))
+        assert clicked.size == (width, height)
         assert seen is not None
         assert believed is not None
         assert words
     assert cells == [0, agent.columns * agent.rows - 1]
-    assert calls.fresh(picture)[0] == []
+    assert calls.fresh(path)[0] == []
     assert calls.fresh(None)[1] is None
+
+
+EPS = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 64 64
+%%EndComments
+0 0 64 64 rectfill
+showpage
+"""
+
+
+def test_files_that_only_other_programs_read_start_none(calls, tmp_path, monkeypatch):
+    """Ghostscript is there, but for its work: a stand-in that leaves a mark where it is started."""
+    program = tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for name in ("photo.png", "photo.eps"):
+        path = str(tmp_path / name)
+        (tmp_path / name).write_bytes(EPS)
+        with pytest.raises(Told, match="not an image in a format that is read"):
+            calls.look(path, "red", "search", 3.0)
+        with pytest.raises(Told, match="not an image in a format that is read"):
+            calls.click(path, "red", [], SimpleNamespace(index=(1, 1)))
+        with pytest.raises(Told, match="not an image in a format that is read"):
+            calls.fresh(path)
+    assert not (tmp_path / "started").exists()
+
+
+def test_a_picture_for_which_everybody_would_wait_is_refused_by_its_size(calls, photo, monkeypatch):
+    monkeypatch.setattr(app, "_MOST_PIXELS", 100)
+    for call in (calls.fresh, lambda path: calls.look(path, "red", "search", 3.0)):
+        with pytest.raises(Told, match=r"picture: expected at most 100 pixels, got \d+ × \d+; reduce it"):
+            call(str(photo))
+
+
+def test_a_visitor_stops_its_own_search(calls, agent, photo, monkeypatch):
+    """Both begin to search; one stops during its first look, the other's search goes on."""
+    counts = {}
+    explore = agent.explore
+
+    def explored(picture, **limits):
+        going = limits["on_look"]
+
+        def on_look(record):
+            calls.stop("impatient")
+            return going(record)
+
+        record = explore(picture, **limits | {"on_look": on_look})
+        counts[visitor] = record.passes
+        return record
+
+    monkeypatch.setattr(type(agent), "explore", lambda _, picture, **limits: explored(picture, **limits))
+    for visitor in ("patient", "impatient"):
+        calls.look(str(photo), "red", "explore", 4.0, visitor)
+    assert counts["impatient"] < counts["patient"] == 4
+
+
+@pytest.mark.parametrize(
+    ("host", "address", "origin", "admitted"),
+    [
+        ("127.0.0.1", "127.0.0.1:7860", None, True),
+        ("127.0.0.1", "localhost:7860", "http://localhost:7860", True),
+        ("127.0.0.1", "[::1]:7860", None, True),
+        ("127.0.0.1", "127.0.0.1:7860", "http://127.0.0.1:7861", False),
+        ("127.0.0.1", "127.0.0.1:7860", "https://elsewhere.org", False),
+        ("127.0.0.1", "127.0.0.1:7860", "null", False),
+        ("127.0.0.1", "elsewhere.org:7860", "http://elsewhere.org:7860", False),
+        ("127.0.0.1", "192.168.0.7:7860", None, False),
+        ("127.0.0.1", "", None, False),
+        ("127.0.0.1", "[", None, False),
+        ("192.168.0.7", "192.168.0.7:7860", "http://192.168.0.7:7860", True),
+        ("192.168.0.7", "192.168.0.8:7860", None, False),
+        ("lab.example.org", "LAB.example.org:7860", "http://lab.example.org:7860", True),
+        ("0.0.0.0", "192.168.0.8:7860", "http://192.168.0.8:7860", True),
+        ("0.0.0.0", "elsewhere.org", "http://elsewhere.org", False),
+        ("0.0.0.0", f"{socket.gethostname()}:7860", None, True),
+    ],
+)
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_requests_enter_by_the_address_that_was_asked_for_and_from_its_own_page(host, address, origin, admitted, kind):
+    """A page of another site may know the port, and may have a name of its own for this machine."""
+    entered, sent = [], []
+
+    async def page(scope, receive, send):
+        entered.append(scope)
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", address.encode()), *([(b"origin", origin.encode())] if origin else [])]
+    asyncio.run(_Doorkeeper(page, host)({"type": kind, "headers": headers}, None, send))
+    assert bool(entered) == admitted
+    assert bool(sent) != admitted
+    assert admitted or sent[0].get("status", 403) == 403
 
 
 @pytest.fixture
@@ -138,3 +244,27 @@ def test_a_picture_a_search_and_a_click_on_the_width_of_a_telephone(served, phot
         own.click(position={"x": 0.1 * number * box["width"], "y": 0.1 * box["height"]})
         served.get_by_text(f"Look {number}", exact=True).wait_for(timeout=60_000)
     assert served.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_strangers_and_large_files_are_turned_away_on_a_telephone(served, tmp_path, monkeypatch):
+    """Gradio itself answers any name of the machine, and opens files with all of Pillow's decoders."""
+    program = tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for headers in ({"Host": "elsewhere.org"}, {"Origin": "http://elsewhere.org"}, {"Origin": "null"}):
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(served.url, headers=headers))
+        assert caught.value.code == 403
+        caught.value.close()
+    (tmp_path / "photo.png").write_bytes(EPS)
+    served.set_input_files("input[type=file]", str(tmp_path / "photo.png"))
+    served.get_by_text("not an image in a format that is read").first.wait_for(timeout=60_000)
+    assert not (tmp_path / "started").exists()
+    with (tmp_path / "large.png").open("wb") as file:
+        file.truncate(app._MOST_BYTES + 1)
+    served.reload()
+    served.set_input_files("input[type=file]", str(tmp_path / "large.png"))
+    served.get_by_text("maximum").first.wait_for(timeout=60_000)

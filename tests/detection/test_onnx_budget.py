@@ -1,0 +1,162 @@
+"""Small ONNX files that ask for much are refused before, or stopped while; what is counted is what a pass takes."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto
+
+from semfov import load_detector
+from semfov.detection.onnx import load_onnx
+from semfov.detection.onnx_budget import Budget
+from semfov.detection.onnx_check import check_file
+from semfov.detection.onnx_session import OnnxSession
+from tests.detection.hostile_models import HOSTILE, node, write
+from tests.refusals import unusable
+from tests.small import write_network
+
+LOAD_ALL = """
+import json, resource, sys
+from pathlib import Path
+
+import torch
+
+from semfov.detection import onnx_session
+from semfov.detection.onnx import load_onnx
+from semfov.errors import DataError
+
+onnx_session._MOST_SECONDS, onnx_session._LAST_SECONDS = 1.0, 0.0
+told = {}
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    try:
+        load_onnx(path).propose(torch.rand(1, 3, 64, 64))
+    except DataError as error:
+        told[path.stem] = str(error)
+print(json.dumps([told, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]), flush=True)
+import os
+os._exit(0)  # operations that were given up go on
+"""
+
+
+@pytest.mark.slow
+def test_small_files_that_ask_for_much_are_refused_within_a_gigabyte(tmp_path):
+    for name in HOSTILE:
+        write(tmp_path / f"{name}.onnx", name)
+    assert max(path.stat().st_size for path in tmp_path.iterdir()) < 400_000
+    done = subprocess.run([sys.executable, "-c", LOAD_ALL, tmp_path], capture_output=True, text=True, check=True)
+    told, most = json.loads(done.stdout)
+    assert told.keys() == HOSTILE.keys() - {"functions that end"}
+    reasons = ("at most", "not done after", "need more than")
+    assert [text for text in told.values() if not any(reason in text for reason in reasons)] == []
+    assert most < 2**20  # kilobytes
+
+
+def test_own_functions_are_counted_as_what_they_call_and_must_end(tmp_path):
+    path = write(tmp_path / "model.onnx", "functions that end")
+    assert not check_file(path)
+    assert load_onnx(path).propose(torch.rand(1, 3, 64, 64)).boxes.shape == (1, 10, 4)
+    model = onnx.load(path)
+    model.functions[0].node[0].op_type, model.functions[0].node[0].domain = "F2", "own"
+    onnx.save(model, str(path))
+    unusable("functions that end, got 'F[012]', which calls itself", check_file, path)
+
+
+@pytest.mark.parametrize("place", ["../other/weights.bin", "/etc/hostname", "missing.bin", "*/_ORT_MEM_ADDR_/*"])
+def test_weights_lie_in_files_of_the_folder(tmp_path, place):
+    """onnxruntime takes a place of this name with a star for an address in its own memory."""
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/weights.bin").write_bytes(bytes(4096))
+    (tmp_path / "model").mkdir()
+    path = write(tmp_path / "model/model.onnx", "tiled")
+    model = onnx.load(path)
+    for tensor in model.graph.initializer:
+        if tensor.name == "rows":
+            tensor.ClearField("raw_data")
+            tensor.data_location = TensorProto.EXTERNAL
+            for key, value in {"location": place, "offset": "0", "length": "240"}.items():
+                tensor.external_data.add(key=key, value=value)
+    onnx.save(model, str(path))
+    unusable("leads out of it|no such file|without \\*", check_file, path)
+    if "*" in place:
+        (tmp_path / "model/*/_ORT_MEM_ADDR_").mkdir(parents=True)
+        (tmp_path / "model" / place).write_bytes(bytes(240))
+        unusable("a name without \\*", check_file, path)
+
+
+def budget(tmp_path, nodes, stored, outputs=None):
+    path = write_network(tmp_path / "model.onnx", nodes, {"images": [1, 3, 64, 64]}, outputs or {"out": None}, stored)
+    return Budget.of(onnx.load(path), (64, 64), "model")
+
+
+def test_bytes_are_those_of_the_tensors_that_are_there_at_once(tmp_path):
+    """Of a chain two maps at a time; of a short cut one more; what is computed of stored values remains."""
+    size = 3 * 64 * 64 * 4
+    chain = [node("Relu", "images", "a"), node("Relu", "a", "b"), node("Relu", "b", "c"), node("Relu", "c", "out")]
+    assert budget(tmp_path, chain, {}).bytes() == 2 * size
+    cut = [*chain[:3], node("Add", "images c", "out")]
+    assert budget(tmp_path, cut, {}).bytes() == 3 * size
+    fixed = [node("Sin", "line", "s"), node("Cos", "s", "t"), node("Add", "images t", "out")]
+    assert budget(tmp_path, fixed, {"line": np.zeros((3, 64, 64), np.float32)}).bytes() == 4 * size
+
+
+def test_work_is_the_multiplications_of_the_same_operations_in_torch(tmp_path):
+    from torch.utils.flop_counter import FlopCounterMode
+
+    image, weight, turned = torch.rand(1, 3, 64, 64), torch.rand(8, 3, 3, 3), torch.rand(3, 5, 2, 2)
+    matrix = torch.rand(64, 7)
+    with FlopCounterMode(display=False) as counted:
+        torch.conv2d(image, weight, stride=2)
+        torch.conv_transpose2d(image, turned, stride=2)
+        image @ matrix
+    nodes = [
+        node("Conv", "images weight", "a", strides=[2, 2]),
+        node("ConvTranspose", "images turned", "b", strides=[2, 2]),
+        node("MatMul", "images matrix", "c"),
+    ]
+    stored = {"weight": weight.numpy(), "turned": turned.numpy(), "matrix": matrix.numpy()}
+    found = budget(tmp_path, nodes, stored, dict.fromkeys("abc"))
+    assert sum(map(found._work, nodes)) == counted.get_total_flops() // 2
+    sums = node("Einsum", "images matrix", "d", equation="bchw,wk->bchk")
+    assert budget(tmp_path, [sums], stored, {"d": None})._work(sums) == 3 * 64 * 64 * 7
+
+
+def test_what_a_file_states_of_its_sizes_is_not_believed(tmp_path):
+    path = write(tmp_path / "model.onnx", "stated")
+    assert check_file(path)
+
+
+def test_a_canvas_is_in_proportion_to_the_files_of_a_model_of_any_size(make_onnx):
+    values = {"output0": np.random.default_rng(0).random((1, 6, 84)).astype(np.float32)}
+    path = make_onnx(values, dynamic=True)
+    load_detector(path, head="yolov8", classes=["a", "b"], input_size=(640, 640))
+    unusable("bytes of tensors together.*smaller input_size", load_detector, path, head="yolov8", input_size=9000)
+
+
+def test_only_models_whose_work_is_known_are_folded(tmp_path, make_onnx, monkeypatch):
+    import onnxruntime
+
+    asked = []
+    make = onnxruntime.InferenceSession
+
+    def session(*given, **options):
+        asked.append(options.get("disabled_optimizers"))
+        return make(*given, **options)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", session)
+    OnnxSession(make_onnx({"a": np.zeros((1, 5, 4), np.float32)}))
+    OnnxSession(write(tmp_path / "loop.onnx", "doubled in a loop"))
+    assert asked == [None, ["ConstantFolding"]]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["yolox_nano_416", "picodet_s_416_coco", "nanodet_plus_m_1.5x_416"])
+def test_shipped_detectors_are_far_below_the_limits(shared, name):
+    path = shared / "weights" / f"{name}.onnx"
+    assert not check_file(path)
+    found = Budget.of(onnx.load(path), (416, 416), name)
+    assert found.bytes() < 2**27 / 4
+    assert sum(map(found._work, found.graph.node)) < 2**34 / 4
