@@ -227,10 +227,11 @@ def dims(value: Any) -> list[int]:
 
 
 def _width(kind: int) -> int:
-    """Bytes of an element; of a text, those of an empty one."""
+    """Bytes of an element; of a text, those of an empty one, and of a kind that is not known, the most of a number."""
     import onnx
 
-    return 32 if kind == onnx.TensorProto.STRING else onnx.helper.tensor_dtype_to_np_dtype(kind).itemsize
+    otherwise = {onnx.TensorProto.UNDEFINED: 16, onnx.TensorProto.STRING: 32}
+    return otherwise.get(kind) or onnx.helper.tensor_dtype_to_np_dtype(kind).itemsize
 
 
 def without_weights(model: Any) -> Any:
