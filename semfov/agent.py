@@ -6,12 +6,13 @@ from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self, get_args
 
+import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike
+from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, check_order
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -26,7 +27,7 @@ from semfov.data.windowed import ChosenBands
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, check, check_number, check_options, checked_keywords, lookup
+from semfov.errors import InputError, check, check_number, check_options, checked_keywords, devices_here, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -39,6 +40,7 @@ from semfov.paths import GazePrediction, Record
 from semfov.paths.gaze import ScanpathLike
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
+from semfov.words import AGENT_WORDS, missing
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
@@ -202,7 +204,19 @@ class ActivePerception(nn.Module):
         return cls(**make(*given, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
+        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more.
+
+        Raises:
+            InputError: PyTorch has no such device here, or a detector without parameters would keep its precision.
+        """
+        try:
+            converted = fn(torch.zeros(0))
+        except (RuntimeError, AssertionError) as error:
+            here, reason = ", ".join(devices_here()), " ".join(str(error).split())
+            raise InputError(f"device: expected one that PyTorch has here ({here}), got another: {reason}") from None
+        detector = self.eye.detector
+        converts = converted.dtype not in HALVES or any(True for _ in detector.parameters())
+        check(converts, "half", "a detector of PyTorch", f"{detector.settings()['name']}, which has no parameters")
 
         def precise(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
@@ -214,8 +228,8 @@ class ActivePerception(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         """The parts of the module; other libraries' words for what an agent does are refused with its own."""
-        if name in ("detect", "find", "locate", "predict", "track"):
-            raise AttributeError(f"an agent has search, find_all, explore, gaze and live, not {name!r}")
+        if name in AGENT_WORDS:
+            raise missing("an agent", name, AGENT_WORDS)
         return super().__getattr__(name)
 
     def __call__(self, *given: Any, **options: Any) -> Any:
@@ -319,9 +333,9 @@ class ActivePerception(nn.Module):
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
                 tensor; a `semfov.data.windowed.LargePicture`; or a scene: a `semfov.Panorama`, a
                 `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
-            target: class by name or index 1..K. In a photograph also several: in a list, of which any will do, or each
-                with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of the record is then
-                the most probable of them.
+            target: class by name or index 1..K. A fovea also takes several: with `how="fovea"` in a list, of which any
+                will do, or each with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of
+                the record is then the most probable of them.
             how: the kind of look, `fovea`, `windows` or `head`; `auto` chooses it by the picture.
             passes: largest number of passes of the detector, closer looks included; None takes 24, and 40 for a head.
             shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 30, or with `passes` no limit.
@@ -349,10 +363,15 @@ class ActivePerception(nn.Module):
             InputError: the class is unknown (near names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
+        check_order(picture, target, self.classes[1:])
         check_thresholds(confirm, give_up, closer)
         # Class numbers may be those of NumPy or a tensor, which have no length.
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
-        foveal = start is not None or boxes is not None or len(targets) > 1
+        foveal = start is not None or boxes is not None
+        listed = len(targets) > 1 and not isinstance(target, Mapping)
+        several = "one class; find_all takes several, and how='fovea' searches for any of them"
+        check(not listed or how != "auto" or foveal or shifts is not None, "target", several, target)
+        foveal |= len(targets) > 1
         opened, kind = self._open(picture, how, shifts, duration, color, white, bands, foveal=foveal)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
         only_for(kind, "fovea", "passes", boxes=boxes)
@@ -418,6 +437,7 @@ class ActivePerception(nn.Module):
             InputError: a class is unknown (nearest names are suggested), or an argument does not fit the kind of look.
             DataError: the file of the picture cannot be read.
         """
+        check_order(picture, target, self.classes[1:])
         targets = class_numbers(target, self.classes[1:], "target")
         opened, kind = self._open(picture, how, shifts, duration, color, white, bands, every=True)
         limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.words import OTHER_WORDS
+from semfov.words import OF_OTHER_METHODS, OTHER_WORDS
 
 __all__ = ["DataError", "InputError", "SemfovError"]
 
@@ -85,6 +85,20 @@ def values_known(*tensors: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def check_device(device: object) -> None:
+    """Raise `InputError` unless PyTorch has a device here; None is the processor."""
+    try:
+        torch.empty(0, device=device).cpu()  # type: ignore[call-overload]  # from `meta` nothing comes back
+    except (RuntimeError, AssertionError, TypeError):
+        got = repr(str(device) if isinstance(device, torch.device) else device)
+        check(False, "device", f"one that PyTorch has here ({', '.join(devices_here())})", got)
+
+
+def devices_here() -> list[str]:
+    """List the kinds of devices that PyTorch has on this machine."""
+    return ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
 
 
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
@@ -167,6 +181,7 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
             near = [each for each in OTHER_WORDS.get(name, ()) if each in names] or get_close_matches(name, names)
             meant = " or ".join(f"{each}=" for each in near)
             hint = f"did you mean {meant}?" if near else f"known: {', '.join(names) or 'none'}"
+            hint = OF_OTHER_METHODS.get((what, name), hint)
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 
 

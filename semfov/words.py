@@ -28,12 +28,23 @@ OTHER_WORDS: dict[str, tuple[str, ...]] = {
     "names": ("classes",),
 }
 
+OF_OTHER_METHODS = {
+    ("explore", "target"): "find_all(picture, target) lists what is there of a class, search(picture, target) decides",
+}
+"""What to call in place of a method of an agent, by its name and the option that it has not."""
+
 _AGENT = "agent = semfov.ActivePerception.recommended(), which has search, find_all, explore, gaze and live"
 PACKAGE_WORDS = {
     **dict.fromkeys(("Agent", "detect", "explore", "find", "find_all", "load", "predict", "search"), _AGENT),
     **dict.fromkeys(("plot", "show"), "record.plot(), or semfov.viz"),
     **dict.fromkeys(("imread", "open"), "semfov.read_image"),
 }
+
+
+AGENT_WORDS = dict.fromkeys(
+    ("detect", "find", "find_objects", "locate", "predict", "run", "track"),
+    "search, find_all, explore, gaze and live, or semfov.run for many pictures",
+)
 
 
 def missing(owner: str, name: str, words: Mapping[str, str]) -> AttributeError:

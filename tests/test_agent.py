@@ -6,7 +6,17 @@ import pickle
 import pytest
 import torch
 
-from semfov import ActivePerception, Detections, FovealObservationModel, Foveation, Grid, HeadAgent, ZoomAgent, saliency
+from semfov import (
+    ActivePerception,
+    Detections,
+    FovealObservationModel,
+    Foveation,
+    Grid,
+    HeadAgent,
+    ZoomAgent,
+    load_detector,
+    saliency,
+)
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, Target
 from semfov.decision import confirms
@@ -128,6 +138,24 @@ def test_half_precision_is_for_the_detector_alone(image, dtype):
         assert torch.equal(found.probabilities, task(other).probabilities)
     assert agent.find_all(image, passes=1).objects.boxes.dtype == torch.float32
     assert agent.float().eye.detector.white.dtype == torch.float32
+
+
+@pytest.mark.parametrize("convert", ["half", "bfloat16"])
+def test_half_precision_that_a_detector_has_not_is_refused(convert):
+    """A file of ONNX has no parameters, so that nothing would change."""
+    agent = ActivePerception.raw(Coloured())
+    with pytest.raises(InputError, match="half: expected a detector of PyTorch, got coloured, which has no parameters"):
+        getattr(agent, convert)()
+    assert agent.double() is agent
+
+
+@pytest.mark.weights
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_device_that_is_not_there_is_refused_with_those_that_are():
+    agent = ActivePerception.raw(Coloured())
+    for ask in (lambda: agent.to("cuda"), agent.cuda, lambda: load_detector("yolov3-tiny", device="cuda")):
+        with pytest.raises(InputError, match=r"device: expected one that PyTorch has here \(cpu.*\), got "):
+            ask()
 
 
 @pytest.mark.parametrize("mapper", [{}, {"prior": 0.25, "fusion": "sum"}], ids=["same", "other"])
@@ -372,7 +400,9 @@ def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, 
     )
     assert listed.found
     assert torch.equal(listed.cells, weighted.cells)
+    assert agent.search(image, ["red", "green"], how="fovea").found
     refused("one class for a search by windows", agent.search, image, ["red", "green"], how="windows")
+    refused("one class; find_all takes several, and how='fovea'", agent.search, image, ["red", "green"])
 
 
 @pytest.mark.parametrize("task", ["search", "explore"])

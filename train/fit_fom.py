@@ -64,8 +64,8 @@ class FitFomConfig(FitConfig):
         levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
         width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
             with the fovea. A sensor with steps of acuity has its own levels, one for each step.
-        minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
-            (0: no level does).
+        minimum: number of objects that a level needs. A level with fewer is fitted with the detections of its
+            neighbours, of as many as it needs (0: no level is).
         shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
             levels with few detections.
         enough: a class with at least so many detections at a level is fitted there by maximum likelihood alone, as
@@ -102,6 +102,23 @@ class FitFomConfig(FitConfig):
         return self.sensor.level_edges(self.levels, self.width)
 
 
+def _fitted_name(config: FitFomConfig) -> str:
+    """Name of the model that is saved, in tables."""
+    return "discriminative" if config.method == "discriminative" else f"Dirichlet, {config.method}"
+
+
+def _judgement(config: FitFomConfig, figures: dict[str, Calibration]) -> str:
+    """Say whether the saved model is better than raw scores on held-out photographs."""
+    raw, fitted = figures["raw scores"], figures[_fitted_name(config)]
+    measured = f"Brier {fitted.brier:.3f} and NLL {fitted.nll:.3f}, raw scores {raw.brier:.3f} and {raw.nll:.3f}"
+    if fitted.brier <= raw.brier and fitted.nll <= raw.nll:
+        return f"The model is better than raw scores on held-out photographs: {measured}."
+    return (
+        f"**Raw scores are better on held-out photographs**: the model has {measured}. Do without the model, or fit it "
+        f"on more photographs."
+    )
+
+
 def _report_markdown(
     config: FitFomConfig,
     model: FovealObservationModel,
@@ -120,14 +137,14 @@ def _report_markdown(
     ]  # fmt: skip
     summary = table([head, *rows])
     counts = torch.tensor(model.metadata["counts"])
-    fallback = model.metadata["fallback"]
+    pooled = model.metadata["pooled"]
     edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
     levels = [
         [
             f"{low} - {high}",
             str(int(counts[0, n])),
             str(int(counts[1:, n].sum())),
-            str(fallback.get(str(n), "")),
+            "{} to {}".format(*[pooled[str(n)][end] for end in (0, -1)]) if str(n) in pooled else "",
             *by_level[n],
         ]
         for n, (low, high) in enumerate(pairwise(edges))
@@ -138,7 +155,7 @@ def _report_markdown(
         if config.mosaics
         else "distance to the fixation in units of the image's longer side"
     )
-    head = [axis, "background", "objects", "uses level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
+    head = [axis, "background", "objects", "with levels", "NLL, raw", "NLL", "ECE, raw", "ECE"]
     return "\n".join(
         [
             f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
@@ -147,8 +164,10 @@ def _report_markdown(
             "",
             *summary,
             "",
-            f"Number of detections in the fit, by {where}. Levels with too few objects use the parameters of another "
-            "level. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
+            _judgement(config, figures),
+            "",
+            f"Number of detections in the fit, by {where}. Levels with too few objects are fitted with their "
+            "neighbours. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
             "",
             *table([head, *levels]),
             "",

@@ -162,7 +162,8 @@ def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] =
         make=kind,
         settings=(config, folder),
         title=title,
-        unit="shard",
+        unit="picture",
+        count=lambda shard: len(sampler.scenes_of(shard)),
     )
     with closing(done):
         for shard, tensors in done:

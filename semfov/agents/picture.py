@@ -1,5 +1,7 @@
 """The picture that a user gave, opened once: its size, the kinds of look that it allows, and its form for each."""
 
+import os
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from os import PathLike
@@ -8,12 +10,13 @@ from typing import Any, Literal, Self, cast, get_args
 
 from torch import Tensor
 
+from semfov.data.classes import class_index
 from semfov.data.images import MAX_PIXELS
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
-from semfov.errors import SemfovError, check, lookup
+from semfov.errors import InputError, SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import World
 from semfov.zoom.lattice import Lattice
@@ -34,6 +37,8 @@ class OpenedPicture:
     def __init__(
         self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> None:
+        several = "one picture; semfov.run looks at folders, patterns and lists of names"
+        check(not _names_several(source), "picture", several, repr(source))
         self.source, self.color, self.white, self.bands = source, color, white, bands
         self.scene = hasattr(source, "look_at")  # a `Panorama`, a `Flat` or a camera that turns
         made = isinstance(source, World | LargePicture)
@@ -88,3 +93,28 @@ class OpenedPicture:
         """The scene for a head."""
         given = self.white is not None or self.bands is not None
         return open_scene(self.large if given else self.source, self.color)
+
+
+def _names_several(source: object) -> bool:
+    """Tell whether something names several pictures: a list of names, a folder, or a pattern that is no file."""
+    if isinstance(source, list | tuple):
+        return any(isinstance(each, str | PathLike) for each in source)
+    if not isinstance(source, str | PathLike):
+        return False
+    return os.path.isdir(source) or (bool({*os.fspath(source)} & {*"*?["}) and not os.path.lexists(source))
+
+
+def check_order(picture: object, target: object, classes: Sequence[str]) -> None:
+    """Raise `InputError` where a class stands in the place of the picture, and what is none in that of the class."""
+    named = isinstance(picture, str) and not os.path.lexists(picture) and _is_class(picture, classes)
+    swapped = named and target is not None and not isinstance(target, int | list | Mapping)
+    check(not swapped or _is_class(target, classes), "picture", "the picture before the class", repr(picture))
+
+
+def _is_class(name: object, classes: Sequence[str]) -> bool:
+    """Tell whether a name is that of a class."""
+    try:
+        class_index(cast(str, name), classes)
+    except InputError:
+        return False
+    return True

@@ -1,5 +1,6 @@
 """The agent and the classes that the options name, with what can be checked before anything is loaded."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.data.classes import class_index
 from semfov.detection.load import check_detector, given_names
 from semfov.detection.weights import WEIGHTS
-from semfov.errors import InputError, check
+from semfov.errors import check, check_device
 from semfov.io.manifest import Manifest
 from semfov.sensor import SENSORS, Foveation
 
@@ -34,12 +35,7 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
 
 def detector_options(options: AgentOptions | GazeOptions) -> dict[str, Any]:
     """What the options give to `load_detector`: weights, a device that PyTorch has, and names or a file of them."""
-    try:
-        torch.empty(0, device=options.device).cpu()  # from `meta` nothing comes back
-    except (RuntimeError, AssertionError):
-        have = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
-        expected = f"expected one that PyTorch has here ({', '.join(have)})"
-        raise InputError(f"device: {expected}, got {options.device!r}") from None
+    check_device(options.device)
     names = options.classes
     if names is not None and len(names) == 1 and Path(names[0]).is_file():
         names = given_names(names[0])
@@ -52,11 +48,12 @@ def make_agent(options: AgentOptions) -> ActivePerception:
     device = options.device
     agent = _load_agent(options, detector_options(options))
     if options.half:
-        name = agent.eye.detector.settings()["name"]
-        check(
-            any(True for _ in agent.eye.detector.parameters()), "half", "a detector of PyTorch", f"{name}, an ONNX file"
-        )
         agent = agent.half()
+        if torch.device(device or "cpu").type == "cpu":
+            warnings.warn(
+                "half: numbers of 16 bits make a processor several times slower; leave it out, or give device='cuda'",
+                stacklevel=2,
+            )
     return agent if device is None else agent.to(device)
 
 

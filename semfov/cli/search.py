@@ -518,8 +518,12 @@ def _meant(options: SearchOptions, classes: Sequence[str]) -> dict[str, float]:
             # What else a target that is no class can be.
             way = "; a description needs --embeddings, a file of word vectors" * ("did you mean" not in str(error))
             with suppress(InputError):
-                if len([class_index(name.strip(), classes) for name in target.split(",")]) > 1:
-                    way = "; a search is for one class, and `semfov find` takes several"
+                several = [classes[class_index(name.strip(), classes) - 1] for name in target.split(",")]
+                foveal = options.how == "fovea" or options.start is not None or options.shifts is not None
+                if len(several) > 1 and foveal:
+                    return dict.fromkeys(several, 1.0)
+                if len(several) > 1:
+                    way = "; a search is for one class, `semfov find` takes several, and --how fovea any of them"
             raise InputError(f"{error}{way}") from None
     vectors = WordVectors.read(options.embeddings, [target, *classes])
     weights = spread(target, classes, vectors)

@@ -19,7 +19,7 @@ from semfov.data.inputs import STREAMS
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.errors import DataError, InputError, SemfovError, check, check_data, needing, printable
-from semfov.io.files import reading
+from semfov.io.files import MADE_HERE, reading
 
 PHOTOGRAPHS = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".apng", ".webp", ".avif", ".avifs", ".heic", ".heif", ".hif"),
@@ -28,6 +28,7 @@ PHOTOGRAPHS = (
 )
 """Ends of the names of photographs."""
 
+_HEAD = 4096  # bytes, in which the comment of a picture is
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")  # ends of the names of videos
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)  # seconds between the attempts to open a stream again that broke off
@@ -60,6 +61,7 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
     within = source.rglob("*") if recursive else source.iterdir()
     seen = [path for path in within if not any(part.startswith(".") for part in path.relative_to(source).parts)]
     files = sorted(path for path in seen if path.suffix.lower() in PHOTOGRAPHS)
+    files = _of_others(files, source) if recursive else files
     photographs(seen, str(source))
     mosaics = [path.name for path in source.iterdir() if path.suffix.lower() == ".vrt"]
     if mosaics:
@@ -70,6 +72,24 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
         what, where = ("source: expected frames", "") if frames else ("picture: expected photographs", where)
         raise DataError(f"{what} (.jpg, .png, .tif, …) in {source}{where}, got none")
     return files
+
+
+def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
+    """Drop the figures and crops that semfov has written, with a warning."""
+    own = [path for path in files if _made_here(path)]
+    if own:
+        what = f"{len(own)} pictures that semfov has written, such as {printable(str(own[0]))}, are left out"
+        warnings.warn(f"{source}: {what}; name them, or their folder, to look at them", stacklevel=3)
+    return [path for path in files if path not in own]
+
+
+def _made_here(path: Path) -> bool:
+    """Tell whether a picture has the comment of those that semfov writes."""
+    try:
+        with path.open("rb") as file:
+            return path.is_file() and MADE_HERE.encode() in file.read(_HEAD)
+    except OSError:
+        return False  # it is skipped when it is opened
 
 
 def photographs(paths: Sequence[Path], where: str) -> list[Path]:

@@ -22,7 +22,7 @@ from semfov.detection.transformers import TransformersDetector
 from semfov.detection.ultralytics import UltralyticsDetector
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import Runtime, YoloV3
-from semfov.errors import DataError, InputError, check, check_options, lookup
+from semfov.errors import DataError, InputError, check, check_device, check_options, lookup
 from semfov.io.files import check_regular, read_text
 
 _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?detr[a-z0-9_-]*)")
@@ -119,7 +119,11 @@ def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, opti
     detector.selection = selection
     if options.get("background") is not None:
         detector.background = options["background"]
-    return detector if "device" in own else detector.to(options.get("device"))
+    if "device" in own or options.get("device") is None:
+        return detector
+    if torch.device(options["device"]).type != "meta":
+        check_device(options["device"])
+    return detector.to(options["device"])
 
 
 def _options_of(load: Callable[..., Detector]) -> list[str]:

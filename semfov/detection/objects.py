@@ -2,14 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from semfov.data.classes import class_index
 from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
+from semfov.words import not_there
 
 _Column = NDArray[np.float32]
 _Index = NDArray[np.intp]
@@ -21,6 +24,21 @@ FAINTEST = 0.05  # score from which on boxes are merged into candidates
 _FAR = 1e9  # pixels of an edge, beyond which areas of single precision overflow
 _PRINTED = 20  # largest number of objects in the text form
 _BORDER = 2 / 416  # boxes that come this near to a border of their window, in longer sides of the window, are cut by it
+
+_WORDS = {
+    **dict.fromkeys(("save", "to_csv", "write"), "record.to_csv(path, 'objects')"),
+    **dict.fromkeys(
+        ("dataframe", "df", "to_dataframe", "to_df", "to_frame", "to_pandas"), "record.to_frame('objects')"
+    ),
+    **dict.fromkeys(("to_dict", "to_json", "tolist"), "record.object_rows()"),
+    **dict.fromkeys(("to_coco", "to_geojson", "to_supervision", "to_yolo"), "the method of the record"),
+    **dict.fromkeys(("draw", "plot", "show"), "record.plot()"),
+    **dict.fromkeys(("bbox", "box", "xyxy"), "objects.boxes"),
+    **dict.fromkeys(("conf", "confidence", "probability", "score"), "objects.scores"),
+    **dict.fromkeys(("class_id", "cls", "label"), "objects.labels"),
+    "names": "objects.classes",
+}
+"""What others call the attributes of objects, and ours."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,6 +62,11 @@ class Objects:
     labels: Tensor
     passes: Tensor
     classes: tuple[str, ...] = field(default=(), compare=False)
+
+    if not TYPE_CHECKING:  # to which any name would be one of objects
+
+        def __getattr__(self, name: str) -> Any:
+            return not_there(self, name, _WORDS)
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -81,19 +104,24 @@ class Objects:
         """
         return self[self.scores >= score]
 
-    def of(self, labels: Sequence[int]) -> "Objects":
+    def of(self, labels: Sequence[int] | str) -> "Objects":
         """Objects of some classes.
 
         Args:
-            labels: the classes, 1..K; none stands for all classes.
+            labels: the classes, 1..K, or the name of one; none stands for all classes.
 
         Returns:
             The objects.
+
+        Raises:
+            InputError: no class has this name.
         """
+        labels = [class_index(labels, self.classes[1:])] if isinstance(labels, str) else labels
         return self[torch.isin(self.labels, torch.tensor(labels))] if len(labels) else self
 
     def __getitem__(self, index: Tensor | slice | int) -> "Objects":
         """Some of the objects, or by a number one of them."""
+        check(not isinstance(index, str), "index", f"a number; objects.of({index!r}) are those of a class", repr(index))
         index = torch.tensor([index]) if isinstance(index, int) else index
         return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
 

@@ -23,6 +23,9 @@ _OLD = 24 * 3600.0  # seconds after which a part of a file is taken for one whos
 
 _unfinished: set[Path] = set()
 
+MADE_HERE = "made by semfov"
+"""Comment in the first bytes of the pictures that semfov writes, by which they are told from photographs."""
+
 
 def discard_unfinished() -> None:
     """Remove temporary files of unfinished writes, for a process that is about to exit without cleaning up."""

@@ -274,8 +274,8 @@ class FovealObservationModel(Pretrained):
         """Set α to its maximum a posteriori estimate, given the statistics of a training set.
 
         `semfov.observation.fitting.fit_tables` explains the estimate and how it differs from that of the paper. A level
-        with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning reports it, and
-        `metadata["fallback"]` records it.
+        with fewer than `minimum` objects is fitted with the samples of its neighbours; a warning reports it, and
+        `metadata["pooled"]` records it.
 
         Args:
             statistics: sums of the scores by class and level, of shape `(K+1, N)`.

@@ -339,7 +339,7 @@ class Moment(Record):
         """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
         return None
 
-    def draw(self, frame: ImageLike, *, color: Color = "bgr", longest: int = 1280) -> NDArray[np.uint8]:
+    def draw(self, frame: ImageLike, *, color: Color = "bgr", longest: int | None = None) -> NDArray[np.uint8]:
         """Draw the look, the belief or the objects, and where the next look goes, into the frame, for a window.
 
         Matplotlib is not needed.
@@ -348,10 +348,10 @@ class Moment(Record):
             frame: the frame of the moment.
             color: order of the channels of the frame and of the drawing: `bgr`, as OpenCV reads and shows them, or
                 `rgb`.
-            longest: longer side of the drawing in pixels; a larger frame is reduced to it.
+            longest: longer side of the drawing in pixels, to which a larger frame is reduced; None keeps the size.
 
         Returns:
-            `(h, w, 3)`, bytes, with even sides.
+            `(h, w, 3)`, bytes.
 
         Raises:
             InputError: it is no frame of the size of the moment's.
@@ -361,12 +361,12 @@ class Moment(Record):
             moment = live.step(frame)
             cv2.imshow("semfov", moment.draw(frame))
         """
-        from semfov.viz.live import draw_moment
+        from semfov.viz.live import draw_moment, reduced
 
         image = as_image(frame, argument="frame", color=color)
         size = tuple(image.shape[:0:-1])
         check(size == self.size, "frame", "{} × {} px".format(*self.size), size)
-        drawn = draw_moment(image, self, self.describe(), longest)
+        drawn = draw_moment(image, self, self.describe(), self.size if longest is None else reduced(self.size, longest))
         return np.ascontiguousarray(drawn[..., ::-1]) if color == "bgr" else drawn
 
     def _decided(self) -> str | None:

@@ -24,7 +24,7 @@ from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
-from semfov.io.files import write_bytes
+from semfov.io.files import MADE_HERE, write_bytes
 from semfov.paths.base import Record
 from semfov.paths.stimulus import reduced_copy
 from semfov.words import not_there
@@ -391,11 +391,11 @@ class GazePrediction:
         if kind == ".npy":
             np.save(content, self.density.numpy(), allow_pickle=False)
         elif kind == ".png":
-            self.plot().savefig(content, format="png", dpi=150)
+            self.plot().savefig(content, format="png", dpi=150, metadata={"Software": MADE_HERE})
         else:
             from PIL import Image
 
-            Image.fromarray(self.density.float().numpy()).save(content, format="TIFF")
+            Image.fromarray(self.density.float().numpy()).save(content, format="TIFF", software=MADE_HERE)
         write_bytes(path, content.getvalue())
         return path
 

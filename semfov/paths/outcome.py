@@ -12,13 +12,23 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects, box_text
+from semfov.errors import check
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
 from semfov.paths.merging import distances_to, merge_fixations
+
+
+class NumberByClass(dict[str, float]):
+    """Numbers by the name of their class, which may be in the plural or another spelling, as that of a target may."""
+
+    def __missing__(self, name: str) -> float:
+        names = list(self)
+        return self[names[class_index(name, names, "expected") - 1]]
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -86,6 +96,8 @@ class Outcome(ABC):
 
     def __getitem__(self, number: int) -> RecordedLook:
         """The look of a number, as iteration gives it; -1 is the last one."""
+        remedy = f"; its objects of a class are record.objects.of({number!r})"
+        check(not isinstance(number, str), "record", "the number of a look", f"{number!r}{remedy}")
         return self.looks[number]
 
     @property
@@ -184,7 +196,7 @@ class Outcome(ABC):
         each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
         or a head, nor of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`).
         """
-        return {name: mean for name, (mean, _) in self._claimed().items()}
+        return NumberByClass({name: mean for name, (mean, _) in self._claimed().items()})
 
     @property
     def expected_error(self) -> dict[str, float]:
@@ -196,7 +208,7 @@ class Outcome(ABC):
 
         .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
-        return {name: variance**0.5 for name, (_, variance) in self._claimed().items()}
+        return NumberByClass({name: variance**0.5 for name, (_, variance) in self._claimed().items()})
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN for those without one."""

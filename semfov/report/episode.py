@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
+from semfov.io.files import MADE_HERE
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import confident_detections
 from semfov.viz.belief import class_posterior
@@ -34,7 +35,7 @@ def pillow(image: Tensor) -> Any:
 def jpeg(image: Tensor, quality: int) -> bytes:
     """A picture `(3, H, W)`, of bytes or in [0, 1], as JPEG."""
     file = io.BytesIO()
-    pillow(image).save(file, "JPEG", quality=quality, optimize=True)
+    pillow(image).save(file, "JPEG", quality=quality, optimize=True, comment=MADE_HERE)
     return file.getvalue()
 
 

@@ -22,7 +22,6 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 
 import torch
-from tqdm import tqdm
 
 from semfov.errors import InputError, SemfovError
 from semfov.io.code import package_digest
@@ -115,31 +114,37 @@ def run_tasks(
     unit: str,
     hidden: bool = False,
     made: _Made | None = None,
+    count: Callable[[_Task], int] = lambda _: 1,
 ) -> Generator[tuple[_Task, _Result], None, None]:
     """Run `function(made, task)` for every task, and yield tasks and results in any order; closing it ends the work.
 
-    Each process makes `made` once, by `make(*settings)`; this one does not where it is given.
+    Each process makes `made` once, by `make(*settings)`; this one does not where it is given. The bar counts units, of
+    which a task may have several.
     """
     if not tasks:
         return
     processes = available_cores() if where is None else where
-    with closing(task_bar(len(tasks), title, unit, hidden=hidden)) as bar:
+    with closing(task_bar(sum(map(count, tasks)), title, unit, hidden=hidden)) as bar:
+
+        def tell(task: _Task) -> None:
+            bar.update(count(task))
+
         if isinstance(processes, int) and (processes <= 1 or len(tasks) == 1):
             if made is None:
                 prepare_worker()
                 made = make(*settings)
             for task in tasks:
                 yield task, function(made, task)
-                bar.update()
+                tell(task)
             return
         code = None if isinstance(processes, int) else package_digest()
         job: Callable[[_Task], _Result] = _Job(function, make, settings, Path.cwd(), code).run
         if isinstance(processes, int):
-            yield from _in_processes(job, tasks, processes, title, bar)
+            yield from _in_processes(job, tasks, processes, title, tell)
         elif isinstance(processes, Executor):
-            yield from _results(processes, job, tasks, lambda _: bar.update())
+            yield from _results(processes, job, tasks, tell)
         else:
-            yield from _on_cluster(processes, job, tasks, title, bar)
+            yield from _on_cluster(processes, job, tasks, title, tell)
 
 
 @contextmanager
@@ -217,7 +222,11 @@ _shared: ContextVar[tuple[ExitStack, dict[int, Executor]] | None] = ContextVar("
 
 
 def _in_processes(
-    job: Callable[[_Task], _Result], tasks: Sequence[_Task], processes: int, title: str, bar: tqdm[Any]
+    job: Callable[[_Task], _Result],
+    tasks: Sequence[_Task],
+    processes: int,
+    title: str,
+    tell: Callable[[_Task], object],
 ) -> Iterator[tuple[_Task, _Result]]:
     shared = _shared.get()
     try:
@@ -226,7 +235,7 @@ def _in_processes(
             if processes not in executors:
                 number = processes if shared else min(processes, len(tasks))
                 executors[processes] = pools.enter_context(_started(number))
-            yield from _results(executors[processes], job, tasks, lambda _: bar.update(), _deaf_children())
+            yield from _results(executors[processes], job, tasks, tell, _deaf_children())
     except BrokenProcessPool:
         raise SemfovError(
             f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
@@ -253,7 +262,11 @@ def _started(processes: int) -> Iterator[Executor]:
 
 
 def _on_cluster(
-    address: str, job: Callable[[_Task], _Result], tasks: Sequence[_Task], title: str, bar: tqdm[Any]
+    address: str,
+    job: Callable[[_Task], _Result],
+    tasks: Sequence[_Task],
+    title: str,
+    tell: Callable[[_Task], object],
 ) -> Iterator[tuple[_Task, _Result]]:
     """Run tasks on a cluster; those that were lost with its scheduler are given to the next one at the same address."""
     left = dict.fromkeys(tasks)
@@ -262,9 +275,10 @@ def _on_cluster(
             with _open_cluster(address, again=attempt > 0) as (executor, places):
                 every, size = [*left], min(_BATCH, max(1, len(left) // (_TURNS * places)))
                 batches = [tuple(every[start : start + size]) for start in range(0, len(every), size)]
-                for batch, results in _results(executor, partial(_in_turn, job), batches, lambda b: bar.update(len(b))):
+                for batch, results in _results(executor, partial(_in_turn, job), batches, lambda batch: None):
                     for task, result in zip(batch, results, strict=True):
                         yield task, result
+                        tell(task)
                         del left[task]
             return
         except _ClusterLost as error:

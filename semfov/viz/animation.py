@@ -16,7 +16,7 @@ from torch import Tensor
 
 from semfov.data.inputs import ImageLike
 from semfov.errors import DataError, check
-from semfov.io.files import replacing
+from semfov.io.files import MADE_HERE, replacing
 from semfov.paths import Record
 from semfov.viz.drawing import photograph_of
 from semfov.viz.scanpath import LookFigure, views_of
@@ -127,7 +127,7 @@ def _write_gif(frames: Sequence[_Frame], file: Any, seconds: float, hold: float)
     first, *others = _in_one_palette(frames)
     times = [int(1000 * seconds)] * len(frames)
     times[-1] += int(1000 * hold)
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=times, loop=0)
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=times, loop=0, comment=MADE_HERE)
 
 
 def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[Any]:

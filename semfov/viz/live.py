@@ -24,14 +24,22 @@ _LONGEST_OF_WINDOWS = 1280  # small objects of large frames are to be seen
 VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}  # suffixes of videos that can be written, and their codecs
 
 
-def draw_moment(image: Tensor, moment: Moment, text: str, longest: int | None = None) -> _Frame:
-    """Draw what is known at a frame, and where the next look goes, into the frame `(3, H, W)`; `(h, w, 3)`."""
+def reduced(size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """Reduce `(width, height)` to a longer side, with even sides, as codecs of videos need them."""
+    scale = min(1.0, longest / max(size))
+    width, height = (max(2, round(side * scale / 2) * 2) for side in size)
+    return width, height
+
+
+def draw_moment(image: Tensor, moment: Moment, text: str, size: tuple[int, int] | None = None) -> _Frame:
+    """Draw what is known at a frame, and where the next look goes, into the frame `(3, H, W)`; `(h, w, 3)`.
+
+    The drawing has a `(width, height)`, or None for that of a frame of the video that is written.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     (height, width), look, ahead = image.shape[-2:], moment.looks[-1], moment.next_region
-    usual = _LONGEST if ahead is None else _LONGEST_OF_WINDOWS
-    scale = min(1.0, (usual if longest is None else longest) / max(width, height))
-    size = max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2)
+    size = size or reduced((width, height), _LONGEST if ahead is None else _LONGEST_OF_WINDOWS)
     pixels = in_bytes(image) if image.is_floating_point() else image
     picture = Image.fromarray(pixels.permute(1, 2, 0).cpu().numpy()).resize(size)
     across, down = size[0] / width, size[1] / height

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 from weakref import WeakSet
 
 from semfov.errors import check
-from semfov.io.files import replacing
+from semfov.io.files import MADE_HERE, replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -171,7 +171,8 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
     fits = path.suffix[1:].lower() in ("", *kinds)
     check(fits, "path", f"a file that ends in {', '.join(f'.{kind}' for kind in kinds)}", path.name)
     with rc_context(_FILES), replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, format=path.suffix[1:].lower() or "png")
+        kind = path.suffix[1:].lower() or "png"
+        figure.savefig(temporary, dpi=dpi, format=kind, metadata={"Software": MADE_HERE} if kind == "png" else None)
     return path
 
 

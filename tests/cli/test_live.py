@@ -98,6 +98,7 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert "written:" not in printed.out
 
 
+@pytest.mark.filterwarnings("default:skipped")  # the command prints them
 def test_a_frame_that_is_none_or_of_another_size_is_skipped(run, tmp_path):
     for name, size in (("b.png", (60, 40)), ("c.png", (40, 60)), ("e.png", (60, 40))):
         Image.new("RGB", size).save(tmp_path / name)
@@ -246,6 +247,8 @@ def test_a_moment_draws_into_a_frame_of_opencv():
     assert np.array_equal(drawn[..., ::-1], draw_moment(image, known, known.describe()))
     assert np.array_equal(known.draw(frame[..., ::-1], color="rgb"), drawn[..., ::-1])
     assert known.draw(frame, longest=100).shape == (50, 100, 3)
+    for size in ((401, 203), (2001, 1001)):  # odd, and larger than a screen
+        assert moment(grid=Grid(4, 2, size)).draw(np.zeros((*size[::-1], 3), np.uint8)).shape == (*size[::-1], 3)
     refused(r"frame: expected 400 × 200 px", known.draw, frame[:100])
 
 

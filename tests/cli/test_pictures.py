@@ -409,7 +409,7 @@ def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_pat
     assert set(table.picture) == {str(folder / f"{name}.png") for name in "abcde"}
     (wrong,) = table[table.error.notna()].to_dict("records")
     assert Path(wrong["picture"]).name == "e.png"
-    assert wrong["error"].startswith(f"{folder / 'e.png'}: ")
+    assert "e.png: not an image" in wrong["error"]
     assert pd.isna(wrong["class"])
     counts = table.groupby(["picture", "class"]).object.count().unstack()
     assert counts["red"].tolist() == [1, 1, 1, 0]

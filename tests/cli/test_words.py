@@ -15,12 +15,13 @@ from semfov.cli.outcome import table_lines
 from semfov.cli.results import kind_of
 from semfov.errors import InputError
 from semfov.runs.command import _usual_form, make_parser
+from tests import small
 
 REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
     "search --target qqq": "airplane and 75 more; `semfov detectors NAME` lists them",
-    "search --target cup,fork": "; a search is for one class, and `semfov find` takes several",
+    "search --target cup,fork": "; a search is for one class, `semfov find` takes several, and --how fovea any of them",
     "search": "target: expected a class, --target cup, got none; `semfov detectors yolox-nano` lists them",
     "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "find --start 5,5": "start: expected none for find",
@@ -77,6 +78,7 @@ WRONG_USE = {
     "FOLDER --target cup": "try `semfov search FOLDER --target CLASS`",
     "search --targt cup": "unknown option --targt; did you mean --target?",
     "find --closer 3": "unknown option --closer; it is one of `semfov search` and `semfov live`",
+    "explore a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find` and",
     "explore --frames=3": "unknown option --frames; it is one of `semfov live`",
     "find . --conf 0.5": "unknown option --conf; did you mean --least?",
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
@@ -236,3 +238,11 @@ def test_a_shell_completes_commands_and_options():
         'complete -c semfov -n __fish_use_subcommand -a "find"',
         'complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up',
     ]
+
+
+def test_half_precision_on_a_processor_is_told(monkeypatch):
+    loaded = small.agent(small.Coloured())
+    monkeypatch.setattr(loaded, "half", lambda: loaded)
+    monkeypatch.setattr(agent, "_load_agent", lambda *given: loaded)
+    with pytest.warns(UserWarning, match="half: numbers of 16 bits make a processor several times slower"):
+        assert make_agent(options.FindOptions(half=True)) is loaded

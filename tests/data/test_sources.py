@@ -8,12 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+import semfov
 from semfov.data import sources
 from semfov.data.images import _FORMATS
 from semfov.data.sources import PHOTOGRAPHS, embedded_picture, open_stream, picture_files
 from semfov.errors import DataError, InputError
+from semfov.report.episode import jpeg
+from tests import small
 from tests.refusals import refused, unusable
 
 SHADES = (20, 90, 160, 230)
@@ -51,6 +55,21 @@ def test_a_folder_leaves_out_no_photograph_that_is_read_alone(tmp_path):
     with pytest.warns(UserWarning, match=r"1 mosaics, such as 'b.VRT', are left out"):
         assert [path.name for path in picture_files(tmp_path)] == ["a.jpg", "c.jpg", "d.jpg"]
     assert picture_files(tmp_path / "d.jpg") == [tmp_path / "d.jpg"]
+
+
+def test_pictures_that_semfov_has_written_are_left_out_of_folders_in_a_folder(tmp_path):
+    """A figure, a film, a crop and heat maps, told by what is in them; by their own folder they are looked at."""
+    Image.new("RGB", (8, 6), "red").save(tmp_path / "photo.jpg")
+    made = tmp_path / "out" / "made"
+    made.mkdir(parents=True)
+    record = small.agent(small.Coloured()).explore(torch.rand(3, 12, 16), shifts=1)
+    figure = semfov.viz.save_figure(record.plot(), made / "scanpath.png")
+    record.animate().save(made / "film.gif")
+    (made / "crop.jpg").write_bytes(jpeg(torch.rand(3, 12, 16), 92))
+    with pytest.warns(UserWarning, match=r": 3 pictures that semfov has written, such as \S+crop.jpg, are left out"):
+        assert picture_files(tmp_path, recursive=True) == [tmp_path / "photo.jpg"]
+    assert picture_files(figure) == [figure]
+    assert [path.name for path in picture_files(made)] == ["crop.jpg", "film.gif", "scanpath.png"]
 
 
 def test_frames_of_a_video_are_read_in_order(video):

@@ -1,15 +1,17 @@
 """`python -m train.fit_fom` as a user runs it: small, on the embedded scenes, with the real detector."""
 
 import json
+from dataclasses import fields
 
 import pytest
 import torch
 
 from eval.calibration import main as calibrate
+from semfov.metrics.calibration import Calibration
 from semfov.observation import FovealObservationModel, match
 from semfov.runs.config import DataConfig
 from semfov.runs.seeds import generator_for
-from train.fit_fom import FitFomConfig, fit_fom, main
+from train.fit_fom import FitFomConfig, _judgement, fit_fom, main
 from train.samples import Sampler
 
 pytestmark = pytest.mark.slow
@@ -38,6 +40,15 @@ def test_fit_writes_a_model_and_a_report(fitted):
         assert word in report
     assert json.loads((fitted / "manifest.json").read_text())["model"]["method"] == "newton"
     assert (fitted / "reliability.png").stat().st_size > 3000
+
+
+def test_the_report_says_when_raw_scores_are_better(fitted):
+    worse, better = (Calibration(*[value] * len(fields(Calibration))) for value in (0.341, 0.285))
+    config = FitFomConfig()
+    said = _judgement(config, {"raw scores": better, "discriminative": worse})
+    assert said.startswith("**Raw scores are better on held-out photographs**: the model has Brier 0.341")
+    assert _judgement(config, {"raw scores": worse, "discriminative": better}).startswith("The model is better")
+    assert "better" in (fitted / "report.md").read_text().partition("on held-out photographs")[0]
 
 
 def test_estimators_agree(fitted):

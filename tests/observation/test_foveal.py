@@ -139,7 +139,7 @@ def test_fit_recovers_the_dirichlets_from_many_samples(method):
     statistics = draw(alpha, torch.full((4, 3), 4000))
     model = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics, method=method)
     np.testing.assert_allclose(model.alpha.detach(), alpha, rtol=0.15)
-    assert model.metadata["fallback"] == {}
+    assert model.metadata["pooled"] == {}
     assert model.metadata["counts"] == statistics.count.tolist()
     assert float(model.log_prior.abs().max()) == 0
     reference = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics)
@@ -152,14 +152,14 @@ def test_cells_with_few_samples_follow_their_class():
     counts[2, 1] = 0
     counts[3] = 0
     fitted, _, _, record = fit_tables(draw(alpha, counts), shrinkage=10.0)
-    assert record["fallback"] == {}
+    assert record["pooled"] == {}
     np.testing.assert_allclose(fitted[2, 1], alpha[2, 1], rtol=0.15)
     torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
 
 
 def test_fits_without_data_or_of_identical_samples_are_finite():
     model = FovealObservationModel.identity(CLASSES, EDGES)
-    with pytest.warns(UserWarning, match="level 0 has no inner neighbour"):
+    with pytest.warns(UserWarning, match="level 0 from levels 0 to 2, level 1 from levels 0 to 2"):
         model.fit(DirichletStatistics((4, 3), 4), prior=True, expected="empirical")
     torch.testing.assert_close(model.alpha, torch.ones(4, 3, 4))
     torch.testing.assert_close(model.expected_scores(), torch.full((4, 3, 4), 0.25))
@@ -173,18 +173,38 @@ def test_fits_without_data_or_of_identical_samples_are_finite():
     assert alpha[1, 0].argmax() == 1
 
 
-def test_levels_with_few_samples_copy_their_inner_neighbour_and_warn():
-    alpha = table()
+def test_levels_with_few_objects_are_fitted_with_their_neighbours_and_warn():
+    """Level 2 needs level 1; the pool has the sums of both, as if their samples were of one level."""
     counts = torch.full((4, 3), 400)
-    counts[1:, 1:] = 5
-    statistics = draw(alpha, counts)
+    counts[1:, 1] = 30
+    counts[1:, 2] = 5
+    statistics = draw(table(), counts)
     model = FovealObservationModel.identity(CLASSES, EDGES)
-    with pytest.warns(UserWarning, match="level 1 as level 0, level 2 as level 0"):
-        model.fit(statistics, minimum=20, expected="empirical")
-    assert model.metadata["fallback"] == {"1": 0, "2": 0}
-    for level in (1, 2):
-        assert torch.equal(model.alpha[:, level], model.alpha[:, 0])
-        assert torch.equal(model.expected_scores()[:, level], model.expected_scores()[:, 0])
+    with pytest.warns(UserWarning, match="level 2 from levels 1 to 2$"):
+        model.fit(statistics, minimum=90, expected="empirical")
+    assert model.metadata["pooled"] == {"2": [1, 2]}
+    joint = DirichletStatistics((4, 3), 4)
+    joint.count[:, 0], joint.sums[:, :, 0] = statistics.count[:, 0], statistics.sums[:, :, 0]
+    joint.count[:, 2], joint.sums[:, :, 2] = statistics.count[:, 1:].sum(1), statistics.sums[:, :, 1:].sum(2)
+    alpha, _, expected, _ = fit_tables(joint, minimum=0)
+    torch.testing.assert_close(model.alpha[:, 2].double(), alpha[:, 2], rtol=1e-5, atol=0)
+    torch.testing.assert_close(model.expected_scores()[:, 2].double(), expected[:, 2], rtol=1e-5, atol=0)
+    assert not torch.allclose(model.alpha[:, 1], model.alpha[:, 2], rtol=1e-3)
+
+
+def test_fewer_objects_than_a_level_needs_are_one_level():
+    """Thirteen objects in eight levels: all levels have them all, and none the innermost one's few alone."""
+    statistics = DirichletStatistics((4, 8), 4)
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.rand(13, 4, generator=generator)
+    statistics.update(rows / rows.sum(-1, keepdim=True), (torch.arange(13) % 3 + 1, torch.arange(13) % 8))
+    with pytest.warns(UserWarning, match="levels with fewer than 100 objects"):
+        alpha, _, _, record = fit_tables(statistics, minimum=100)
+    assert record["pooled"] == {str(level): list(range(8)) for level in range(8)}
+    assert bool((alpha == alpha[:, :1]).all())
+    whole = DirichletStatistics((4, 1), 4)
+    whole.count, whole.sums = statistics.count.sum(1, keepdim=True), statistics.sums.sum(2, keepdim=True)
+    torch.testing.assert_close(alpha[:, :1], fit_tables(whole, minimum=0)[0])
 
 
 def test_expected_scores_and_prior_are_those_of_the_data():

@@ -1,5 +1,6 @@
 """Work that is shared by processes of this machine, or by those of a cluster."""
 
+import io
 import multiprocessing
 import operator
 import os
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tqdm import tqdm
 
 from semfov.errors import InputError, SemfovError
 from semfov.runs import workers
@@ -183,6 +185,21 @@ def results(function, tasks, where, *, make=id, settings=(0,)):
     one = partial(of_task, function)
     run = run_tasks(one, tasks, where=where, make=make, settings=settings, title="testing", unit="task")
     return dict(run)
+
+
+@pytest.mark.parametrize("where", [1, 2])
+def test_a_bar_counts_the_units_of_tasks(where, monkeypatch):
+    bars = []
+
+    def bar(total, title, unit, *, hidden):
+        bars.append(tqdm(total=total, unit=unit, disable=False, file=io.StringIO()))
+        return bars[-1]
+
+    monkeypatch.setattr(workers, "task_bar", bar)
+    names = ["a", "bb", "cccc"]
+    work = run_tasks(str.__add__, names, where=where, make=str, settings=("x",), title="", unit="letter", count=len)
+    assert dict(work) == {name: f"x{name}" for name in names}
+    assert [(each.total, each.n, each.unit) for each in bars] == [(7, 7, "letter")]
 
 
 class Waiting(Executor):
