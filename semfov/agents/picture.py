@@ -38,7 +38,7 @@ class OpenedPicture:
         self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> None:
         several = "one picture; semfov.run looks at folders, patterns and lists of names"
-        check(not _names_several(source), "picture", several, repr(source))
+        check(not _names_several(source), "picture", several, source)
         self.source, self.color, self.white, self.bands = source, color, white, bands
         self.scene = hasattr(source, "look_at")  # a `Panorama`, a `Flat` or a camera that turns
         made = isinstance(source, World | LargePicture)
