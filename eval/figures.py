@@ -261,8 +261,7 @@ def _ambiguity(example: Example, before: Detections, after: Detections, fixation
 
 def _only(detections: Detections, number: int) -> Detections:
     """One detection of a look."""
-    here = slice(number, number + 1)
-    return Detections(detections.boxes[:, here], detections.scores[:, here], detections.mask[:, here])
+    return detections.take(slice(number, number + 1))
 
 
 @styled

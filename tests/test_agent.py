@@ -323,7 +323,7 @@ def test_confirmation_of_a_batch_equals_that_of_each_look():
             left, top = int(cell[look]) % 4 * 40, int(cell[look]) // 4 * 40
             there = x < left + 40 and z > left and y < top + 40 and w > top
             sure = scores[look, detection].tolist()
-            answer |= bool(mask[look, detection]) and there and max(sure) == sure[2] and sure[2] >= 0.6
+            answer |= bool(mask[look, detection]) and there and sure[2] >= 0.6
         expected.append(answer)
     assert 0 < sum(expected) < 40
     assert confirms(Detections(boxes, scores, mask), grid, cell, 2, 0.6).tolist() == expected

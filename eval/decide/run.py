@@ -383,7 +383,9 @@ def detected_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: i
     if not hits or hits[0] == 0:
         return None
     step = steps[hits[0]]
-    return bool(confirms(step.detections, grid, step.cell, target, 0.0))
+    seen = step.detections
+    named = seen.mask & (seen.scores.argmax(-1) == target)  # more probable than background, too
+    return bool(confirms(replace(seen, mask=named), grid, step.cell, target, 0.0))
 
 
 LANDINGS = ["landings", "p", "seen", "p, seen", "not seen", "p, not seen"]

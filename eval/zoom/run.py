@@ -22,7 +22,6 @@ from semfov.agents.windows import WindowEpisode
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST
 from semfov.episode.stopwatch import Stopwatch
 from semfov.paths import ZoomPath
@@ -295,6 +294,5 @@ class ZoomRun(WindowLooking, SceneRun):
 
 def without_cut(glance: Glance) -> Glance:
     """A look without the boxes that are cut by the border of its window."""
-    every, whole = glance.detections, ~glance.cut
-    detections = Detections(every.boxes[:, whole], every.scores[:, whole], every.mask[:, whole])
-    return replace(glance, detections=detections, cut=glance.cut[whole])
+    whole = ~glance.cut
+    return replace(glance, detections=glance.detections.take(whole), cut=glance.cut[whole])

@@ -406,9 +406,7 @@ class WindowEpisode(Episode[ZoomPath]):
             return None
         best, box = 0.0, None
         for detections in (glance.detections for glance in self.glances):
-            scores = detections.confidence[0].masked_fill(
-                ~detections.mask[0] | (detections.labels[0] != self.target), 0
-            )
+            scores = detections.class_scores[0, :, self.target - 1]
             if len(scores) and float(scores.max()) > best:
                 best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
         return Decision("found", best, None, box) if best >= self._confirm else Decision("undecided", best)
@@ -501,6 +499,5 @@ def _without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glanc
             if later.fixation[2] >= glance.window.fixation[2]:
                 first, last = low.new_tensor(later.region(lattice)).split(2)
                 left = left & ~((low >= first) & (high <= last)).all(-1)
-        remaining = Detections(detections.boxes[:, left], detections.scores[:, left], detections.mask[:, left])
-        current.append(replace(glance, detections=remaining, cut=glance.cut[left]))
+        current.append(replace(glance, detections=detections.take(left), cut=glance.cut[left]))
     return current

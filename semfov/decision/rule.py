@@ -151,8 +151,8 @@ def check_thresholds(confirm: float | None, give_up: float | None, closer: int |
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
-    """Whether a detection over each cell `(B,)` has `target` as its best class with at least this score, `(B,)`."""
-    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
+    """Whether a detection over each cell `(B,)` gives `target` at least this score, `(B,)`."""
+    sure = detections.mask & (detections.class_scores[..., target - 1] >= score)
     there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
     return (there & sure).any(-1)
 

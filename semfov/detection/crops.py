@@ -1,5 +1,7 @@
 """Detections in several crops of a picture around one point, merged into one set."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -19,9 +21,9 @@ def merge_crops(
     for first in range(0, len(detections.mask), crops):
         rows = slice(first, first + crops)
         number, row = detections.mask[rows].nonzero(as_tuple=True)
-        boxes, scores, window = detections.boxes[rows][number, row], detections.scores[rows][number, row], windows[rows]
-        limits = boxes.new_tensor([*size, *size], dtype=boxes.dtype)
-        boxes = torch.minimum(boxes.clamp(min=0), limits)
+        seen, window = detections[rows][number, row], windows[rows]
+        limits = seen.boxes.new_tensor([*size, *size], dtype=seen.boxes.dtype)
+        boxes = torch.minimum(seen.boxes.clamp(min=0), limits)
         own = boxes.detach()
         low, high = window[:, :2], window[:, 2:]
         border = _BORDER * (high - low) / side
@@ -32,11 +34,9 @@ def merge_crops(
         sharper = torch.arange(crops, device=number.device) < number[:, None]
         left = (own[:, 2:] > own[:, :2]).all(-1) & ~(whole & sharper).any(-1)
         index = left.nonzero()[:, 0]
-        value, label = scores[index, 1:].detach().max(-1)
+        value, label = seen.scores[index, 1:].detach().max(-1)
         cut = ~whole[index, number[index]]
         columns = (own[index], value, label, number[index], cut, -number[index])
         chosen = index[unlike(*(column.cpu() for column in columns))[:limit].to(index)]
-        merged.append(
-            Detections(boxes[chosen][None], scores[chosen][None], torch.ones_like(chosen, dtype=torch.bool)[None])
-        )
+        merged.append(replace(seen, boxes=boxes).take(chosen)[None])
     return merged[0] if len(merged) == 1 else Detections.stack(merged)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -39,16 +39,22 @@ def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
 class Detections:
     """A padded batch of detections, each with a score for every class and for background.
 
+    Beliefs read the score vectors, whose classes share what background leaves. Lists, drawings and thresholds read the
+    confidence, the number that the bare detector shows: with many classes a share is often far below it.
+
     Attributes:
         boxes: `(..., L, 4)`, `(x1, y1, x2, y2)` in pixels of the detector's input image.
         scores: `(..., L, K+1)`, score vectors that sum to 1; index 0 is background, 1..K are the detector's classes.
         mask: `(..., L)`, true where a row is a detection and false where it is padding.
+        confidence: `(..., L)`, the detector's own score of the best class, 0 for padding; None takes the largest score
+            of a class from the vectors.
 
-    Detections are in descending order of confidence (the largest score of a class other than background), with padding
-    last.
+    Detections are in descending order of their largest score of a class in the vectors, in which beliefs fuse them,
+    with padding last.
 
-    Other libraries store one class and one score for each box: the most probable class other than background, and its
-    score. Where a library can store further data, the full score vector is stored too, and converting back is exact.
+    Other libraries store one class and one score for each box: the best class other than background, and the
+    confidence. Where a library can store further data, the full score vector is stored too, and converting back is
+    exact.
 
     >>> d = Detections(torch.zeros(1, 2, 4), torch.full((1, 2, 3), 1 / 3), torch.tensor([[True, False]]))
     >>> d.count
@@ -58,6 +64,7 @@ class Detections:
     boxes: Tensor
     scores: Tensor
     mask: Tensor
+    confidence: Tensor = None  # type: ignore[assignment]  # `__post_init__` replaces None
 
     def __post_init__(self) -> None:
         check_shape(self.boxes, "boxes", None, 4)
@@ -70,6 +77,11 @@ class Detections:
             "the same leading dimensions",
             (tuple(self.boxes.shape), tuple(self.scores.shape), tuple(lead)),
         )
+        if self.confidence is None:
+            classes = self.scores[..., 1:]
+            best = classes.amax(-1) if classes.shape[-1] else classes.sum(-1)
+            object.__setattr__(self, "confidence", best * self.mask)
+        check(self.confidence.shape == lead, "confidence", f"shape {tuple(lead)}", tuple(self.confidence.shape))
 
     @property
     def count(self) -> Tensor:
@@ -77,14 +89,19 @@ class Detections:
         return self.mask.sum(-1)
 
     @property
-    def confidence(self) -> Tensor:
-        """Largest score of a class other than background, `(..., L)`; 0 for padding."""
-        return self.scores[..., 1:].amax(-1) * self.mask
+    def labels(self) -> Tensor:
+        """Best class other than background, `(..., L)`, from 1 to K; 0 for padding."""
+        return (self.scores[..., 1:].argmax(-1) + 1) * self.mask
 
     @property
-    def labels(self) -> Tensor:
-        """Most probable class other than background, `(..., L)`, from 1 to K; 0 for padding."""
-        return (self.scores[..., 1:].argmax(-1) + 1) * self.mask
+    def class_scores(self) -> Tensor:
+        """The detector's own score of each class, `(..., L, K)`: the confidence for the best class.
+
+        Every background policy divides what background leaves in proportion to these scores.
+        """
+        classes = self.scores[..., 1:]
+        best = classes.amax(-1, keepdim=True).clamp(min=torch.finfo(classes.dtype).tiny)
+        return classes / best * self.confidence[..., None]
 
     def to(self, device: torch.device | str) -> Self:
         """Move the detections to a device.
@@ -95,11 +112,28 @@ class Detections:
         Returns:
             The detections on that device.
         """
-        return type(self)(self.boxes.to(device), self.scores.to(device), self.mask.to(device))
+        return self._mapped(lambda each: each.to(device))
 
-    def __getitem__(self, index: int | slice | Tensor) -> Self:
+    def __getitem__(self, index: int | slice | Tensor | tuple[Tensor, ...] | None) -> Self:
         """Return the detections of some images of the batch."""
-        return type(self)(self.boxes[index], self.scores[index], self.mask[index])
+        return self._mapped(lambda each: each[index])
+
+    def take(self, rows: slice | Tensor) -> Self:
+        """Take some detections of every image.
+
+        Args:
+            rows: the rows of the detections: their numbers, or a boolean `(L,)`.
+
+        Returns:
+            The detections, in the order of the rows.
+        """
+        return type(self)(
+            self.boxes[..., rows, :], self.scores[..., rows, :], self.mask[..., rows], self.confidence[..., rows]
+        )
+
+    def _mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The results of a function of each tensor."""
+        return type(self)(*map(function, (self.boxes, self.scores, self.mask, self.confidence)))
 
     @classmethod
     def empty(cls, batch: int, classes: int, *, like: Tensor | None = None) -> Self:
@@ -129,20 +163,26 @@ class Detections:
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
         longest = max(each.mask.shape[-1] for each in images)
-        columns = zip(*((each.boxes, each.scores, each.mask[..., None]) for each in images), strict=True)
-        boxes, scores, mask = (
-            torch.cat([pad(each, (0, 0, 0, longest - each.shape[-2])) for each in column]) for column in columns
-        )
-        return cls(boxes, scores, mask[..., 0])
+        padded = [each._padded(longest) for each in images]
+        columns = zip(*((each.boxes, each.scores, each.mask, each.confidence) for each in padded), strict=True)
+        return cls(*map(torch.cat, columns))
+
+    def _padded(self, length: int) -> Self:
+        """The same detections with padding up to a length."""
+        more = length - self.mask.shape[-1]
+        rows = pad(self.boxes, (0, 0, 0, more)), pad(self.scores, (0, 0, 0, more))
+        return type(self)(*rows, pad(self.mask, (0, more)), pad(self.confidence, (0, more)))
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Boxes, score vectors, classes from 1, and scores of the single image."""
-        lead, real = self.mask.shape[:-1], self.mask.reshape(-1)
+        """Boxes, score vectors, classes from 1, and confidences of the single image, the most confident first."""
+        lead = self.mask.shape[:-1]
         one = "the detections of one image, such as detections[0]"
         check(lead.numel() == 1, "detections", one, f"a batch of shape {tuple(lead)}")
-        boxes, vectors = self.boxes.reshape(-1, 4)[real], self.scores.reshape(-1, self.scores.shape[-1])[real]
-        best = vectors[:, 1:].max(-1) if vectors.shape[-1] > 1 else vectors.max(-1)
-        return boxes, vectors, best.indices + 1, best.values
+        image = self._mapped(lambda each: each.reshape(*each.shape[len(lead) :]))
+        image = image.take(image.mask)
+        image = image.take(image.confidence.argsort(descending=True, stable=True))
+        labels = image.labels if image.scores.shape[-1] > 1 else image.mask.long()
+        return image.boxes, image.scores, labels, image.confidence
 
     def to_supervision(self, classes: Sequence[str] | None = None) -> supervision.Detections:
         """Convert the detections of one image to `supervision.Detections`, for its annotators, trackers and metrics.
@@ -187,16 +227,16 @@ class Detections:
         """
         boxes = torch.as_tensor(detections.xyxy).reshape(-1, 4)
         boxes = boxes if boxes.is_floating_point() else boxes.float()
+        scores = None if detections.confidence is None else torch.as_tensor(detections.confidence)
         full = detections.data.get(_SCORES)
         if full is not None:
             vectors = torch.as_tensor(full)
             shape = (len(boxes), classes + 1)
             check(tuple(vectors.shape) == shape, "data['scores']", f"shape {shape}", tuple(vectors.shape))
-            return cls._one_image(boxes, vectors)
-        numbers, confidence = detections.class_id, detections.confidence
+            return cls._one_image(boxes, vectors, scores)
+        numbers = detections.class_id
         check(numbers is not None or not len(boxes), "detections", "a class_id for every box", "none")
         labels = torch.as_tensor([] if numbers is None else numbers).long() + 1
-        scores = None if confidence is None else torch.as_tensor(confidence)
         return cls._one_image(boxes, _vectors_of(labels, scores, classes))
 
     def to_torchvision(self) -> dict[str, Tensor]:
@@ -259,9 +299,10 @@ class Detections:
         return coco_results(image_id, boxes, labels, scores, dict(enumerate(ids, 1)))
 
     @classmethod
-    def _one_image(cls, boxes: Tensor, vectors: Tensor) -> Self:
-        """A batch of one, in descending order of confidence."""
+    def _one_image(cls, boxes: Tensor, vectors: Tensor, confidence: Tensor | None = None) -> Self:
+        """A batch of one, in descending order of the largest score of a class; confidence `(L,)`, or None."""
         check_shape(boxes, "boxes", len(vectors), 4)
+        every = torch.ones(1, len(boxes), dtype=torch.bool, device=boxes.device)
+        own = {} if confidence is None else {"confidence": confidence[None]}
         order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
-        mask = torch.ones(1, len(boxes), dtype=torch.bool, device=boxes.device)
-        return cls(boxes[order][None], vectors[order][None], mask)
+        return cls(boxes[None], vectors[None], every, **own).take(order)

@@ -41,6 +41,9 @@ _WRAPPERS: dict[str, Callable[..., Detector]] = {
 }
 """Classes of detectors that hold a module (in memory, not a copy), by the package of its class or of its bases."""
 
+_INNER = "module", "_orig_mod", "model"
+"""Where a model is in what wraps it: for several GPUs, compiled, or for training."""
+
 DetectorLike = str | PathLike[str] | nn.Module
 """What `load_detector` takes: the name or file of a detector, a `Detector`, or a model of another library."""
 
@@ -96,10 +99,13 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
     for package, wrapper in _WRAPPERS.items():
         if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
             return _load(wrapper, model, f"a {type(model).__name__}", options)
-    raise InputError(
-        f"detector: expected a model of torchvision, transformers or Ultralytics, got {type(model).__module__}."
-        f"{type(model).__qualname__}; write a class with the method propose (semfov.Detector), or export it to ONNX"
-    )
+    inner = next((name for name in _INNER if isinstance(getattr(model, name, None), nn.Module)), None)
+    way = "write a class with the method propose (semfov.Detector), or export it to ONNX"
+    if inner is not None:
+        way = f"give the {type(getattr(model, inner)).__name__} in it, which is its .{inner}; or {way}"
+    kind = f"{type(model).__module__}.{type(model).__qualname__}"
+    expected = "a model of torchvision, transformers or Ultralytics"
+    raise InputError(f"detector: expected {expected}, got {kind}; {way}")
 
 
 def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:

@@ -29,6 +29,7 @@ from semfov.io.schema import excerpt
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
+_ROUNDING = 0.02  # how far beyond 0 and 1 the scores of networks of 8 and 16 bits may lie
 _MOST_BOXES = 2**20  # largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px
 
 
@@ -69,7 +70,7 @@ class OnnxDetector(Detector):
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
-        self._placed = False
+        self._placed = self._rounded = False
         self._layers: dict[str, str] | None = None
         self._named_layers: tuple[str, ...] = ()
         self._wide = session
@@ -136,13 +137,29 @@ class OnnxDetector(Detector):
         if values_known(candidates.boxes):
             named = f"with head {self.head!r}; check that head= names the model's head"
             check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
-            for scores in (candidates.classes, candidates.objectness):
-                low, high = (0.0, 0.0) if scores is None else _range(scores)
-                way = "set logits=True if the model returns them before the sigmoid"
-                got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
-                check_data(low >= 0 and high <= 1, self.name, "scores in [0, 1]", got)
+            candidates = replace(
+                candidates,
+                classes=self._probabilities(candidates.classes),
+                objectness=None if candidates.objectness is None else self._probabilities(candidates.objectness),
+            )
         self._placed |= first
         return keep_classes(candidates, self._places, self._scores)
+
+    def _probabilities(self, scores: Tensor) -> Tensor:
+        """Scores in [0, 1]: those that rounding has put a little outside are clamped, with one warning."""
+        low, high = _range(scores)
+        way = "set logits=True if the model returns them before the sigmoid"
+        got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
+        check_data(low >= -_ROUNDING and high <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
+        if low >= 0 and high <= 1:
+            return scores
+        if not self._rounded:
+            warnings.warn(
+                f"{self.name}: scores from {low:.7g} to {high:.7g}, which rounding explains, are taken as 0 to 1",
+                stacklevel=2,
+            )
+        self._rounded = True
+        return scores.clamp(0, 1)
 
     def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: tuple[int, int]) -> None:
         """Raise `DataError` where the numbers of the first pass show another head or scores after their sigmoid."""
@@ -154,9 +171,9 @@ class OnnxDetector(Detector):
             low, high = _range(each)
             got = f"[{low:.3g}, {high:.3g}]; {way}"
             check_data(not 0 <= low < high <= 1, self.name, f"scores before the {before}", got)
-        wrong, heads = misplaced(candidates.boxes, size), ", ".join(sorted(HEADS))
+        wrong = misplaced(candidates.boxes, size)
         expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
-        check_data(wrong is None, self.name, expected, f"{wrong}; name the model's head with head=, one of {heads}")
+        check_data(wrong is None, self.name, expected, wrong)
 
     def settings(self) -> dict[str, object]:
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
@@ -234,10 +251,10 @@ def load_onnx(
             f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
         ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
-    if chosen["head"] == "end2end":
+    if chosen["head"].startswith("end2end"):
         warnings.warn(
             f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
-            "end2end=False (and without NMS) it has all scores, from which beliefs learn more",
+            "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
             stacklevel=2,
         )
     names = _coco_names(scores, file) if names is None else names

@@ -5,7 +5,7 @@ Boxes are `(x1, y1, x2, y2)` in canvas pixels, edges between pixels (0 is the le
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from semfov.errors import InputError, check, check_shape, values_known
 from semfov.sensor.lines import constant
 
 _Outputs = Mapping[str, Tensor]
+_Named = TypeVar("_Named")
 _Canvas = tuple[int, int]
 
 
@@ -47,7 +48,8 @@ def decode_yolov8(columns: Tensor) -> Candidates:
 def _decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     """Decode rows `x1 y1 x2 y2 score class`, `(B, N, 6)`, that a network has selected itself: other scores are 0."""
     if classes is None:
-        raise InputError("classes: expected the names of the model's classes, which its rows only number, got None")
+        expected = "the names of the model's classes, which its rows only number"
+        raise InputError(f"classes: expected {expected}, got None; give them by classes=cat,dog")
     check_shape(rows, "rows", None, None, 6)
     scores, numbers = rows[..., 4], rows[..., 5]
     if values_known(rows):
@@ -60,6 +62,27 @@ def _decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
     vectors = scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
     return Candidates(rows[..., :4], vectors)
+
+
+def _selected_outputs(outputs: Mapping[str, _Named]) -> dict[str, _Named]:
+    """The outputs of a network that selects boxes itself by what they are: boxes, scores, labels and count."""
+    found = {what: next((name for name in names if name in outputs), None) for what, names in _SELECTED.items()}
+    return {what: outputs[name] for what, name in found.items() if name is not None}
+
+
+def _decode_selected(outputs: _Outputs, canvas: _Canvas, classes: int | None) -> Candidates:
+    """Decode boxes `(B, N, 4)`, scores and labels `(B, N)` that a network has selected itself, as rows of `end2end`.
+
+    Scores may be the fifth column of the boxes. Where a network counts its boxes, those after that number are padding.
+    """
+    found = _selected_outputs(outputs)
+    boxes, labels = found["boxes"], found["labels"]
+    check_shape(labels, "labels", None, None)
+    scores = found["scores"] if "scores" in found else boxes[..., 4]
+    if "count" in found:
+        place = torch.arange(scores.shape[1], device=scores.device)
+        scores = scores * (place < found["count"].reshape(-1, 1))
+    return _decode_end_to_end(torch.cat([boxes[..., :4], scores[..., None], labels[..., None]], -1), classes)
 
 
 def _decode_distances(
@@ -122,7 +145,28 @@ def _fractions(boxes: Tensor, canvas: tuple[int, int]) -> Tensor:
 
 
 def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
-    """What boxes `(B, N, 4)` of one pass look like if another head has made them, in words; None for boxes in place."""
+    """What boxes `(B, N, 4)` of one pass look like if another head has made them, and what to do; None if in place."""
+    wrong = _wrong_places(boxes, canvas)
+    # Boxes of a network that selects them are in no order, and a square canvas has room for both readings.
+    exchanged = _exchanged(boxes, canvas) if wrong is None else _wrong_places(boxes[..., _EXCHANGED], canvas) is None
+    if exchanged:
+        return "boxes whose y comes before x; export the model with boxes as x1 y1 x2 y2"
+    return wrong and f"{wrong}; name the model's head with head=, one of {', '.join(sorted(HEADS))}"
+
+
+def _exchanged(boxes: Tensor, canvas: tuple[int, int]) -> bool:
+    """Whether the middles of boxes in the order of cells go down where the cells of the finest level go right."""
+    if boxes.shape[1] not in _box_counts(canvas):
+        return False
+    columns, rows = cells(canvas, STRIDES[0])
+    cell = torch.arange(columns * rows)
+    places = torch.stack([(boxes[0, cell, side] + boxes[0, cell, side + 2]).detach().cpu() for side in (0, 1)])
+    both = torch.corrcoef(torch.cat([places.double(), torch.stack([cell % columns, cell // columns])]))
+    return bool((both[0, 3] > _ALONG) & (both[1, 2] > _ALONG))
+
+
+def _wrong_places(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
+    """Why boxes `(B, N, 4)` of one pass cannot be in their places, in words; None for boxes that can."""
     rows = boxes.detach().reshape(-1, 4).double()
     rows = rows[(rows != 0).any(-1)][:_ENOUGH]  # empty rows of a network that selects boxes itself
     if not len(rows):
@@ -146,6 +190,8 @@ def misplaced(boxes: Tensor, canvas: tuple[int, int]) -> str | None:
 
 
 _FRACTIONS = 2.0  # coordinates up to here, of all boxes of a canvas, are no pixels
+_EXCHANGED = [1, 0, 3, 2]  # coordinates of boxes with y before x
+_ALONG = 0.8  # correlation of places with cells from which on boxes follow them
 _ENOUGH = 100_000  # number of boxes whose places are looked at
 _MANY = 20  # number of boxes from which on all of them do not begin in the upper left corner
 _MOST_MISPLACED = 0.5  # share of the boxes of a pass that may lie elsewhere
@@ -161,7 +207,15 @@ STRIDES = (8, 16, 32, 64)
 _OTHER_TASKS = ("segment", "pose", "obb", "classify")
 """Tasks in Ultralytics' metadata whose outputs are other ones than those of detection."""
 _SCORES = "all class scores of each box"
-_DETR_LOGITS = ("logits", "pred_logits")
+_DETR_LOGITS = ("logits", "pred_logits", "labels")
+_DETR_BOXES = ("pred_boxes", "dets")
+_SELECTED = {
+    "boxes": ("boxes", "dets", "det_boxes", "bboxes", "nmsed_boxes"),
+    "scores": ("scores", "det_scores", "nmsed_scores"),
+    "labels": ("labels", "det_classes", "nmsed_classes", "classes"),
+    "count": ("num_dets", "num_detections"),
+}
+"""Names of the outputs of networks that select boxes themselves: RT-DETR's, mmdeploy's and those of TensorRT."""
 
 
 class _DetectionHead(NamedTuple):
@@ -217,6 +271,7 @@ def _fits(name: str, outputs: _Outputs, signature: Signature) -> bool:
 def _fitting(signature: Signature) -> Iterator[str]:
     shapes = dict(signature.outputs)
     names = list(shapes)
+    selected = _selected_outputs(shapes)
     if "pred_boxes" in shapes and any(name in shapes for name in _DETR_LOGITS):
         # A softmax has one channel more than classes. Unknown classes are COCO's, 91 ids or 80 classes.
         channels, classes = shapes[_logits(shapes)][-1], signature.classes
@@ -224,8 +279,10 @@ def _fitting(signature: Signature) -> Iterator[str]:
             yield "rtdetr"
         elif channels == (92 if classes is None else classes + 1):
             yield "detr"
-    elif {"labels", "boxes", "scores"} <= set(shapes):
-        check(False, f"outputs {', '.join(names)}", _SCORES, "one class; export the model without its top-k")
+    elif {"dets", "labels"} <= shapes.keys() and len(shapes["labels"]) == 3:
+        yield "rfdetr"
+    elif "boxes" in selected and len(selected.get("labels", ())) == 2:
+        yield "end2end-detr" if {*shapes} == {"labels", "boxes", "scores"} else "end2end-nms"
     elif "boxes" in shapes and shapes.keys() & {"classes", "scores"}:
         yield "candidates"
     elif len(shapes) > 1:
@@ -344,10 +401,11 @@ def _level_maps(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candid
 
 def _rtdetr(outputs: _Outputs, canvas: _Canvas, count: int | None) -> Candidates:
     """Decode DETRs trained with focal loss (RT-DETR): a sigmoid a class, without "no object"; logits `(B, Q, K)`."""
-    if "pred_boxes" in outputs:
+    boxes = next((outputs[name] for name in _DETR_BOXES if name in outputs), None)
+    if boxes is not None:
         logits = outputs[_logits(outputs)]
         check_shape(logits, "logits", None, None, None)
-        return Candidates(_fractions(outputs["pred_boxes"], canvas), logits.sigmoid())
+        return Candidates(_fractions(boxes, canvas), logits.sigmoid())
     rows = _first(outputs)  # `(B, Q, 4 + K)`, with the scores after their sigmoid
     check_shape(rows, "rows", None, None, None)
     return Candidates(_fractions(rows[..., :4], canvas), rows[..., 4:])
@@ -360,6 +418,8 @@ HEADS: dict[str, _DetectionHead] = {
     "yolov5": _DetectionHead(lambda outputs, canvas, _: _decode_yolov5(_rows(outputs, canvas))),
     "yolov8": _DetectionHead(lambda outputs, canvas, _: decode_yolov8(_rows(outputs, canvas, across=True).mT)),
     "end2end": _DetectionHead(lambda outputs, _, count: _decode_end_to_end(_first(outputs), count)),
+    "end2end-detr": _DetectionHead(_decode_selected, Preprocessing(stretch=True)),
+    "end2end-nms": _DetectionHead(_decode_selected),
     "picodet": _DetectionHead(_level_maps, _IMAGENET),
     "nanodet": _DetectionHead(_level_maps, _NANODET),
     # Class scores, then distances with 8 bins for each side. Nearly every candidate exceeds the usual threshold of
@@ -380,5 +440,6 @@ HEADS: dict[str, _DetectionHead] = {
         "own",
     ),
     "rtdetr": _DetectionHead(_rtdetr, Preprocessing(stretch=True)),
+    "rfdetr": _DetectionHead(_rtdetr, _IMAGENET),
 }
 """All known heads by name."""

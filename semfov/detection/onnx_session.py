@@ -18,6 +18,7 @@ from semfov.detection.onnx_budget import check_elements, dims, without_weights
 from semfov.detection.onnx_check import check_file
 from semfov.errors import DataError, check
 
+_WHOLE = "tensor(int64)", "tensor(int32)"  # of outputs that number classes and boxes
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
 # Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
@@ -103,7 +104,7 @@ class OnnxSession:
             self.producer: str = meta.producer_name
             for output in self._session.get_outputs():
                 name = f"{self.path.name}: output {output.name!r}"
-                check(output.type in _FLOATS, name, "floating-point numbers", output.type)
+                check(output.type in (*_FLOATS, *_WHOLE), name, "numbers", output.type)
             self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
             self.image, self.shape, self._dtype, self._extra = self._inputs()
         except UnicodeDecodeError as error:

@@ -79,10 +79,11 @@ def _select_one(
     rows = candidates.take(image, index[chosen])
     check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     scores = score_vectors(rows, policy)
-    # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
+    # Suppression ranks by confidence; the shares of a vector can rank otherwise.
     order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
     boxes, scores = boxes.index_select(0, chosen[order]), scores.index_select(0, order)
-    return Detections(boxes[None], scores[None], torch.ones_like(order, dtype=torch.bool)[None])
+    every = torch.ones_like(order, dtype=torch.bool)
+    return Detections(boxes[None], scores[None], every[None], rows.confidence.index_select(0, order)[None])
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:

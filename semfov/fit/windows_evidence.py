@@ -53,7 +53,7 @@ class ZoomExample(NamedTuple):
         annotation, looks = pictures.annotation(index), []
         for glance in glances.see(cls.windows(pictures, index, glances.lattice)):
             detections = glance.detections
-            sure = detections.confidence[0] >= DETECTION_SCORE
+            sure = detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
             boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
             hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
             looks.append(_WindowResult(glance.window, glance.gist, glance.show, hits.any(0)))

@@ -43,6 +43,7 @@ _DETECTIONS = {
     "mask": Field(("M",), dtype=torch.bool),
 }
 _OPTIONAL = {
+    "confidence": Field(("M",), mixed=True, optional=True),  # files of earlier versions have none
     "box": Field((4,), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "closer_boxes": Field(("Q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
@@ -98,7 +99,8 @@ class Format:
         looks: tuple[Detections, ...] = fields["detections"]
         decision: Decision | None = fields["decision"]
         # The detections of all looks in a row, without padding; `lengths` separates them again.
-        whole = {name: torch.cat([getattr(look, name)[0] for look in looks]) for name in _DETECTIONS} | dict(tensors)
+        names = *_DETECTIONS, "confidence"
+        whole = {name: torch.cat([getattr(look, name)[0] for look in looks]) for name in names} | dict(tensors)
         values: dict[str, Any] = {
             "kind": self.kind,
             "version": __version__,
@@ -132,7 +134,8 @@ class Format:
         check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
         sides = (1,) if photograph is None else photograph.shape[1:]
         check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
-        looks = zip(*(tensors[name].split(lengths) for name in _DETECTIONS), strict=True)
+        names = [name for name in (*_DETECTIONS, "confidence") if name in tensors]
+        looks = zip(*(tensors[name].split(lengths) for name in names), strict=True)
         decision, closer = record.get("decision"), record["closer"]
         boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
         check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))

@@ -185,8 +185,7 @@ class HeadPath(Record):
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
         detections = self.detections[look]
-        best, label = detections.scores[0, :, 1:].max(-1)
-        label = label + 1
+        best, label = detections.confidence[0], detections.labels[0]
         chosen = detections.mask[0] & (best >= score)
         if self.target is not None:
             chosen &= label == self.target

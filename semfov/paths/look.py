@@ -84,10 +84,10 @@ def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]
 
 
 def confident_detections(detections: Detections, most: int | None = None) -> Detections:
-    """The most confident detections of a look, a batch of one, without padding."""
-    chosen = slice(int((detections.confidence[0] >= CONFIDENT).sum()))
-    boxes, scores, mask = (each[:, chosen][:, :most] for each in (detections.boxes, detections.scores, detections.mask))
-    return Detections(boxes, scores, mask).to("cpu")
+    """The most confident detections of a look, a batch of one in descending order of confidence, without padding."""
+    order = detections.confidence[0].argsort(descending=True, stable=True)
+    count = int((detections.confidence[0] >= CONFIDENT).sum())
+    return detections.take(order[:count][:most]).to("cpu")
 
 
 def detections_in_words(
@@ -98,11 +98,11 @@ def detections_in_words(
     labels, scores = told.labels[0].tolist(), told.confidence[0].tolist()
     names = [f"{classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
     if target is not None and bool(detections.mask.any()):
-        chances = detections.scores[0, :, target].masked_fill(~detections.mask[0], 0)
-        best = int(chances.argmax())
-        if best < len(names) and labels[best] == target:
-            del names[best]
-        place = box_text(detections.boxes[0, best].tolist())
-        names.insert(0, f"{classes[target]} {chances[best]:.2f} in {place}")
+        best = int(detections.class_scores[0, :, target - 1].argmax())
+        score, place = detections.class_scores[0, best, target - 1], box_text(detections.boxes[0, best].tolist())
+        own = f"{classes[target]} {score:.2f}"
+        if own in names:
+            names.remove(own)
+        names.insert(0, f"{own} in {place}")
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more or "nothing"

@@ -187,7 +187,7 @@ class ZoomPath(Record):
         if self.decision is not None:
             return counts
         whole = [glance for glance in self.glances if self.is_whole(glance.window.region(self.lattice))]
-        return counts | shown(candidates, whole, self._sought, self.least)
+        return counts | shown(candidates, whole, self._sought, self.least, shares=self.unseen is not None)
 
     def objects_in_words(self) -> str:
         """Count the objects, by class where classes were searched for, and say how many this detector can show.

@@ -104,15 +104,15 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     columns = zip(
         view.boxes.tolist(),
         detections.boxes[0].tolist(),
-        detections.scores[0],
+        detections.class_scores[0],
         detections.labels[0].tolist(),
         detections.confidence[0].tolist(),
         strict=True,
     )
-    for box, place, vector, label, score in columns:
+    for box, place, own, label, score in columns:
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label and float(vector[path.target]) >= CONFIDENT:
-            label, score = path.target, float(vector[path.target])
+        if path.target is not None and label and float(own[path.target - 1]) >= CONFIDENT:
+            label, score = path.target, float(own[path.target - 1])
         if score >= CONFIDENT:
             first = label == path.target
             rows.append((first, score, {"box": box, "place": place, "label": path.classes[label], "score": score}))

@@ -45,5 +45,4 @@ def photograph_looks(
 
 def tight(look: Detections) -> Detections:
     """Remove the padding from the detections of a single look."""
-    mask = look.mask[0]
-    return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])
+    return look.take(look.mask[0])

@@ -66,6 +66,7 @@ class DetectionStore(SceneStore):
             "count": Field(("N",), torch.int64, low=0),
             "boxes": Field(("M", 4)),
             "scores": Field(("M", "C" if components is None else components), low=0, high=1),
+            "confidence": Field(("M",), low=0, high=1),
         }
         super().__init__(folder, what, modules_digest(*sources, __name__), Schema(fields | {**self.more}))
 
@@ -96,15 +97,21 @@ class DetectionStore(SceneStore):
             "count": torch.cat([look.mask.sum(-1) for look in looks]),
             "boxes": torch.cat([look.boxes[look.mask] for look in looks]),
             "scores": torch.cat([look.scores[look.mask] for look in looks]),
+            "confidence": torch.cat([look.confidence[look.mask] for look in looks]),
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Any]) -> list[Any]:
         """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
         counts = tensors["count"].tolist()
-        looks = zip(tensors["boxes"].split(counts), tensors["scores"].split(counts), strict=True)
+        looks = zip(*(tensors[name].split(counts) for name in ("boxes", "scores", "confidence")), strict=True)
         return [
-            Detections(boxes[None].clone(), scores[None].clone(), torch.ones(1, len(boxes), dtype=torch.bool))
-            for boxes, scores in looks
+            Detections(
+                boxes[None].clone(),
+                scores[None].clone(),
+                torch.ones(1, len(boxes), dtype=torch.bool),
+                confidence[None].clone(),
+            )
+            for boxes, scores, confidence in looks
         ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,6 @@ from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
-from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView, confident_detections
@@ -305,7 +305,7 @@ def _annotation_entries(record: Record, boxes: Tensor | None) -> list[_LegendEnt
 def _draw_view(axes: Axes, record: Record, number: int, view: LookView, most: int) -> list[Artist]:
     """Draw gaze and most confident detections of a look into its view; labels do not cover the point of gaze."""
     look, (x, y), reach = record.looks[number].detections, view.gaze, 8 * per_point(axes)
-    detections = confident_detections(Detections(view.boxes[None], look.scores, look.mask), most)
+    detections = confident_detections(replace(look, boxes=view.boxes[None]), most)
     gaze = (x + 0.5 - reach, y + 0.5 - reach, x + 0.5 + reach, y + 0.5 + reach)
     drawn = draw_look(axes, detections, record.classes, view.size, target=record.target, obstacles=[gaze])
     return [*draw_cross(axes, view.gaze), *drawn]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -154,7 +154,7 @@ class WindowEye(nn.Module):
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
-        detections = Detections(boxes, selected.scores, selected.mask).to(here)
+        detections = replace(selected, boxes=boxes).to(here)
         detections, cut = self._treat(detections, place.cut(selected).to(here))
         if not hints:
             return WindowLooks(detections, cut, None)
@@ -233,17 +233,13 @@ class WindowEye(nn.Module):
         if self.cut == "keep" or not bool(cut.any()):
             return detections, cut
         if self.cut == "drop":
-            masks = [detections.mask[n] & ~cut[n] for n in range(len(cut))]
-            whole = [
-                Detections(detections.boxes[n : n + 1, mask], detections.scores[n : n + 1, mask], mask[mask][None])
-                for n, mask in enumerate(masks)
-            ]
-            left = Detections.stack(whole)
+            whole = detections.mask & ~cut
+            left = Detections.stack([detections[n : n + 1].take(rows) for n, rows in enumerate(whole)])
             return left, torch.zeros_like(left.mask)
         nothing = torch.zeros_like(detections.scores[..., :1, :])
         nothing[..., 0] = 1
         scores = torch.where(cut[..., None], nothing, detections.scores)
-        return Detections(detections.boxes, scores, detections.mask), cut
+        return replace(detections, scores=scores, confidence=detections.confidence * ~cut), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
         """Open a picture, look at it and detect.

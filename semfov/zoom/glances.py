@@ -145,7 +145,7 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
     detections = looks.detections
     if len(detections.mask) > 1:  # a batch of one, without padding
         count, one = int(detections.mask[number].sum()), slice(number, number + 1)
-        detections = Detections(*(each[one, :count] for each in (detections.boxes, detections.scores, detections.mask)))
+        detections = detections[one].take(slice(count))
     look_gist, faint = None, None
     if looks.hints is None:
         scores = detections.scores[0, :, 1:]

@@ -43,7 +43,7 @@ def merge(
     Args:
         glances: looks at one picture.
         target: class 1..K, whose score counts for every box; of several classes, the best one for each box. None, or
-            no class, takes the best class of each box.
+            no class, takes the best class of each box. Scores are the detector's own (`Detections.class_scores`).
         score: boxes with a lower score are left out.
         iou: intersection over union from which on two boxes are the same object.
         inside: share of the area of a cut box from which on it is the same object.
@@ -61,7 +61,7 @@ def merge(
     """
     if not glances:
         return Objects.none()
-    return merge_looks(*_detected(glances, target), score=score, iou=iou, inside=inside)
+    return merge_looks(*_detected(glances, target, shares=False), score=score, iou=iou, inside=inside)
 
 
 def merge_with_facts(
@@ -70,7 +70,7 @@ def merge_with_facts(
     """Merge detections as `merge` does, with mean boxes (`_fused`) in still pictures, and list facts of the objects."""
     if not glances:
         return Objects.none(), torch.zeros(0, len(FACTS))
-    every = _detected(glances, target)
+    every = _detected(glances, target, shares=True)
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = every = tuple(each[enough] for each in every)
@@ -123,11 +123,13 @@ def probable_objects(
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
 
 
-def shown(objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float) -> Tensor:
+def shown(
+    objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float, *, shares: bool
+) -> Tensor:
     """Which objects `(M,)` looks show with a score: for each box the most probable one it fits, or the best fit."""
     counts = torch.zeros(len(objects), dtype=torch.bool)
     if len(objects) and glances:
-        boxes, scores, labels, *_ = _detected(glances, target)
+        boxes, scores, labels, *_ = _detected(glances, target, shares=shares)
         sure = scores >= score
         overlap = box_iou(objects.boxes, boxes[sure].to(objects.boxes)) * (objects.labels[:, None] == labels[sure])
         best, place = torch.where(overlap >= _ALIKE, 1 + objects.scores[:, None], overlap).max(0)
@@ -141,16 +143,18 @@ def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
     return replace(objects, scores=chances)[chances.argsort(descending=True, stable=True)]
 
 
-def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None) -> tuple[Tensor, ...]:
-    """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications."""
+def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None, *, shares: bool) -> tuple[Tensor, ...]:
+    """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications.
+
+    Scores are those of the vectors, on which a certainty is fitted (`shares`), or the detector's own.
+    """
     looks = [glance.detections for glance in glances]
-    columns = zip(*((look.boxes, look.scores, look.mask) for look in looks), strict=True)
+    columns = zip(*((look.boxes, look.scores, look.mask, look.confidence) for look in looks), strict=True)
     detections = Detections(*(torch.cat(column, 1) for column in columns))
-    value, label = detections.confidence[0], detections.labels[0]
-    classes = [target] if isinstance(target, int) else list(target or ())
-    if classes:
-        value, best = detections.scores[0][:, classes].max(-1)
-        label = torch.tensor(classes)[best]
+    scores = detections.scores[0, :, 1:] if shares else detections.class_scores[0]
+    classes = [target] if isinstance(target, int) else list(target or range(1, scores.shape[-1] + 1))
+    value, best = (scores * detections.mask[0, :, None])[:, [label - 1 for label in classes]].max(-1)
+    label = torch.tensor(classes)[best]
     counts = torch.tensor([look.mask.shape[1] for look in looks])
     number = torch.arange(len(looks)).repeat_interleave(counts)
     closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]

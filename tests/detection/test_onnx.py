@@ -393,3 +393,32 @@ def test_a_digest_is_of_all_files_of_a_model(tmp_path):
         digests.append((load_detector(split).settings()["digest"], sha256(split)))
     assert digests[0] == digests[1]
     assert (digests[0][0] == digests[2][0], digests[0][1] == digests[2][1]) == (False, True)
+
+
+def test_scores_that_rounding_puts_beyond_one_are_clamped_with_a_warning(make_onnx):
+    """Those of networks of 8 bits reach 1.004; logits go much farther and are refused."""
+    gain = 1 / (1 + np.exp(-1.0))  # of `make_onnx`, for a white picture
+    outputs = {"output0": pixels(random(1, 252, 8))}
+    outputs["output0"][..., 4:] = outputs["output0"][..., 4:].clip(0, 0.5)
+    outputs["output0"][0, 3, 4:6] = [1.004 / gain, -0.003 / gain]
+    detector = load_onnx(make_onnx(outputs), classes=NAMES)
+    with pytest.warns(UserWarning, match=r"scores from -0\.003\S* to 0\.9.*|scores from \S+ to 1\.004.*rounding"):
+        found = detector.propose(torch.ones(1, 3, SIDE, SIDE))
+    assert float(found.objectness[0, 3]) == 1
+    assert float(found.classes[0, 3, 0]) == 0
+    detector.propose(torch.ones(1, 3, SIDE, SIDE))  # warned of once
+
+
+def test_what_wraps_a_model_is_named(make_small):
+    class Trained(torch.nn.Module):
+        def __init__(self, model):
+            super().__init__()
+            self.model = model
+
+    small = make_small()
+    for wrapper, inner in [
+        (torch.nn.DataParallel(small), "module"),
+        (torch.compile(small, backend="eager"), "_orig_mod"),
+        (Trained(small), "model"),
+    ]:
+        refused(rf"detector: expected .*give the YoloV3 in it, which is its \.{inner};", load_detector, wrapper)

@@ -136,6 +136,24 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
         ("end2end", signature((1, 300, 6), classes=2, end2end="True", task="detect")),
         ("end2end", signature((1, 300, 6), classes=2, end2end="False", args="{'batch': 1, 'nms': True}")),
         ("end2end", signature((1, 300, 6), classes=80)),
+        ("end2end-detr", signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300)))),
+        ("end2end-nms", signature(("dets", (1, 100, 5)), ("labels", (1, 100)))),
+        (
+            "end2end-nms",
+            signature(
+                ("num_dets", (1, 1)), ("det_boxes", (1, 100, 4)), ("det_scores", (1, 100)), ("det_classes", (1, 100))
+            ),
+        ),
+        (
+            "end2end-nms",
+            signature(
+                ("num_detections", (1,)),
+                ("nmsed_boxes", (1, 100, 4)),
+                ("nmsed_scores", (1, 100)),
+                ("nmsed_classes", (1, 100)),
+            ),
+        ),
+        ("rfdetr", signature(("dets", (1, 300, 4)), ("labels", (1, 300, 91)))),
         ("rtdetr", signature(("logits", (1, 300, 80)), ("pred_boxes", (1, 300, 4)))),
         ("detr", signature(("logits", (1, 100, 92)), ("pred_boxes", (1, 100, 4)), ("hidden", (1, 100, 256)))),
         ("detr", signature(("pred_logits", (1, 100, 6)), ("pred_boxes", (1, 100, 4)), classes=5)),
@@ -173,11 +191,7 @@ def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
 
 
 def test_models_without_score_vectors_or_of_other_tasks_are_refused():
-    for outputs in [
-        signature((1, 300, 7)),
-        signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
-    ]:
-        refused("export", outputs.head)
+    refused("export", signature((1, 300, 7)).head)
     for task in ["segment", "pose", "obb", "classify"]:
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
             signature((1, 116, 8400), classes=80, task=task).head()
@@ -208,6 +222,21 @@ def test_end_to_end_rows_are_one_hot_vectors():
     refused("rows: expected a whole number", heads._decode_end_to_end, rows + 0.5, 9)
 
 
+def test_selected_outputs_are_one_hot_vectors():
+    """Those of RT-DETR, of mmdeploy with the scores beside the boxes, and of a network that counts its boxes."""
+    boxes = torch.tensor([[[4.0, 8.0, 40.0, 30.0], [1.0, 1.0, 9.0, 9.0], [5.0, 5.0, 7.0, 7.0]]])
+    scores, labels = torch.tensor([[0.9, 0.2, 0.4]]), torch.tensor([[2.0, 0.0, 1.0]])
+    every = torch.tensor([[[0, 0, 0.9], [0.2, 0, 0], [0, 0.4, 0]]])
+    detr = HEADS["end2end-detr"].decode({"labels": labels, "boxes": boxes, "scores": scores}, (64, 64), 3)
+    assert torch.equal(detr.boxes, boxes)
+    assert torch.equal(detr.classes, every)
+    dets = {"dets": torch.cat([boxes, scores[..., None]], -1), "labels": labels}
+    assert torch.equal(HEADS["end2end-nms"].decode(dets, (64, 64), 3).classes, every)
+    counted = {"num_dets": torch.tensor([[2.0]]), "det_boxes": boxes, "det_scores": scores, "det_classes": labels}
+    found = HEADS["end2end-nms"].decode(counted, (64, 64), 3)
+    assert torch.equal(found.classes, torch.cat([every[:, :2], torch.zeros(1, 1, 3)], 1))
+
+
 @pytest.mark.parametrize(
     ("box", "message"),
     [
@@ -231,3 +260,16 @@ def test_corners_that_were_read_as_centres_and_sizes_are_told():
     assert "corners" in heads.misplaced(heads.decode_yolov8(rows.mT).boxes, (64, 64))
     assert "comes first" in heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
     assert heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
+
+
+def test_boxes_with_y_before_x_are_told():
+    """By the order of cells, and on a canvas that is not square by their places."""
+    for canvas in [(64, 64), (96, 64)]:
+        cells = torch.tensor(cell_list(canvas, (8, 16, 32)), dtype=torch.float32)
+        middle = (cells[:, :2] + 0.5) * cells[:, 2:] + noise(len(cells), 2, dtype=torch.float32)
+        boxes = torch.cat([middle - 9, middle + 9], -1)[None]
+        assert heads.misplaced(boxes, canvas) is None
+        assert "y comes before x; export" in heads.misplaced(boxes[..., [1, 0, 3, 2]], canvas)
+    wide = torch.tensor([[[200.0, 8.0, 220.0, 30.0], [150.0, 1.0, 170.0, 9.0]]])
+    assert heads.misplaced(wide, (240, 32)) is None
+    assert "y comes before x" in heads.misplaced(wide[..., [1, 0, 3, 2]], (240, 32))
