@@ -26,6 +26,8 @@ OTHER_WORDS: dict[str, tuple[str, ...]] = {
     "batch_size": ("batch",),
     "classes": ("target",),
     "names": ("classes",),
+    **dict.fromkeys(("agnostic", "agnostic_nms", "nms_per_class", "class_agnostic"), ("per_class",)),
+    **dict.fromkeys(("bgr", "channels", "color", "colours", "colors"), ("colour",)),
 }
 
 OF_OTHER_METHODS = {

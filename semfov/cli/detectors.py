@@ -1,12 +1,17 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
 from os import fspath
+from pathlib import Path
 
+from semfov.agent import ActivePerception
 from semfov.belief import MapEvidence, TargetEvidence, Verification
+from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
+from semfov.cli.trial import try_detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, cache_folder, weights_path
+from semfov.errors import check
 from semfov.gaze.saliency import FixationDensity
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
@@ -24,18 +29,37 @@ _PURPOSES: dict[str, type[Pretrained]] = {
 _WIDTH = 100  # characters of a line of names
 
 
-def show(options: DetectorsOptions) -> int:
-    """List the detectors, or the classes of one."""
-    if options.name is not None:
-        name = fspath(options.name)
-        classes = Manifest.read(options.name).classes if options.name.is_dir() else check_detector(name)
-        classes = load_detector(name).classes if classes is None else classes
-        print(f"{name} knows {len(classes)} classes:")
-        wide = max(map(len, classes)) + 2
-        down = -(-len(classes) // max(1, _WIDTH // wide))
-        for row in range(down):  # in order down each column
-            print("".join(each.ljust(wide) for each in classes[row::down]).rstrip())
+def _show_one(options: DetectorsOptions, path: Path) -> int:
+    """List the classes of a detector, or try it out in a photograph."""
+    name, loaded = fspath(path), detector_options(options)
+    if path.is_dir():
+        classes = Manifest.read(path).classes
+    else:
+        check_onnx_options(options, name)
+        known = check_detector(name)
+        classes = load_detector(name, **loaded).classes if known is None or loaded else known
+    written = remember(options, name)
+    if written is not None:
+        print(f"wrote {written}")
+    if options.try_ is not None:
+        fitted = path.is_dir() or (GlimpseEvidence.shipped / f"{name}.safetensors").is_file()
+        agent = ActivePerception.from_pretrained(name, **loaded) if fitted else ActivePerception.raw(name, **loaded)
+        try_detector(agent, options.try_)
         return 0
+    print(f"{name} knows {len(classes)} classes:")
+    wide = max(map(len, classes)) + 2
+    down = -(-len(classes) // max(1, _WIDTH // wide))
+    for row in range(down):  # in order down each column
+        print("".join(each.ljust(wide) for each in classes[row::down]).rstrip())
+    return 0
+
+
+def show(options: DetectorsOptions) -> int:
+    """List the detectors, or the classes of one, or try one out."""
+    if options.name is not None:
+        return _show_one(options, options.name)
+    for name in ("try_", "remember"):
+        check(not getattr(options, name), name.strip("_"), "the name or the file of a detector before it", "none")
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
         elsewhere = "downloaded when needed" if weights.sources else "given by --weights"

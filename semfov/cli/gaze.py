@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from semfov.agents.picture import OpenedPicture
-from semfov.cli.agent import detector_options
+from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import GazeOptions
 from semfov.cli.results import held_outputs, tell_written, unfinished
 from semfov.cli.sources import PictureSource, picture_sources
@@ -51,9 +51,11 @@ class _GazeJob:
         if options.report is not None:
             check_writable(page_path(options.report))
         check_detector(options.detector)
+        check_onnx_options(options, options.detector)
         loaded = detector_options(options)
         own = None if options.model is None else FixationDensity.from_pretrained(options.model)
         self.detector = load_detector(options.detector, **loaded)
+        remember(options, options.detector)
         self.model = FixationDensity.for_detector(self.detector) if own is None else own
         if not self.sources:
             print("no picture was given: looking at an embedded scene")

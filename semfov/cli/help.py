@@ -30,8 +30,8 @@ Without a picture, search, find, explore and gaze take an embedded scene, so `se
 
 _AGENT = """\
   --detector NAME      yolox-nano (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
-  --models FOLDER      models of your own detector, from semfov fit; --classes cat,dog: names that its file lacks
-  --agent KIND         recommended (default), published (of the paper), or raw (any detector, without fitted models)"""
+  --classes cat,dog    what an ONNX file lacks: names, --head, --colour; --remember them (semfov detectors --help)
+  --models FOLDER      from semfov fit; --agent recommended (default), published (of the paper), or raw (any file)"""
 
 _LOOKS = """\
   --how KIND           auto (default: windows of any picture), fovea, windows, or head (in a panorama)
@@ -225,11 +225,17 @@ semfov detectors: detectors that can be named, or the classes of one
 
   semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
   semfov detectors yolox-nano      the classes that it knows
-  semfov detectors mine.onnx
+  semfov detectors mine.onnx --try kitchen.jpg
+  semfov detectors mine.onnx --head yolov8 --classes cat,dog --colour bgr --remember
 
-usage: semfov detectors [NAME]
+usage: semfov detectors [NAME] [options]
 
   NAME                 name or file of a detector, as for semfov.load_detector, or a folder of models
+  --try PHOTO          what the bare detector shows beside what semfov lists, and what its file may have lost
+  --head, --colour     what an ONNX file takes and returns; --logits, --input-size N, --per-class (suppression of boxes)
+  --classes cat,dog    names of its classes, or a file with a name a line
+  --remember           write these beside the file, mine.json for mine.onnx, where every command reads them
+  --weights FILE       weights of a .cfg; --device cuda
 
 Weights of the default, yolox-nano, are in the package. Those of others are downloaded when they are first used, into
 $SEMFOV_CACHE or the user's cache folder. A detector without shipped models runs with --agent raw, or after semfov fit.

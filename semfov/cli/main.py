@@ -77,8 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "--help-all" in rest or "--help_all" in rest:
         make_parser(options, HELP[name].partition("\nusage:")[0], positional, program).print_help()
         return 0
-    dotted = ["detector.classes"] if name == "fit" else []
-    words = partial(_in_command_words, options=[*dotted, *(field.name for field in fields(options))])
+    words = partial(_in_command_words, options=_told_options(name))
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
@@ -147,7 +146,18 @@ def _unknown(name: str) -> str:
 
 def _option_names(name: str) -> list[str]:
     """Names of the options of a subcommand, without the positional one."""
-    return [field.name for field in fields(_options_of(name)) if field.name != _SUBCOMMANDS[name][0][0]]
+    options = _options_of(name)
+    names = [field.name for field in fields(options) if field.name not in (_SUBCOMMANDS[name][0][0], *options.unused)]
+    return [each.rstrip("_") for each in names]  # `try_` is --try
+
+
+def _told_options(name: str) -> list[str]:
+    """Names of the options that messages may name; those of `semfov fit` for a detector are dotted."""
+    own = [field.name for field in fields(_options_of(name))]
+    if name != "fit":
+        return own
+    detector = resolve_name("semfov.runs.config:DetectorConfig")
+    return [*(f"detector.{field.name}" for field in fields(detector) if field.name not in own), *own]
 
 
 def _of_others(own: str, rest: Sequence[str]) -> str | None:

@@ -23,7 +23,38 @@ _MostCloserLooks = Annotated[int, Range(0, 100)]  # largest number of closer loo
 
 
 @dataclass(frozen=True)
-class AgentOptions(Settings):
+class DetectorOptions(Settings):
+    """The detector.
+
+    Args:
+        detector: name or file, as for `semfov.load_detector`.
+        weights: file of the weights, for a detector that is a `.cfg` file or whose weights are not downloaded.
+        classes: names of the detector's classes in the order of its scores, for a detector whose file does not hold
+            them, or a text file with a name a line.
+        head: output format of an ONNX file that is not recognised (docs/detectors.md).
+        colour: order of the channels that an ONNX file takes, `rgb` or `bgr` (none: that of its head).
+        input_size: longer side in pixels of the input of an ONNX file that takes any size.
+        logits: whether an ONNX file returns scores before their sigmoid.
+        per_class: let boxes suppress boxes of their own class alone, for classes of which one holds another.
+        remember: write `classes`, `head`, `colour`, `input_size`, `logits` and `per_class` into a file beside the ONNX
+            file, `mine.json` for `mine.onnx`, from which they are read from then on.
+        device: where the detector runs, such as `cuda` or `cuda:1` (none: the processor).
+    """
+
+    detector: str = "yolox-nano"
+    weights: Path | None = None
+    classes: tuple[str, ...] | None = None
+    head: str | None = None
+    colour: Literal["rgb", "bgr"] | None = None
+    input_size: Annotated[int, Range(1, 65_536)] | None = None
+    logits: bool = False
+    per_class: bool = False
+    remember: bool = False
+    device: str | None = None
+
+
+@dataclass(frozen=True)
+class AgentOptions(DetectorOptions):
     """The agent.
 
     Args:
@@ -31,11 +62,7 @@ class AgentOptions(Settings):
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
-        weights: file of the weights, for a detector that is a `.cfg` file or whose weights are not downloaded.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
-        classes: names of the detector's classes in the order of its scores, for a detector whose file does not hold
-            them, or a text file with a name a line.
-        device: where the detector runs, such as `cuda` or `cuda:1` (none: the processor).
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
@@ -44,11 +71,7 @@ class AgentOptions(Settings):
     """
 
     agent: Literal["recommended", "published", "raw"] = "recommended"
-    detector: str = "yolox-nano"
-    weights: Path | None = None
     models: Path | None = None
-    classes: tuple[str, ...] | None = None
-    device: str | None = None
     half: bool = False
     sensor: SensorName | None = None
     start: str | None = None
@@ -204,17 +227,14 @@ class LiveOptions(AgentOptions):
 
 
 @dataclass(frozen=True)
-class GazeOptions(Settings):
+class GazeOptions(DetectorOptions):
     """Predict where people look.
 
     Args:
         pictures: photographs, folders of them, or patterns of names (none: an embedded scene).
         recursive: also take the photographs of the folders in a folder.
         detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
-        weights: file of the weights, for a detector whose weights are not downloaded.
-        classes: names of the detector's classes, as for `semfov search`.
         model: file of a model for your own detector, from `semfov fit` (none: the one that is shipped).
-        device: where the detector runs, such as `cuda` (none: the processor).
         people: number of viewers whose scanpaths are drawn.
         seconds: time in seconds for which each views a picture.
         white: values that are black and white, as for `semfov search`.
@@ -228,11 +248,7 @@ class GazeOptions(Settings):
 
     pictures: tuple[str, ...] = ()
     recursive: bool = False
-    detector: str = AgentOptions.detector
-    weights: Path | None = None
-    classes: tuple[str, ...] | None = None
     model: Path | None = None
-    device: str | None = None
     people: Annotated[int, Range(1, 1000)] = 15
     seconds: Annotated[float, Range(0.1, 60)] = 3.0
     white: str | None = None
@@ -283,14 +299,18 @@ class CheckOptions(Settings):
 
 
 @dataclass(frozen=True)
-class DetectorsOptions(Settings):
+class DetectorsOptions(DetectorOptions):
     """Detectors that can be named.
 
     Args:
         name: name or file of a detector whose classes are listed, or a folder of models.
+        try_: photograph in which to compare what the bare detector shows with what semfov lists.
     """
 
+    unused = ("detector",)
+
     name: Path | None = None
+    try_: Path | None = None
 
 
 def start_of(text: str | None) -> int | tuple[int, int] | None:

@@ -76,8 +76,8 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         there = path.exists() or bool(path.suffix) or len(path.parts) > 1
-        expected = f"a file or folder (a class is given by --target {name})"
-        check(there, "picture", expected, f"{name}, which does not exist")
+        of_class = f" (a class is given by --target {name})" if hasattr(options, "target") else ""
+        check(there, "picture", f"a file or folder{of_class}", f"{name}, which does not exist")
         video = path.suffix.lower() in VIDEOS and not path.is_dir()
         check(not video, "picture", "photographs; `semfov live` takes videos", name)
         for each in picture_files(path, recursive=options.recursive):

@@ -33,7 +33,8 @@ class UnnamedClasses(InputError):
     def __init__(self, count: int, file: Path) -> None:
         super().__init__(
             f"classes: expected the names of the {count} classes of {file.name} in the order of its scores, got None; "
-            f"give them by classes=cat,dog, or as the list “classes” in {file.with_suffix('.json')}"
+            f"give them by classes=cat,dog, as the list “classes” in {file.with_suffix('.json')}, or in classes.txt "
+            "beside it"
         )
         self.count = count
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import fields
+from dataclasses import fields, replace
 from inspect import Parameter, signature
 from os import PathLike, fspath
 from pathlib import Path
@@ -120,9 +120,10 @@ def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, opti
         except (RuntimeError, TypeError):
             got = repr(options["device"])
             raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {got}") from None
-    selection = Selection(**{name: value for name, value in options.items() if name in _SELECTING})
+    selecting = {name: value for name, value in options.items() if name in _SELECTING}
+    Selection(**selecting)  # what is wrong is told before a network is loaded
     detector = load(model, **{name: value for name, value in options.items() if name in own})
-    detector.selection = selection
+    detector.selection = replace(detector.selection, **selecting)
     if options.get("background") is not None:
         detector.background = options["background"]
     if "device" in own or options.get("device") is None:

@@ -15,7 +15,7 @@ from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_clas
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
 from semfov.detection.onnx_check import check_file
-from semfov.detection.onnx_file import check_canvas, read_settings, with_input_size
+from semfov.detection.onnx_file import check_canvas, names_beside, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, Signature, misplaced
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.preprocessing import Preprocessing
@@ -137,29 +137,28 @@ class OnnxDetector(Detector):
         if values_known(candidates.boxes):
             named = f"with head {self.head!r}; check that head= names the model's head"
             check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
-            candidates = replace(
-                candidates,
-                classes=self._probabilities(candidates.classes),
-                objectness=None if candidates.objectness is None else self._probabilities(candidates.objectness),
-            )
+            candidates = self._rounded_scores(candidates)
         self._placed |= first
         return keep_classes(candidates, self._places, self._scores)
 
-    def _probabilities(self, scores: Tensor) -> Tensor:
-        """Scores in [0, 1]: those that rounding has put a little outside are clamped, with one warning."""
-        low, high = _range(scores)
+    def _rounded_scores(self, candidates: Candidates) -> Candidates:
+        """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
+        scores = [each for each in (candidates.classes, candidates.objectness) if each is not None]
+        lows, highs = zip(*map(_range, scores), strict=True)
+        low, high = min(lows), max(highs)
         way = "set logits=True if the model returns them before the sigmoid"
         got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
         check_data(low >= -_ROUNDING and high <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
         if low >= 0 and high <= 1:
-            return scores
+            return candidates
         if not self._rounded:
             warnings.warn(
                 f"{self.name}: scores from {low:.7g} to {high:.7g}, which rounding explains, are taken as 0 to 1",
                 stacklevel=2,
             )
         self._rounded = True
-        return scores.clamp(0, 1)
+        objectness = None if candidates.objectness is None else candidates.objectness.clamp(0, 1)
+        return replace(candidates, classes=candidates.classes.clamp(0, 1), objectness=objectness)
 
     def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: tuple[int, int]) -> None:
         """Raise `DataError` where the numbers of the first pass show another head or scores after their sigmoid."""
@@ -232,6 +231,7 @@ def load_onnx(
         check_file(path, size)
     outputs = session.probe(size)
     names = chosen.get("classes")
+    beside = names_beside(file) if names is None and published_name is None else None
     if "head" not in chosen:
         # A pass tells apart heads whose shapes are alike.
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
@@ -243,6 +243,8 @@ def load_onnx(
     if not isinstance(preprocessing, Preprocessing):
         default = head_kind.preprocessing.merged(stored["preprocessing"])
         preprocessing = default.merged({} if preprocessing is None else preprocessing)
+    if names is None and chosen["head"].startswith("end2end") and beside is not None:
+        names = beside[1]  # its outputs do not tell how many classes there are
     try:
         scores = head_kind.decode(outputs, size, None if names is None else len(names)).classes.shape[-1]
     except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
@@ -257,9 +259,10 @@ def load_onnx(
             "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
             stacklevel=2,
         )
-    names = _coco_names(scores, file) if names is None else names
+    if names is None:
+        names = beside[1] if beside is not None and len(beside[1]) == scores else _coco_names(scores, file)
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
-    return OnnxDetector(
+    detector = OnnxDetector(
         session,
         chosen["head"],
         names,
@@ -271,6 +274,8 @@ def load_onnx(
         background=chosen.get("background"),
         digest=_model_digest(file),
     )
+    detector.selection = replace(detector.selection, per_class=chosen.get("per_class", False))
+    return detector
 
 
 def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> tuple[int, int]:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from semfov.detection.onnx_check import check_file
 from semfov.detection.onnx_heads import STRIDES, cells
 from semfov.detection.weights import cache_folder
@@ -17,6 +19,7 @@ from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, che
 _MOST_BYTES = 2**20  # largest number of bytes of a settings file
 _MOST_PIXELS = 89_478_485  # largest number of pixels of a canvas, the same as for pictures that are read
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
+_NAMES = "class_names", "labels", "character", "names"  # keys of metadata with names of classes, as exporters have them
 METADATA_KEY = "semfov"  # key of the settings, as JSON, in the metadata of models that semfov exports
 
 _SETTINGS = Object(
@@ -26,6 +29,7 @@ _SETTINGS = Object(
         "input_size": Array(Number(whole=True)),
         "stride": Maybe(Number(whole=True)),
         "logits": Flag(),
+        "per_class": Flag(),
         "preprocessing": Object(others=Json()),
         **dict.fromkeys(("licence", "source"), Json()),  # for people, of any length and in lines
     }
@@ -43,7 +47,7 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     texts = {f"metadata of {path.name}": metadata[METADATA_KEY]} if METADATA_KEY in metadata else {}
     if (beside := path.with_suffix(".json")).exists():
         texts[str(beside)] = read_text(beside, most=_MOST_BYTES)
-    found, preprocessing = _ultralytics(metadata), dict[str, Any]()
+    found, preprocessing = {**_names_in(metadata), **_ultralytics(metadata)}, dict[str, Any]()
     for where, text in texts.items():
         try:
             settings = json.loads(text)
@@ -55,6 +59,77 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         preprocessing |= settings.get("preprocessing", {})
         found |= settings
     return {**found, "preprocessing": preprocessing}
+
+
+def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
+    """Add options of `load_detector` to the settings in `model.json` beside an ONNX file.
+
+    Args:
+        path: the ONNX file.
+        options: the options; others than the settings of such a file are left out.
+
+    Returns:
+        The file of the settings.
+    """
+    beside = path.with_suffix(".json")
+    stored: dict[str, Any] = json.loads(read_text(beside, most=_MOST_BYTES)) if beside.exists() else {}
+    chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}
+    for name in {"classes", "input_size"} & chosen.keys():
+        chosen[name] = [chosen[name]] * 2 if isinstance(chosen[name], int) else list(chosen[name])
+    preprocessing = {**stored.get("preprocessing", {}), **chosen.get("preprocessing", {})}
+    settings = {**stored, **chosen, **({"preprocessing": preprocessing} if preprocessing else {})}
+    check_content(str(beside), settings, _SETTINGS)
+    write_bytes(beside, f"{json.dumps(settings, indent=1, ensure_ascii=False)}\n".encode())
+    return beside
+
+
+def names_beside(path: Path) -> tuple[str, list[str]] | None:
+    """The file beside a model that has names of classes, and the names; None where there is none.
+
+    Args:
+        path: the ONNX file, beside which there may be `data.yaml`, as of a data set for YOLO, or `classes.txt`.
+    """
+    for name in ("data.yaml", "classes.txt"):
+        beside = path.with_name(name)
+        if beside.is_file():
+            text = read_text(beside, most=_MOST_BYTES)
+            names = _data_names(text) if name == "data.yaml" else text.splitlines()
+            names = [str(each).strip() for each in names if str(each).strip()]
+            if names and all(map(is_plain, names)):
+                return name, names
+    return None
+
+
+def _data_names(text: str) -> list[Any]:
+    """The names of classes in `data.yaml`: a list, or by their numbers."""
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return []
+    return _listed(content.get("names") if isinstance(content, Mapping) else None)
+
+
+def _listed(names: Any) -> list[Any]:
+    """Names in a list, or by numbers from 0; none where they are neither."""
+    if isinstance(names, Mapping):
+        by_number = {str(number): name for number, name in names.items()}
+        numbers = [str(number) for number in range(len(by_number))]
+        return [by_number[number] for number in numbers] if {*numbers} == {*by_number} else []
+    return list(names) if isinstance(names, list | tuple) else []
+
+
+def _names_in(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Class names in metadata under other keys than Ultralytics': a list, by numbers, or a name a line."""
+    for key in _NAMES:
+        text = metadata.get(key, "")
+        try:
+            names = _listed(ast.literal_eval(text))
+        except (ValueError, SyntaxError, RecursionError, MemoryError):
+            names = text.split("\n" if "\n" in text.strip() else ",")
+        names = [str(name).strip() for name in names if str(name).strip()]
+        if len(names) > 1 and all(map(is_plain, names)):
+            return {"classes": names}
+    return {}
 
 
 def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:

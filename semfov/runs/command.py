@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import partial
+from keyword import iskeyword
 from pathlib import Path
 from types import FrameType, UnionType
 from typing import (
@@ -215,6 +216,7 @@ def _usual_form(arguments: Sequence[str], config: type[Any], options: Iterable[s
         word = rest.pop(0)
         name, equals, value = word.partition("=")
         option = "--" + name[2:].replace("-", "_")
+        option += "_" if iskeyword(option[2:]) else ""  # --try, which Python cannot name so
         if word == "--":
             return [*usual, word, *rest]
         if not word.startswith("--") or option not in option_names:

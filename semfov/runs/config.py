@@ -65,6 +65,9 @@ class DetectorConfig(Settings):
         runtime: what runs a Darknet network: `torch`, `onnxruntime`, or the faster of the two (`auto`).
         classes: names of the classes in the order of the scores (None: the network's own names, or those of COCO).
         head: output format of an ONNX model whose format is not recognised (docs/detectors.md).
+        colour: order of the channels that an ONNX model takes, `rgb` or `bgr` (None: that of its head).
+        logits: whether an ONNX model returns scores before their sigmoid.
+        per_class: let boxes suppress boxes of their own class alone.
     """
 
     name: str = "yolox-nano"
@@ -78,6 +81,9 @@ class DetectorConfig(Settings):
     runtime: Runtime = "auto"
     classes: tuple[str, ...] | None = None
     head: str | None = None
+    colour: Literal["rgb", "bgr"] | None = None
+    logits: bool = False
+    per_class: bool = False
 
 
 @dataclass(frozen=True)

@@ -70,14 +70,14 @@ def make_detector(detector: DetectorConfig) -> Detector:
 def detector_options(detector: DetectorConfig) -> dict[str, Any]:
     """The options of `semfov.load_detector` that correspond to the settings."""
     onnx = detector.name.endswith(".onnx")
-    if detector.head is not None and not onnx:
-        raise InputError(
-            f"detector.head: expected null, since detector.name {detector.name!r} is not an ONNX file, got "
-            f"{detector.head!r}"
-        )
-    default, options = DetectorConfig(), ("background", "weights", "classes", "head", "stride", "input_size", "runtime")
-    changed = [name for name in options if getattr(detector, name) != getattr(default, name)]
-    return {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}
+    for name in ("head", "colour", "logits"):
+        value = getattr(detector, name)
+        expected = f"none, since detector.name {detector.name!r} is not an ONNX file"
+        check(onnx or not value, f"detector.{name}", expected, repr(value))
+    default, same = DetectorConfig(), ("background", "weights", "classes", "head", "stride", "input_size", "runtime")
+    changed = [name for name in (*same, "logits", "per_class") if getattr(detector, name) != getattr(default, name)]
+    options = {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}
+    return options if detector.colour is None else {**options, "preprocessing": {"channels": detector.colour}}
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:

@@ -33,7 +33,7 @@ REFUSED = {
     "search nosuch.jpg cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "search zebr nosuch.jpg": "picture: expected a file or folder (a class is given by --target zebr), got zebr",
     "find nosuch --target cup": "picture: expected a file or folder (a class is given by --target nosuch)",
-    "find --classes cup": "classes: expected none for yolox-nano, which has its own; --target names",
+    "find --classes cup": "classes: expected none for yolox-nano, which has its own; `semfov find --target CLASS`",
     "find --device nosuch": "device: expected one that PyTorch has here (cpu",
     "find --device meta": "device: expected one that PyTorch has here (cpu",
     "live": "source: expected a video, an address or --camera 0, got none",

@@ -1,0 +1,129 @@
+"""`semfov detectors NAME --try PHOTO`: what the bare detector shows in a photograph beside what semfov lists."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from semfov.agent import ActivePerception
+from semfov.cli.outcome import table_lines
+from semfov.detection import Candidates, Detector, Objects, score_vectors
+from semfov.detection.objects import LEAST, box_text
+from semfov.detection.onnx import OnnxDetector
+from semfov.detection.selection import suppress
+from semfov.observation.matching import box_iou
+from semfov.zoom.glances import Window
+
+_SAME = 0.5  # overlap from which on a box that is listed is one that the bare detector shows
+_MORE = 1.25  # factor of the sum of scores from which on the other order of the channels suits a detector better
+_FEW = 16  # number of different scores up to which an export has lost them
+_ENOUGH = 100  # number of scores from which on they must differ
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One pass over a whole photograph: boxes `(M, 4)` in its pixels, scores and labels `(M,)`, and all proposals."""
+
+    boxes: Tensor
+    scores: Tensor
+    labels: Tensor
+    proposals: Candidates
+
+    @classmethod
+    @torch.inference_mode()
+    def of(cls, agent: ActivePerception, photo: Path) -> "Trial":
+        """Run the bare detector: its best class of each box, and non-maximum suppression."""
+        eye, detector = agent.zoom.eye, agent.eye.detector
+        view = eye.open(photo)
+        canvas, frames = eye.glimpse(view, torch.tensor([Window.overview(view.lattice).fixation]))
+        proposals = detector.propose(canvas).precise()
+        confidence, labels = proposals.confidence[0], proposals.classes[0].argmax(-1)
+        sure = (confidence >= LEAST).nonzero()[:, 0]
+        boxes = proposals.boxes[0, sure]
+        kept = suppress(boxes, confidence[sure], labels[sure], detector.selection)
+        low, high, first, last = frames[0].view(4, 2).repeat(1, 2).unbind()
+        placed = ((boxes[kept] - first) * (high - low) / (last - first) + low).clamp(low, high)
+        return cls(placed, confidence[sure][kept], labels[sure][kept] + 1, proposals)
+
+
+def try_detector(agent: ActivePerception, photo: Path) -> None:
+    """Print what a detector shows in a photograph beside what semfov lists after one look, and what may be lost."""
+    detector, bare = agent.eye.detector, Trial.of(agent, photo)
+    record = agent.find_all(photo, how="windows", passes=1, least=LEAST)
+    rows = _rows(bare, record.objects, agent.classes)
+    both = sum("-" not in row[1:3] for row in rows)
+    print(f"{detector.name}: {_settings(detector)}")
+    print(
+        f"{photo.name}: the bare detector shows {len(bare.scores)} from {LEAST:g} on, and semfov lists {both} of them"
+    )
+    if rows:
+        print("\n".join(table_lines([["class", "bare", record.measure, "box"], *rows])))
+    for word in (*_about_scores(bare, detector), *_about_colours(bare, agent, photo)):
+        print(f"note: {word}")
+
+
+def _settings(detector: Detector) -> str:
+    width, height = detector.input_size
+    parts = [f"{len(detector.classes)} classes", f"{width} × {height} px"]
+    if isinstance(detector, OnnxDetector):
+        parts = [f"head {detector.head}", f"colours {detector.preprocessing.channels}", *parts]
+    return ", ".join([*parts, f"background {detector.background}"])
+
+
+def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[str]]:
+    """Class, both scores and box of what the bare detector shows, and then of what semfov lists beyond it."""
+    overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * (bare.labels[:, None] == objects.labels)
+    rows, left = list[list[str]](), set(range(len(objects)))
+    for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
+        best = int(overlap[number].argmax()) if len(objects) else 0
+        same = best in left and float(overlap[number, best]) >= _SAME
+        left -= {best} if same else set()
+        listed = f"{objects.scores[best]:.2f}" if same else "-"
+        rows.append([classes[label], f"{score:.2f}", listed, box_text(box.tolist())])
+    for number in sorted(left):
+        name, score = classes[int(objects.labels[number])], f"{objects.scores[number]:.2f}"
+        rows.append([name, "-", score, box_text(objects.boxes[number].tolist())])
+    return rows
+
+
+def _about_scores(bare: Trial, detector: Detector) -> list[str]:
+    """What the scores of the proposals tell of the export, its head and its background."""
+    confidence = bare.proposals.confidence[0]
+    if not len(bare.scores):
+        best, values = float(confidence.amax()) if len(confidence) else 0.0, len(confidence.unique())
+        if len(confidence) >= _ENOUGH and values <= _FEW:
+            return [
+                f"its {len(confidence):,} boxes have {values} different score{'s' if values > 1 else ''}: an export to "
+                "int8 with one scale for boxes and scores loses the scores; leave its last layers out of the conversion"
+            ]
+        return [
+            f"the best score is {best:.2f}; if the photograph shows objects of its classes, the head or the colours "
+            "may be wrong: give --head, --colour or --logits"
+        ]
+    best_box = confidence.argmax()[None]
+    share = float(score_vectors(bare.proposals.take(0, best_box), detector.background)[0, 1:].max())
+    score = float(confidence.max())
+    if share >= 0.5 * score:
+        return []
+    return [
+        f"in the score vectors, which beliefs read, the best class has {share:.2f} of {score:.2f}, since many small "
+        "scores share it; lists have the score itself, and semfov fit learns the difference"
+    ]
+
+
+def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[str]:
+    """Whether an ONNX file shows more with the other order of the channels."""
+    detector = agent.eye.detector
+    if not isinstance(detector, OnnxDetector):
+        return []
+    usual = detector.preprocessing
+    other = "bgr" if usual.channels == "rgb" else "rgb"
+    detector.preprocessing = replace(usual, channels=other)
+    try:
+        swapped = Trial.of(agent, photo)
+    finally:
+        detector.preprocessing = usual
+    if float(swapped.scores.sum()) < _MORE * float(bare.scores.sum()) or not len(swapped.scores):
+        return []
+    return [f"with --colour {other} it shows {len(swapped.scores)} from {LEAST:g} on; other photographs will tell"]
