@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -118,7 +119,7 @@ def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[st
     if not isinstance(detector, OnnxDetector):
         return []
     usual = detector.preprocessing
-    other = "bgr" if usual.channels == "rgb" else "rgb"
+    other: Literal["rgb", "bgr"] = "bgr" if usual.channels == "rgb" else "rgb"
     detector.preprocessing = replace(usual, channels=other)
     try:
         swapped = Trial.of(agent, photo)

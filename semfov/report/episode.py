@@ -151,12 +151,11 @@ def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     """The most confident detections of a look, each with its highest class scores and the position of its label."""
     looked, classes = confident_detections(scanpath.detections[fixation], _MOST)[0], scanpath.classes
     detections = []
-    for box, vector in zip(looked.boxes, looked.scores, strict=True):
-        best = vector.topk(min(_SCORES, len(vector)))
+    for box, scores in zip(looked.boxes, looked.class_scores, strict=True):
+        best = scores.topk(min(_SCORES, len(scores)))
         pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
-        top = [[classes[index], rounded(score, 9)] for score, index in pairs]
-        label = classes[int(vector[1:].argmax()) + 1]
-        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
+        top = [[classes[index + 1], rounded(score, 9)] for score, index in pairs]
+        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": top[0][0], "scores": top})
     width, height = scanpath.grid.extent.tolist()
     unit = width / 640
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()

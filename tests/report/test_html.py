@@ -101,10 +101,11 @@ def test_the_page_contains_fixations_detections_and_pictures(page, scanpath, ima
     for number, each in enumerate(episode["fixations"]):
         np.testing.assert_allclose(each["values"], scanpath.values[number], rtol=1e-3)
         seen = scanpath.detections[number]
-        for row, detection in enumerate(each["detections"]):
+        rows = seen.confidence[0].argsort(descending=True).tolist()
+        for row, detection in zip(rows, each["detections"], strict=False):
             np.testing.assert_allclose(detection["box"], seen.boxes[0, row], atol=0.06)
-            best = seen.scores[0, row].sort(descending=True)
-            assert [name for name, _ in detection["scores"]] == [scanpath.classes[index] for index in best.indices]
+            best = seen.scores[0, row, 1:].sort(descending=True)
+            assert [name for name, _ in detection["scores"]] == [scanpath.classes[index + 1] for index in best.indices]
             np.testing.assert_allclose([score for _, score in detection["scores"]], best.values, rtol=1e-3)
         assert each["seconds"] == {"detect": 0.1, "choose": 0.001}
     picture = data["pictures"][episode["image"]]

@@ -154,6 +154,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
         boxes=place[None],
         scores=first.detections.scores.expand(1, many, -1),
         mask=torch.ones(1, many, dtype=torch.bool),
+        confidence=first.detections.confidence.expand(1, many),
     )
     glances = (replace(first, detections=seen), *zoom_path.glances[1:])
     data = zoom_data(
