@@ -74,10 +74,11 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
     beside = path.with_suffix(".json")
     stored: dict[str, Any] = json.loads(read_text(beside, most=_MOST_BYTES)) if beside.exists() else {}
     chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}
-    for name in {"classes", "input_size"} & chosen.keys():
-        chosen[name] = [chosen[name]] * 2 if isinstance(chosen[name], int) else list(chosen[name])
-    preprocessing = {**stored.get("preprocessing", {}), **chosen.get("preprocessing", {})}
-    settings = {**stored, **chosen, **({"preprocessing": preprocessing} if preprocessing else {})}
+    settings = {**stored, **chosen}
+    if isinstance(side := settings.get("input_size"), int):
+        settings["input_size"] = [side, side]
+    if "preprocessing" in settings:
+        settings["preprocessing"] = {**stored.get("preprocessing", {}), **chosen.get("preprocessing", {})}
     check_content(str(beside), settings, _SETTINGS)
     write_bytes(beside, f"{json.dumps(settings, indent=1, ensure_ascii=False)}\n".encode())
     return beside
@@ -104,7 +105,7 @@ def _data_names(text: str) -> list[Any]:
     """The names of classes in `data.yaml`: a list, or by their numbers."""
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, RecursionError, ValueError):
         return []
     return _listed(content.get("names") if isinstance(content, Mapping) else None)
 
@@ -114,8 +115,9 @@ def _listed(names: Any) -> list[Any]:
     if isinstance(names, Mapping):
         by_number = {str(number): name for number, name in names.items()}
         numbers = [str(number) for number in range(len(by_number))]
-        return [by_number[number] for number in numbers] if {*numbers} == {*by_number} else []
-    return list(names) if isinstance(names, list | tuple) else []
+        names = [by_number[number] for number in numbers] if {*numbers} == {*by_number} else []
+    listed = isinstance(names, list | tuple) and all(isinstance(name, str | int) for name in names)
+    return list(names) if listed else []
 
 
 def _names_in(metadata: Mapping[str, str]) -> dict[str, Any]:
