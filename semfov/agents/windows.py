@@ -167,8 +167,8 @@ class ZoomAgent(nn.Module):
             on_look: called after each look with the record so far; returning False ends the exploration.
             batch: number of windows that are chosen jointly and pass the detector together.
             worth: the exploration ends when no look is expected to find more new objects than this.
-            least: probability from which on objects count, or their score in a look at the whole picture, as the bare
-                detector shows it; None takes 0.5. Without evidence it is their score, and None takes 0.3.
+            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
+                takes 0.3.
 
         Returns:
             The looks and the objects.
@@ -286,7 +286,7 @@ class WindowEpisode(Episode[ZoomPath]):
     def open(self, glances: Glances, *, told: bool = False) -> Self:
         """Begin with a picture, or with the first frame of a stream."""
         self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
-        # From this probability or score on objects count. Without evidence and in photographs slices are looked at.
+        # From this probability, or score, on objects count. Without evidence and in photographs slices are looked at.
         usual = LEAST if self.certainty is None else LIKELY
         self.least = usual if self._least is None else self._least
         self._slicing = self.evidence is None or glances.lattice.levels == 1

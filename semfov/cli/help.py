@@ -87,7 +87,7 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 {_AGENT}
 {_LOOKS}
   --worth N            a look is worth a pass if it is expected to show this many new objects (default 0.01)
-  --least P            objects count from this probability on, or with this score in the whole picture (default 0.5)
+  --least P            objects count from this probability on, without fitted models from this score (default 0.5)
   --batch N            windows that are looked at together
 {_OUTPUT}
 """,

@@ -32,13 +32,14 @@ _OBJECTS_LISTED = 20  # largest number of objects that are listed
 def _outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
-    passes = f"{record.passes} pass{'es' if record.passes != 1 else ''} in {seconds:.1f} s"
+    limit = " (the limit)" if record.ending == "passes" else ""
+    looks = f"{record.passes} look{'s' if record.passes != 1 else ''}{limit} in {seconds:.1f} s"
     if record.how == "head":  # whose seconds are those of its movements and looks
-        passes += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
+        looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
     headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
-    lines = [f"{name}, {width} × {height} px: {headline}"]
-    lines.append(f"  {record.why_it_ended()} {passes}.".replace("   ", "  "))
+    why = "" if limit else record.why_it_ended()
+    lines = [f"{name}, {width} × {height} px: {headline}", f"  {why} {looks}.".replace("   ", "  ")]
     if record.decision is None:
         lines += _regions_lines(record) if isinstance(record, Scanpath) and record.target is None else []
         lines += _objects_lines(record)
@@ -64,9 +65,8 @@ def _objects_lines(record: Record) -> list[str]:
     rows = record.object_rows()
     lines = [
         f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
-        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}"
-        f"{', confirmed' * row['confirmed']}{', listed by its score in the whole picture' * by_score}"
-        for row, by_score in zip(rows[:_OBJECTS_LISTED], record.listed_by_score.tolist(), strict=False)
+        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' * row['confirmed']}"
+        for row in rows[:_OBJECTS_LISTED]
     ]
     more = len(rows) - _OBJECTS_LISTED
     lines += [f"  and {more} more (--out FILE.json writes all)"] if more > 0 else []

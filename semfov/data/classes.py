@@ -104,6 +104,7 @@ _ALIASES = {
 _SPELT = {"".join(new.split()): [old for old in _ALIASES if _ALIASES[old] == new] for new in _ALIASES.values()}
 _MOST_NAMED = 12  # largest number of classes that a message names
 
+_UNCHANGED = ("sheep", "skis", "scissors", "broccoli")
 _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "scissor"}
 
 
@@ -121,6 +122,29 @@ def canonical_name(name: str) -> str:
     """
     plain = " ".join(name.replace("_", " ").lower().split())
     return _ALIASES.get(plain, plain)
+
+
+def counted(number: int, name: str) -> str:
+    """Write a number of objects of a class in words.
+
+    >>> counted(0, "wine glass"), counted(1, "cup"), counted(36, "person"), counted(2, "wine glass")
+    ('no wine glass', '1 cup', '36 people', '2 wine glasses')
+    """
+    return f"{number or 'no'} {name if number < 2 else plural(name)}"
+
+
+def plural(name: str) -> str:
+    """Write the plural of a class name; a name that does not end in a small letter has none."""
+    word = re.split(r"[\s_-]", name)[-1]
+    if word in _UNCHANGED or not re.search("[a-z]$", word):
+        return name
+    if word in ("person", "mouse"):
+        return name.removesuffix(word) + _IRREGULAR[word]
+    if re.search("(s|x|z|ch|sh)$", word):
+        return f"{name}es"
+    if re.search("[^aeiou]y$", word):
+        return f"{name[:-1]}ies"
+    return f"{name[:-2]}ves" if word.endswith("ife") else f"{name}s"
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from semfov.data.classes import canonical_name, class_indices
 from semfov.errors import InputError, check, needing
+from semfov.io.tables import digits, pixels
 
 if TYPE_CHECKING:
     import supervision
@@ -37,7 +38,7 @@ def coco_results(
     size = boxes[:, 2:] - boxes[:, :2]
     placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
     return [
-        {"image_id": image_id, "category_id": ids[label], "bbox": box, "score": score}
+        {"image_id": image_id, "category_id": ids[label], "bbox": [*map(pixels, box)], "score": digits(score)}
         for label, box, score in zip(labels.tolist(), placed, scores.double().tolist(), strict=True)
     ]
 

@@ -3,8 +3,31 @@
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from typing import overload
 
 _FORMULAS = ("=", "+", "-", "@")  # first characters of a formula in spreadsheets
+
+
+def pixels(value: float) -> float:
+    """Round a place in a table to a hundredth of a pixel, or of a degree."""
+    return round(value, 2)
+
+
+@overload
+def digits(value: float) -> float: ...
+
+
+@overload
+def digits(value: float | None) -> float | None: ...
+
+
+def digits(value: float | None) -> float | None:
+    """Round a number in a table, such as a probability, to four digits.
+
+    >>> digits(0.123456789), digits(8.803147466096561e-06)
+    (0.1235, 8.803e-06)
+    """
+    return None if value is None else float(f"{value:.4g}")
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -52,7 +52,7 @@ class Record(Conversion):
         seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count, in windows their probability or score (`threshold_in_words`).
+        least: score from which on objects count, in windows their probability (`threshold_in_words`).
         unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
             no probabilities.
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
@@ -72,13 +72,12 @@ class Record(Conversion):
 
     def __repr__(self) -> str:
         """The summary, the looks, and the most confident objects."""
-        objects, lower = self.objects, self.listed_by_score.tolist()
+        rows = self.object_rows()
         named = [
-            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f})"
-            f"{' (confirmed)' * row['confirmed']}{' (by score alone)' * by_score}"
-            for row, by_score in zip(self.object_rows()[:_NAMED], lower, strict=False)
+            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){' (confirmed)' * row['confirmed']}"
+            for row in rows[:_NAMED]
         ]
-        more = [f"and {len(objects) - _NAMED} more"] if len(objects) > _NAMED else []
+        more = [f"and {len(rows) - _NAMED} more"] if len(rows) > _NAMED else []
         found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"
         return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])
 

@@ -20,7 +20,7 @@ from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
-from semfov.io.tables import csv_text
+from semfov.io.tables import csv_text, digits, pixels
 from semfov.paths.georeference import georeference
 from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 _Table = Literal["looks", "objects"]  # tables of a record
 
-COLUMNS = ("object", "class", "score", "confirmed", "x", "y", "x1", "y1", "x2", "y2", "look")
+_PLACE = ("x", "y", "x1", "y1", "x2", "y2")
+COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
 _WORDS = {
@@ -83,15 +84,15 @@ class Conversion(Outcome):
             rows.append(
                 {
                     "look": look.number,
-                    **dict(zip(("x", "y", "x1", "y1", "x2", "y2"), (*look.fixation, *look.region), strict=True)),
+                    **dict(zip(_PLACE, map(pixels, (*look.fixation, *look.region)), strict=True)),
                     "detections": count,
                     "seen": self.classes[int(seen.labels[0, 0])] if count else None,
-                    "score": float(seen.confidence[0, 0]) if count else None,
-                    "seconds": look.seconds,
-                    "value": look.value,
-                    "closer": closer.get(look.number),
+                    "score": digits(float(seen.confidence[0, 0])) if count else None,
+                    "seconds": None if look.seconds is None else round(look.seconds, 3),
+                    "value": digits(look.value),
+                    "closer": digits(closer.get(look.number)),
                     "brought": brought[look.number],
-                    **look.more,
+                    **{name: digits(each) if isinstance(each, float) else each for name, each in look.more.items()},
                 }
             )
         return rows
@@ -107,12 +108,12 @@ class Conversion(Outcome):
         values["targets"] = [self.classes[label] for label in self._sought]
         if decision is not None:
             box = decision.box.tolist() if decision.outcome == "found" and decision.box is not None else [None] * 4
-            values |= {"outcome": decision.outcome, "probability": decision.probability}
+            values |= {"outcome": decision.outcome, "probability": digits(decision.probability)}
             edges = (*(self.found_at or (None, None)), *box)
-            values |= dict(zip(("x", "y", "x1", "y1", "x2", "y2"), edges, strict=True))
+            values |= {name: None if edge is None else pixels(edge) for name, edge in zip(_PLACE, edges, strict=True)}
         values["least"] = self.least
         for key, numbers in (("expected", self.expected), ("expected_error", self.expected_error)):
-            values[key] = {name: None if math.isnan(number) else number for name, number in numbers.items()}
+            values[key] = {name: None if math.isnan(number) else digits(number) for name, number in numbers.items()}
         values["passes"] = self.passes
         return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
 
@@ -131,14 +132,12 @@ class Conversion(Outcome):
             {
                 "object": number,
                 "class": self.classes[label],
-                "score": score,
+                "score": digits(score),
                 "confirmed": sure,
-                "x": (box[0] + box[2]) / 2,
-                "y": (box[1] + box[3]) / 2,
-                **dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
+                **dict(zip(_PLACE, map(pixels, ((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)), strict=True)),
                 "look": look,
             }
-            for number, (label, score, sure, look, box) in enumerate(
+            for number, (label, score, sure, look, (x1, y1, x2, y2)) in enumerate(
                 zip(*(column.tolist() for column in columns), strict=True)
             )
         ]
@@ -345,7 +344,7 @@ class Conversion(Outcome):
         ]
         if place is not None and rows:
             flat = place(np.array(corners).reshape(-1, 2))
-            corners = [[(x, y) for x, y in ring] for ring in flat.reshape(-1, 4, 2).tolist()]
+            corners = [[(x, y) for x, y in ring] for ring in flat.round(8).reshape(-1, 4, 2).tolist()]
         names = "object", "class", "score", "confirmed", "look"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",

@@ -25,6 +25,7 @@ from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.io.files import MADE_HERE, write_bytes
+from semfov.io.tables import digits, pixels
 from semfov.paths.base import Record
 from semfov.paths.stimulus import reduced_copy
 from semfov.words import not_there
@@ -192,7 +193,7 @@ class GazePrediction:
         while bool(free.any()):  # all of them, since a later place can have a larger share
             best = int(torch.where(free, value, -1.0).argmax())
             at = places[best].tolist()
-            found.append({"x": at[0] - 0.5, "y": at[1] - 0.5, "share": float(share[best])})
+            found.append({"x": pixels(at[0] - 0.5), "y": pixels(at[1] - 0.5), "share": digits(float(share[best]))})
             free &= distance[best] > 2
         return sorted(found, key=lambda place: -place["share"])
 

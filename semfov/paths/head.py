@@ -18,6 +18,7 @@ from semfov.errors import InputError, check
 from semfov.head.scenes import Flat, Panorama, Sphere, World
 from semfov.head.views import Views
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Text
+from semfov.io.tables import pixels
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format
@@ -138,7 +139,10 @@ class HeadPath(Record):
         points = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2) - 0.5
         places = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
         angles = world.angles_of(places).tolist()
-        return [row | dict(zip(("pan", "tilt"), each, strict=True)) for row, each in zip(rows, angles, strict=True)]
+        return [
+            row | dict(zip(("pan", "tilt"), map(pixels, each), strict=True))
+            for row, each in zip(rows, angles, strict=True)
+        ]
 
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.

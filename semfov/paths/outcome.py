@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, counted
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects, box_text
@@ -117,9 +117,8 @@ class Outcome(ABC):
 
     @property
     def threshold_in_words(self) -> str:
-        """From what on objects count, such as `probability or score 0.5`; in a search only the probability counts."""
-        score = " or score" if self.decision is None and self.unseen is not None else ""
-        return f"{self.measure}{score} {self.least:g}"
+        """From what on objects count, such as `probability 0.5`."""
+        return f"{self.measure} {self.least:g}"
 
     @property
     def decided_by(self) -> str:
@@ -173,11 +172,6 @@ class Outcome(ABC):
         return self._outcome[1]
 
     @property
-    def listed_by_score(self) -> Tensor:
-        """Which objects, less probable than `least`, count by their score in the whole picture, `(M,)` boolean."""
-        return ~self.confirmed & (self.objects.scores < self.least)
-
-    @property
     def confirmable(self) -> bool:
         """Whether objects can be confirmed: by a decision or by closer looks."""
         return self.decision is not None or len(self.closer) > 0
@@ -194,7 +188,8 @@ class Outcome(ABC):
 
         It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
         each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
-        or a head, nor of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`).
+        or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is not known in a
+        large picture, and in a photograph it is twice the sum (`semfov.zoom.certainty.number_of_faint`).
         """
         return NumberByClass({name: mean for name, (mean, _) in self._claimed().items()})
 
@@ -238,7 +233,7 @@ class Outcome(ABC):
         """The objects, and which of them were confirmed."""
         candidates = self.candidates.of(self._sought)
         boxes, scores, labels, looks = candidates.boxes, candidates.scores, candidates.labels, candidates.passes
-        counts, sure = self._counts(candidates), torch.zeros(len(candidates), dtype=torch.bool)
+        counts, sure = candidates.scores >= self.least, torch.zeros(len(candidates), dtype=torch.bool)
         for place, label, chance, look in self._confirmed_places:
             box, probability = place[None].to(boxes), scores.new_tensor([chance])
             overlap = box_iou(boxes, box)[:, 0].masked_fill(labels != label, 0)
@@ -263,24 +258,21 @@ class Outcome(ABC):
             sure = torch.zeros(len(objects), dtype=torch.bool)
         return replace(objects, classes=self.classes), sure
 
-    def _counts(self, candidates: Objects) -> Tensor:
-        """Which candidates of the classes that were searched for count as objects without being confirmed, `(M,)`."""
-        return candidates.scores >= self.least
-
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, such as `2 × person from score 0.3`."""
+        """Count the objects, by class where classes were searched for, such as `2 cups, no cat found`."""
         labels = self.objects.labels
-        names = [f"{int((labels == label).sum())} × {self.classes[label]}" for label in self._sought]
-        every = f"{len(labels)} object{'s' if len(labels) != 1 else ''}"
-        return f"{', '.join(names) or every} from {self.threshold_in_words}"
+        names = [counted(int((labels == label).sum()), self.classes[label]) for label in self._sought]
+        text = f"{', '.join(names) or counted(len(labels), 'object')} found"
+        return text[0].upper() + text[1:]
 
     def classes_in_words(self) -> str:
-        """Count the objects by class, the most frequent first, and say how many of them this detector can show."""
-        labels = Counter(self.objects.labels.tolist()).most_common()
-        return ", ".join(f"{count} × {self.classes[label]}{self._number_in_words([label])}" for label, count in labels)
+        """Count the objects by class, the most frequent first, and say how many of each to expect in all."""
+        counts = Counter(self.objects.labels.tolist()).most_common()
+        words = [f"{counted(count, self.classes[label])}{self._number_in_words(label)}" for label, count in counts]
+        return ", ".join(words)
 
-    def _number_in_words(self, labels: Sequence[int]) -> str:
-        """The expected number of objects of some classes, in brackets; empty where it is not known or says no more."""
+    def _number_in_words(self, label: int) -> str:
+        """The expected number of objects of a class, in brackets; empty where it is not known."""
         return ""
 
     def why_it_ended(self) -> str:
@@ -323,4 +315,6 @@ class Outcome(ABC):
     def summary(self) -> str:
         """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""
         place = self.best_place_in_words().capitalize()
-        return " ".join(filter(None, (f"{self.describe()}.", self.why_it_ended(), place and f"{place}.")))
+        limited = self.how == "windows" and self.ending == "passes"
+        ending = " (the limit)." if limited else f". {self.why_it_ended()}".rstrip()
+        return f"{self.describe()}{ending}{place and f' {place}.'}"

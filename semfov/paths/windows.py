@@ -8,17 +8,17 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from semfov.data.classes import plural
 from semfov.detection import Detections, Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
-from semfov.zoom.certainty import SPREAD, number_of, reacts
+from semfov.zoom.certainty import SPREAD, number_of, number_of_faint, reacts
 from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import shown
 
 _WINDOW_VALUES = {
     "fixation": Array((Number(), Number(), POSITIVE)),
@@ -83,7 +83,7 @@ class ZoomPath(Record):
     ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(), values=(), candidates=nothing
     ... )
     >>> path.describe()
-    '0 × cup from score 0.3 in 0 passes'
+    'No cup found. 0 looks'
     """
 
     lattice: Lattice
@@ -133,23 +133,30 @@ class ZoomPath(Record):
         return len(self.objects.of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
-        """Mean and variance of the number of objects of each class; NaN where the detector hardly reacts."""
+        """Mean and variance of the number of objects of each class; NaN where none is estimated."""
         if self.unseen is None:
             return super()._claimed()
-        nothing = math.nan, math.nan
-        numbers = self._numbers().items()
-        return {self.classes[label]: number if self._reacts_to([label]) else nothing for label, number in numbers}
+        return {self.classes[label]: number for label, number in self._numbers().items()}
 
     def _numbers(self) -> dict[int, tuple[float, float]]:
-        """Mean and variance of the number of objects of each class."""
+        """Mean and variance of the number of objects of each class; NaN where none is estimated.
+
+        Where the detector hardly reacts to a class, photographs are like those of the fit, of which it is known how
+        many objects it misses. Nothing is known of large pictures: of airports from above it shows no airplane.
+        """
         more, spread = self.unseen or (0.0, 0.0)
         sought = self._sought or tuple(self.candidates.labels.unique().tolist())
-        chances = [self.candidates.of([label]).scores for label in sought]
-        sums = [float(each.double().sum()) + 1e-9 for each in chances]
-        return {
-            label: number_of(each, (total / sum(sums) * more, total / sum(sums) * spread), self.spread)
-            for label, each, total in zip(sought, chances, sums, strict=True)
-        }
+        counted = {*self._sought, *self.objects.labels.tolist()} if self.lattice.levels == 1 else {}
+        chances = {label: self.candidates.of([label]).scores for label in sought}
+        sums = {label: float(each.double().sum()) + 1e-9 for label, each in chances.items()}
+        numbers = {}
+        for label, each in chances.items():
+            share = sums[label] / sum(sums.values())
+            if self._reacts_to([label]):
+                numbers[label] = number_of(each, (share * more, share * spread), self.spread)
+            else:
+                numbers[label] = number_of_faint(each) if label in counted else (math.nan, math.nan)
+        return numbers
 
     @property
     def size(self) -> tuple[int, int]:
@@ -163,11 +170,11 @@ class ZoomPath(Record):
 
     def describe(self) -> str:
         """Summarise the result."""
-        passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
+        looks = f"{self.passes} look{'s' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
             outcome = f"{self.decision.outcome} (there with probability {self.decision.probability:.2f})"
-            return f"{self.target_name}: {outcome} in {passes}"
-        return f"{self.objects_in_words()} in {passes}"
+            return f"{self.target_name}: {outcome} in {looks}"
+        return f"{self.objects_in_words()}. {looks}"
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why the search or the exploration ended, or what a decision without candidates says.
@@ -181,45 +188,42 @@ class ZoomPath(Record):
             return self._sentences["unseen"]
         return super().why_it_ended()
 
-    def _counts(self, candidates: Objects) -> Tensor:
-        """Candidates from the probability `least` on, and those that a look at the whole shows with such a score."""
-        counts = super()._counts(candidates)
-        if self.decision is not None:
-            return counts
-        whole = [glance for glance in self.glances if self.is_whole(glance.window.region(self.lattice))]
-        return counts | shown(candidates, whole, self._sought, self.least, shares=self.unseen is not None)
-
     def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many this detector can show.
+        """Count the objects, by class where classes were searched for, and say how many to expect in all.
 
-        Where fewer are expected than are counted, it is said how many of those counted are right. Without a class to
-        search for there is no such number, since the small rests of all classes add up to many. Of one object it would
-        say no more. No number is given of a class to which the detector hardly reacts (`reacts`).
+        Without a class to search for no number in all is given, since the small rests of all classes add up to many.
 
         Returns:
-            A phrase such as `41 × person from probability or score 0.5 (about 47 ± 5 that this detector can show)`, or
-            `9 × person from probability or score 0.5 (about 8 ± 1 of them right)`.
+            A phrase such as `36 people found; expect 36 to 54 in all`, or `No cup found`.
         """
         text = super().objects_in_words()
-        if self.unseen is None or not self._sought:
+        ranges = {label: self._range(label) for label in self._sought}
+        told = [(label, ends) for label, ends in ranges.items() if ends is not None]
+        if not told:
             return text
-        if not any(self._reacts_to([label]) for label in self._sought):
-            why = "beside many faint candidates" if len(self.objects) else "the detector hardly reacts"
-            return f"{text} ({why}, so no number in all is given)"
-        return text + self._number_in_words(self._sought)
+        several = len(ranges) > 1
+        each = [f"{_ends_in_words(*ends)}{f' {plural(self.classes[label])}' * several}" for label, ends in told]
+        return f"{text}; expect {', '.join(each)} in all"
 
-    def _number_in_words(self, labels: Sequence[int]) -> str:
-        claimed, chances = [label for label in labels if self._reacts_to([label])], self.objects.of(labels).scores
-        if self.unseen is None or not claimed or len(chances) == 1:
-            return ""
-        chances, numbers = self.objects.of(claimed).scores, self._numbers()
-        (mean, variance), of = number_of(chances, (0.0, 0.0), self.spread), "of them right"
-        means, variances = zip(*(numbers[label] for label in claimed), strict=True)
-        if round(sum(means)) >= len(chances):
-            mean, variance, of = sum(means), sum(variances), "that this detector can show"
-        left = [self.classes[label] for label in labels if label not in claimed]
-        without = f"; for {' and '.join(left)} no number is given" if left else ""
-        return f" (about {mean:.0f} ± {variance**0.5:.0f} {of}{without})"
+    def _number_in_words(self, label: int) -> str:
+        ends = self._range(label)
+        return "" if ends is None else f" ({_ends_in_words(*ends)} in all)"
+
+    def _range(self, label: int) -> tuple[int, int] | None:
+        """From how many objects of a class to how many are in the picture, by a standard deviation.
+
+        It starts with those that are listed, unless fewer are expected. None where no number is estimated, and where
+        none is listed and less than one is expected.
+        """
+        if self.unseen is None:
+            return None
+        mean, variance = self._numbers().get(label, (math.nan, math.nan))
+        listed = len(self.objects.of([label]))
+        if math.isnan(mean) or (not listed and mean < 1):
+            return None
+        error = variance**0.5
+        low = max(round(mean - error), min(listed, round(mean)))
+        return low, max(low, round(mean + error))
 
     def _looks(self) -> Iterator[RecordedLook]:
         clock = self.seconds or (None,) * len(self.glances)
@@ -347,6 +351,10 @@ class WindowMoment(ZoomPath, Moment):
         made = super()._fields(tensors, record, shared)
         window = _window_from(record["next_window"], made["lattice"])
         return {**made, "number": record["number"], "next_window": window}
+
+
+def _ends_in_words(low: int, high: int) -> str:
+    return f"{low} to {high}" if low < high else str(low)
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:

@@ -117,7 +117,6 @@ def object_data(record: Record) -> Data:
             for row in rows[:_DRAWN]
         ],
         "count": len(rows),
-        "listed_by_score": record.listed_by_score.tolist()[:_DRAWN],
         "confirmable": record.confirmable,
         "turns": record.how == "head",
         "best": None if record.best_place is None else record.best_place[0].tolist(),

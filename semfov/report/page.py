@@ -82,7 +82,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     for number, episode in enumerate(episodes):
         if "looks" not in episode:
             fixations = [{**each, "view": numbers.get(each["view"])} for each in episode["fixations"]]
-            own = {key: value for key, value in episode.items() if key not in ("objects", "listed_by_score")}
+            own = {key: value for key, value in episode.items() if key != "objects"}
             own |= {"image": numbers.get(episode["image"]), "fixations": fixations, "article": f"objects-{number}"}
             read_by_script.append(own)
         else:
@@ -331,11 +331,9 @@ def _objects(data: Data, place: str) -> str:
     )
     label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {nearest}"
     table = f"<thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody>"
-    lower = ", ".join(str(order) for order, each in enumerate(data["listed_by_score"], 1) if each)
-    why = f"<p>Less probable, listed by the score in the whole picture: {lower}.</p>" if lower else ""
     return (
         f'<div class="wide" tabindex="0" role="region" aria-label="{label}"><table class="objects" '
-        f'aria-label="{label}">{table}</table></div>{why}{_left_out(count - len(rows), "object")}'
+        f'aria-label="{label}">{table}</table></div>{_left_out(count - len(rows), "object")}'
     )
 
 

@@ -34,7 +34,8 @@ def zoom_data(
     reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    reason = path.summary().removeprefix(path.describe()).removeprefix(".").strip()
+    place = path.best_place_in_words().capitalize()
+    reason = f"{path.why_it_ended()}{place and f' {place}.'}".strip()
     result = f"{path.objects_in_words()}."
     if path.decision is not None:
         what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"

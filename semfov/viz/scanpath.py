@@ -66,13 +66,12 @@ def _draw_objects(
     many = len(rows) > _NAMED
     single = many and record.target is not None
     # The most confident objects are drawn last, over the others.
-    lower = record.listed_by_score.tolist()
     for row in reversed(rows):
         colour, line = (FOUND, 2.0) if row["confirmed"] else (TARGET, 0.8 if many else 1.2)
         text = f"{row['score']:.2f}" if single else f"{row['class']} {row['score']:.2f}"
         for turn in (0, width) if row["x2"] > width else (0,):
             box = row["x1"] - turn, row["y1"], row["x2"] - turn, row["y2"]
-            drawn += draw_boxes(axes, Tensor([box]), colour, "--" if lower[row["object"]] else "-", line)
+            drawn += draw_boxes(axes, Tensor([box]), colour, "-", line)
             tags.append((box, text, colour))
     if record.best_place is not None and last >= len(record) - 1:
         best, chance = record.best_place
@@ -163,8 +162,6 @@ def plot_scanpath(
     if objects and others:
         rest = "not confirmed: " if count or scanpath.decision is not None else ""
         entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
-    if objects and (lower := int(scanpath.listed_by_score.sum())):
-        entries.append((TARGET, "--", f"of them by score alone ({lower})"))
     best = scanpath.best_place
     if objects and best is not None:
         entries.append((FOUND, "--", "best place, not sure enough"))

@@ -90,6 +90,19 @@ def reacts(chances: Tensor) -> bool:
     return len(sure) >= _SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
 
 
+def number_of_faint(chances: Tensor) -> tuple[float, float]:
+    r"""Mean and variance of the number of objects in a photograph where the detector hardly reacts to their class.
+
+    Of them it misses as many as it shows: in 71 photographs of the fit in which it hardly reacts to people, the
+    probabilities have a sum of 150, and there are 279 people. Two of the errors hold the true number in nine of ten:
+
+    .. math:: E = 2 \sum_i p_i, \qquad \sigma^2 = \sum_i p_i (1 - p_i) + (1 + E / 2)^2
+    """
+    each = chances.double()
+    mean = 2 * float(each.sum())
+    return mean, float((each * (1 - each)).sum()) + (1 + mean / 2) ** 2
+
+
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
     r"""Mean and variance of the number of objects with probabilities `(M,)`, and of those that no look has shown.
 

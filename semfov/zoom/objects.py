@@ -11,7 +11,6 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, intersection, merge_looks, neighbours, unlike
-from semfov.observation.matching import box_iou
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
@@ -20,7 +19,6 @@ _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
 
 _SAME = 0.5
-_ALIKE = 0.6  # overlap from which on a more probable box stands for one that a look at the whole shows
 
 _LEAST, _MOST = 0.01, 0.999
 _SMALLEST = 6.0  # side in canvas pixels from which on a look should show an object
@@ -121,20 +119,6 @@ def probable_objects(
     before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
-
-
-def shown(
-    objects: Objects, glances: Sequence[Glance], target: int | Sequence[int] | None, score: float, *, shares: bool
-) -> Tensor:
-    """Which objects `(M,)` looks show with a score: for each box the most probable one it fits, or the best fit."""
-    counts = torch.zeros(len(objects), dtype=torch.bool)
-    if len(objects) and glances:
-        boxes, scores, labels, *_ = _detected(glances, target, shares=shares)
-        sure = scores >= score
-        overlap = box_iou(objects.boxes, boxes[sure].to(objects.boxes)) * (objects.labels[:, None] == labels[sure])
-        best, place = torch.where(overlap >= _ALIKE, 1 + objects.scores[:, None], overlap).max(0)
-        counts[place[best >= _SAME]] = True
-    return counts
 
 
 def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:

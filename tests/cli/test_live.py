@@ -122,7 +122,7 @@ def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):
     _, printed = run("live", path, "--find", "red,green", "--out", tmp_path / "out")
     lines = printed.out.splitlines()
     assert lines[0] == "large.avi: finding all “red”, “green”"
-    assert re.match(r"     0  at \(\d+, \d+\) × 0\.\d\d: .* \d × red, 0 × green from score 0\.3", lines[1])
+    assert re.match(r"     0  at \(\d+, \d+\) × 0\.\d\d: .* (\d|No) reds?, no green found", lines[1])
     assert [film.shape for film in read(tmp_path / "out" / f"live{video_suffix()}")] == [(768, 1024, 3)] * 4
     _, printed = run("live", path, "--target", "red", "--frames", 1)
     assert re.search(r"0  at .* red: (found|undecided), p 0\.\d\d", printed.out)

@@ -291,7 +291,7 @@ def test_search_with_annotated_boxes_makes_no_decision(image):
 def test_exploration_makes_no_decision(image):
     scanpath = agent(Scripted((cells(), 0.5))).explore(image, start=0, shifts=1)
     assert scanpath.decision is None
-    assert scanpath.describe() == "explored with 1 gaze shift: 1 object from score 0.3"
+    assert scanpath.describe() == "explored with 1 gaze shift: 1 object found"
 
 
 def test_without_thresholds_a_detection_confirms_the_target(image):

@@ -16,11 +16,9 @@ from semfov.paths.look import detections_in_words
 from semfov.report.episode import episode_data
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, Window
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
-HARDLY = "so no number in all is given"
 LEFT, RIGHT = [10.0, 10, 30, 30], [50.0, 40, 70, 55]
 
 
@@ -136,9 +134,9 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
     assert set(path.expected) == {"cat", "cup"}
     assert all(isnan(each) for each in (*path.expected.values(), *path.expected_error.values()))
     assert path.to_dict()["expected"] == path.to_dict()["expected_error"] == {"cat": None, "cup": None}
-    assert replace(path, least=0.5).describe().endswith(": 1 object from score 0.5")
+    assert replace(path, least=0.5).describe().endswith(": 1 object found")
     assert list(replace(path, target=1).expected) == ["cup"]
-    assert replace(path, targets=(1, 2)).objects_in_words() == "1 × cup, 1 × cat from score 0.3"
+    assert replace(path, targets=(1, 2)).objects_in_words() == "1 cup, 1 cat found"
     rows = path.object_rows()
     json.dumps(rows)
     assert rows[0]["class"] == "cat"
@@ -151,46 +149,47 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
 @pytest.mark.parametrize(
     ("chances", "unseen", "words"),
     [
-        (
-            [0.9, 0.9, 0.9, 0.2],
-            (1.5, 0.25),
-            "3 × cup from probability or score 0.5 (about 4 ± 2 that this detector can show)",
-        ),
-        (
-            [0.9, 0.9, 0.9, 0.3],
-            (0.0, 0.0),
-            "3 × cup from probability or score 0.5 (about 3 ± 1 that this detector can show)",
-        ),
-        (
-            [0.9, *[0.3] * 9],
-            (0.0, 0.0),
-            f"1 × cup from probability or score 0.5 (beside many faint candidates, {HARDLY})",
-        ),
-        ([0.9, 0.1], (0.0, 0.0), "1 × cup from probability or score 0.5"),
-        (
-            [*[0.6] * 5, *[0.4] * 20],
-            (0, 0),
-            "5 × cup from probability or score 0.5 (about 11 ± 4 that this detector can show)",
-        ),
-        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
-        ([0.7, 0.7, 0.6, 0.2], (0.1, 0.1), "3 × cup from probability or score 0.5 (about 2 ± 1 of them right)"),
-        (
-            [0.2],
-            (0.0, 0.0),
-            f"0 × cup from probability or score 0.5 (the detector hardly reacts, {HARDLY})",
-        ),
+        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 cups found; expect 3 to 6 in all"),  # 4.4 ± 1.5
+        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 cups found; expect 3 to 4 in all"),  # 3.0 ± 1.1
+        ([*[0.9] * 2, *[0.7] * 2], (8.0, 0.0), "4 cups found; expect 8 to 15 in all"),  # 11.2 ± 3.5
+        ([0.9, *[0.3] * 9], (0.0, 0.0), "1 cup found"),
+        ([0.9, 0.1], (0.0, 0.0), "1 cup found; expect 1 to 2 in all"),
+        ([*[0.6] * 5, *[0.4] * 20], (0, 0), "5 cups found; expect 7 to 15 in all"),  # 11 ± 4.0
+        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 cups found; expect 2 to 4 in all"),  # 2.4 ± 1.2
+        ([0.2], (0.0, 0.0), "No cup found"),
     ],
 )
-def test_the_expected_number_never_contradicts_the_number_that_is_shown(chances, unseen, words):
-    """Where fewer are expected in all than are shown, it is told how many of those that are shown are right."""
+def test_the_number_in_all_starts_with_the_objects_that_are_listed(chances, unseen, words):
+    """Unless fewer are expected. Where the detector shows faint candidates alone, a large picture has no number."""
     count = len(chances)
     found = Objects(torch.rand(count, 4), torch.tensor(chances), torch.ones(count).long(), torch.zeros(count).long())
     lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"glances": (), "values": (), "least": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
-    assert path.describe() == f"{words} in 0 passes"
+    assert path.describe() == f"{words}. 0 looks"
     values = path.to_dict()
     numbers = values["expected"]["cup"], values["expected_error"]["cup"]
-    assert numbers == ((None, None) if HARDLY in words else (path.expected["cup"], path.expected_error["cup"]))
+    given = "expect" in words
+    assert numbers == (
+        pytest.approx((path.expected["cup"], path.expected_error["cup"]), abs=1e-4) if given else (None, None)
+    )
+
+
+def test_a_photograph_has_a_number_where_the_detector_hardly_reacts(tmp_path):
+    """Of nothing none is expected, with an error of one; of faint candidates twice their sum."""
+    lattice, empty = Lattice.over((640, 480), (416, 416)), torch.zeros(0).long()
+    assert lattice.levels == 1
+    nothing = Objects(torch.zeros(0, 4), torch.zeros(0), empty, empty)
+    parts = {"glances": (), "values": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
+    path = ZoomPath(lattice=lattice, target=None, targets=(1, 2), candidates=nothing, **parts)
+    assert path.expected == {"cup": 0, "cat": 0}
+    assert path.expected_error == {"cup": 1, "cat": 1}
+    assert path.describe() == "No cup, no cat found. 0 looks"
+    faint = Objects(torch.rand(4, 4), torch.full((4,), 0.3), torch.ones(4).long(), torch.zeros(4).long())
+    path = replace(path, candidates=faint)
+    assert path.expected["cup"] == pytest.approx(2.4)
+    assert path.expected_error["cup"] == pytest.approx((4 * 0.21 + 2.2**2) ** 0.5)
+    assert path.describe() == "No cup, no cat found; expect 0 to 5 cups in all. 0 looks"
+    assert isnan(replace(path, targets=()).expected["cup"])  # which nobody asked for
 
 
 def test_a_number_is_claimed_class_by_class():
@@ -205,45 +204,17 @@ def test_a_number_is_claimed_class_by_class():
     error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
     assert path.expected_error["cup"] == pytest.approx(error**0.5)
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
-    number = "(about 2 ± 1 that this detector can show; for cat no number is given)"
-    assert path.objects_in_words() == f"2 × cup, 0 × cat from probability or score 0.5 {number}"
+    assert path.objects_in_words() == "2 cups, no cat found; expect 2 to 3 cups in all"
     every = replace(path, targets=())
     # Of all classes only those are counted of which something is listed.
-    assert every.classes_in_words() == "2 × cup (about 2 ± 1 that this detector can show)"
-    faint = replace(every, least=0.1).classes_in_words()
-    assert faint == "3 × cat, 2 × cup (about 2 ± 1 that this detector can show)"
-    assert replace(every, unseen=None).classes_in_words() == "2 × cup"
+    assert every.classes_in_words() == "2 cups (2 to 3 in all)"
+    assert replace(every, least=0.1).classes_in_words() == "3 cats, 2 cups (2 to 3 in all)"
+    assert replace(every, unseen=None).classes_in_words() == "2 cups"
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])
     values = path.to_dict()
     assert (values["expected"]["cat"], values["expected_error"]["cat"]) == (None, None)
     json.dumps(values, allow_nan=False)
-
-
-def test_objects_that_a_look_at_the_whole_picture_shows_count_too():
-    """From the same number on: the most probable candidate of its class that is alike. In a search none."""
-    lattice = Lattice.over((80, 60), (80, 60))
-    seen = look((LEFT, 1, 0.6), (RIGHT, 2, 0.7), (shifted(RIGHT, 12), 2, 0.9))
-    glances = tuple(
-        Glance(window, seen, torch.zeros(3).bool(), torch.zeros(2), None)
-        for window in (Window.overview(lattice), Window.around(lattice, (0.0, 0.0, 60.0, 60.0)))
-    )
-    # With the box of the whole picture the first one shares 0.57 of their union, the second one 0.9.
-    boxes = torch.tensor([shifted(LEFT, 3), shifted(LEFT, -1), RIGHT, RIGHT, LEFT])
-    labels, looks = torch.tensor([1, 1, 1, 2, 1]), torch.zeros(5).long()
-    candidates = Objects(boxes, torch.tensor([0.45, 0.4, 0.3, 0.2, 0.1]), labels, looks)
-    parts = {"classes": CLASSES, "values": (0.0,), "unseen": (0.0, 0.0), "least": 0.5}
-    path = ZoomPath(lattice=lattice, target=None, glances=glances[:1], candidates=candidates, **parts)
-    assert path.objects.scores.tolist() == pytest.approx([0.4, 0.2])
-    assert path.listed_by_score.all()
-    assert len(replace(path, least=0.65).objects) == 1
-    apart = replace(path, candidates=candidates[torch.tensor([0, 3])])
-    assert apart.objects.scores.tolist() == pytest.approx([0.45, 0.2])
-    sure = replace(path, candidates=replace(candidates, scores=torch.tensor([0.45, 0.9, 0.3, 0.2, 0.1])))
-    assert sure.objects.scores.tolist() == pytest.approx([0.9, 0.2])
-    assert len(replace(path, glances=glances[1:]).objects) == 0
-    searched = replace(path, target=1, decision=Decision("absent", 0.1, None, None))
-    assert len(searched.objects) == 0
 
 
 def test_looks_are_given_one_by_one():

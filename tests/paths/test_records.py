@@ -139,9 +139,9 @@ WORDS = {
         "“cup” found after 2 gaze shifts and 1 closer look (probability 0.90, 0.80 at this place)",
         "A closer look confirmed the target.",
     ),
-    "zoom_path": ("cup: found (there with probability 0.90) in 3 passes", "A closer look confirmed the target."),
+    "zoom_path": ("cup: found (there with probability 0.90) in 3 looks", "A closer look confirmed the target."),
     "head_path": (
-        "3 × cat from score 0.3 in 1.2 s of eye and head: 3 looks, 1 turn of the head",
+        "3 cats found in 1.2 s of eye and head: 3 looks, 1 turn of the head",
         "All 3 passes were used.",
     ),
     "moment": ("cup: undecided, p 0.25", None),

@@ -102,23 +102,6 @@ def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_p
     assert ("confirmed ones green" in path._repr_html_()) == sought
 
 
-def test_an_object_that_counts_by_its_score_in_the_whole_picture_is_told_from_the_others(zoom_path, large_picture):
-    """The look at the whole shows the one of probability 0.4 with a score of 0.5, and another window the other one."""
-    window, whole = zoom_path.candidates.boxes.flip(0), zoom_path.glances[0].detections.scores[0, 0, 2]
-    candidates = replace(zoom_path.candidates, boxes=window)
-    found = {"candidates": candidates, "decision": None, "unseen": (0.0, 0.0), "least": float(whole)}
-    path = replace(zoom_path, classes=("background", "cat", "dog", "cup"), **found)
-    assert path.listed_by_score.tolist() == [False, True]
-    assert not replace(path, least=0.4).listed_by_score.any()
-    assert re.search(r"dog 0\.80 at \(\d+, \d+\), dog 0\.40 at \(\d+, \d+\) \(by score alone\)", repr(path))
-    page = page_html("field", [zoom_data(path, large_picture, name="field")])
-    assert "Less probable, listed by the score in the whole picture: 2." in page
-    (axes,) = path.plot(image=large_picture).axes
-    dashed = [patch.get_bbox().extents.tolist() for patch in axes.patches if patch.get_linestyle() == "--"]
-    assert dashed == [window[1].tolist()]
-    assert "of them by score alone (1)" in [text.get_text() for text in axes.get_legend().get_texts()]
-
-
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
     looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
     assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]
@@ -183,9 +166,9 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
         (Decision("undecided", 0.2), "windows", "0.20. No window is left that can show more.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
         (Decision("found", 0.7), "detection", "“cat” found, best score: 0.70. A detection shows the target.$"),
-        (None, "passes", "^0 × cat from score 0.3. All 3 passes were used.$"),
-        (None, "worth", "^0 × cat from score 0.3. No remaining look is expected to show enough new objects.$"),
-        (None, None, "^0 × cat from score 0.3.$"),
+        (None, "passes", "^No cat found. All 3 passes were used.$"),
+        (None, "worth", "^No cat found. No remaining look is expected to show enough new objects.$"),
+        (None, None, "^No cat found.$"),
     ],
 )
 def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, ending, told):

@@ -76,7 +76,7 @@ def test_scanpath_shows_numbered_fixations(scanpath, image):
     assert len(bare.axes[0].texts) == 3
     assert axes.get_title() == "“cup” found after 2 gaze shifts"
     explored = draw(plot_scanpath(replace(scanpath, target=None, found=False), image))
-    assert explored.axes[0].get_title() == "explored with 2 gaze shifts: 2 objects from score 0.3"
+    assert explored.axes[0].get_title() == "explored with 2 gaze shifts: 2 objects found"
 
 
 def test_belief_is_laid_over_a_grey_photograph(scanpath, image):

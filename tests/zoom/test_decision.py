@@ -409,7 +409,7 @@ def path(detector, picture):
 
 def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     assert path.least == 0.5
-    assert (path.objects.scores >= 0.5).all()  # the overview shows none with such a score
+    assert (path.objects.scores >= 0.5).all()
     assert path.unseen[0] > 0
     assert path.spread == SPREAD
     chances = path.candidates.scores.double()
@@ -417,7 +417,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
     variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
-    assert path.describe() == "1 object from probability or score 0.5 in 4 passes"
+    assert path.describe() == "1 object found. 4 looks"
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
