@@ -139,10 +139,7 @@ class HeadPath(Record):
         points = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2) - 0.5
         places = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
         angles = world.angles_of(places).tolist()
-        return [
-            row | dict(zip(("pan", "tilt"), map(pixels, each), strict=True))
-            for row, each in zip(rows, angles, strict=True)
-        ]
+        return [row | {"pan": pixels(pan), "tilt": pixels(tilt)} for row, (pan, tilt) in zip(rows, angles, strict=True)]
 
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.

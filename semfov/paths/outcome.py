@@ -188,8 +188,8 @@ class Outcome(ABC):
 
         It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
         each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
-        or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is not known in a
-        large picture, and in a photograph it is twice the sum (`semfov.zoom.certainty.number_of_faint`).
+        or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is twice the sum
+        (`semfov.zoom.certainty.number_of_faint`), and not known in a large picture in which no other class is clear.
         """
         return NumberByClass({name: mean for name, (mean, _) in self._claimed().items()})
 

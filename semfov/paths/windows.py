@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -15,10 +16,11 @@ from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
-from semfov.zoom.certainty import SPREAD, number_of, number_of_faint, reacts
+from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
 from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge
 
 _WINDOW_VALUES = {
     "fixation": Array((Number(), Number(), POSITIVE)),
@@ -33,6 +35,7 @@ _LATTICE = {
     "canvas": Array(Number(low=1, whole=True), 2),
     "magnifications": Array(POSITIVE, least=1, ascending=True),
 }
+_CLEAR = 0.7  # score from which on an object of any class is clear
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
 _TENSORS = {
@@ -141,12 +144,11 @@ class ZoomPath(Record):
     def _numbers(self) -> dict[int, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where none is estimated.
 
-        Where the detector hardly reacts to a class, photographs are like those of the fit, of which it is known how
-        many objects it misses. Nothing is known of large pictures: of airports from above it shows no airplane.
+        Where the detector hardly reacts to a class, one is estimated in pictures that are like those of the fit alone.
         """
         more, spread = self.unseen or (0.0, 0.0)
         sought = self._sought or tuple(self.candidates.labels.unique().tolist())
-        counted = {*self._sought, *self.objects.labels.tolist()} if self.lattice.levels == 1 else {}
+        counted = {*self._sought, *self.objects.labels.tolist()} if self._familiar else set[int]()
         chances = {label: self.candidates.of([label]).scores for label in sought}
         sums = {label: float(each.double().sum()) + 1e-9 for label, each in chances.items()}
         numbers = {}
@@ -157,6 +159,15 @@ class ZoomPath(Record):
             else:
                 numbers[label] = number_of_faint(each) if label in counted else (math.nan, math.nan)
         return numbers
+
+    @cached_property
+    def _familiar(self) -> bool:
+        """Whether the picture is like those of the fit: a photograph, or one in which objects of any class are clear.
+
+        In 12 pictures of airports from above, of whose airplanes the detector shows next to nothing, at most three
+        objects of any class have the score `_CLEAR`; in sheets of photographs and in frames of a street nine or more.
+        """
+        return self.lattice.levels == 1 or len(merge(self.glances, score=_CLEAR)) >= SEVERAL
 
     @property
     def size(self) -> tuple[int, int]:

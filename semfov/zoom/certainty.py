@@ -29,8 +29,10 @@ FACTS = (
 
 SPREAD = 0.3  # the spread of a certainty (`Certainty`) for which none was fitted
 
-_SURE, _SEVERAL, _PART = 0.5, 5, 0.6
-"""Probability, number and share of the objects to which a detector reacts (`reacts`)."""
+SEVERAL = 5  # the number of likely or clear objects from which on a detector reacts
+
+_SURE, _PART = 0.5, 0.6
+"""Probability and share of the objects to which a detector reacts (`reacts`)."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +89,14 @@ class Certainty:
 def reacts(chances: Tensor) -> bool:
     """Whether a detector reacts to objects of these probabilities `(M,)`: several are likely, or most of their sum."""
     sure = chances[chances >= _SURE]
-    return len(sure) >= _SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
+    return len(sure) >= SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
 
 
 def number_of_faint(chances: Tensor) -> tuple[float, float]:
-    r"""Mean and variance of the number of objects in a photograph where the detector hardly reacts to their class.
+    r"""Mean and variance of the number of objects of a class to which the detector hardly reacts.
 
-    Of them it misses as many as it shows: in 71 photographs of the fit in which it hardly reacts to people, the
-    probabilities have a sum of 150, and there are 279 people. Two of the errors hold the true number in nine of ten:
+    It misses as many as it shows: in 71 photographs of the fit in which it hardly reacts to people, the probabilities
+    have a sum of 150, and there are 279 people. In nine of ten the true number is within two of the errors:
 
     .. math:: E = 2 \sum_i p_i, \qquad \sigma^2 = \sum_i p_i (1 - p_i) + (1 + E / 2)^2
     """
