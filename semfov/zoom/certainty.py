@@ -96,13 +96,13 @@ def number_of_faint(chances: Tensor) -> tuple[float, float]:
     r"""Mean and variance of the number of objects of a class to which the detector hardly reacts.
 
     It misses as many as it shows: in 71 photographs of the fit in which it hardly reacts to people, the probabilities
-    have a sum of 150, and there are 279 people. In nine of ten the true number is within two of the errors:
+    have a sum of 150, and there are 279 people. In 68 of them the true number is within two of the errors:
 
-    .. math:: E = 2 \sum_i p_i, \qquad \sigma^2 = \sum_i p_i (1 - p_i) + (1 + E / 2)^2
+    .. math:: E = 2 \sum_i p_i, \qquad \sigma^2 = \sum_i p_i (1 - p_i) + (1 + E)^2
     """
     each = chances.double()
     mean = 2 * float(each.sum())
-    return mean, float((each * (1 - each)).sum()) + (1 + mean / 2) ** 2
+    return mean, float((each * (1 - each)).sum()) + (1 + mean) ** 2
 
 
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:

@@ -186,8 +186,8 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     faint = Objects(torch.rand(4, 4), torch.full((4,), 0.3), torch.ones(4).long(), torch.zeros(4).long())
     path = replace(path, candidates=faint)
     assert path.expected["cup"] == pytest.approx(2.4)
-    assert path.expected_error["cup"] == pytest.approx((4 * 0.21 + 2.2**2) ** 0.5)
-    assert path.describe() == "No cup, no cat found; expect 0 to 5 cups in all. 0 looks"
+    assert path.expected_error["cup"] == pytest.approx((4 * 0.21 + 3.4**2) ** 0.5)
+    assert path.describe() == "No cup, no cat found; expect 0 to 6 cups in all. 0 looks"
     assert isnan(replace(path, targets=()).expected["cup"])  # which nobody asked for
 
 
