@@ -619,7 +619,7 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     assert [int(edge) for edge in place.groups()] == pytest.approx([1000, 700, 1040, 740], abs=8)
     assert "3 looks (the limit) in" in printed.out
     _, printed = run("explore", large, "--worth", 1000)
-    assert "1 pass in" in printed.out
+    assert "1 look in" in printed.out
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):

@@ -236,9 +236,9 @@ def test_coco_results_are_read_by_pycocotools(category, count):
     assert judge.stats[0] == pytest.approx(1)
     for row, each in enumerate(read.loadAnns(read.getAnnIds())):
         x, y, width, height = each["bbox"]
-        torch.testing.assert_close(torch.tensor([x, y, x + width, y + height]), seen.boxes[0, row])
+        torch.testing.assert_close(torch.tensor([x, y, x + width, y + height]), seen.boxes[0, row], rtol=0, atol=0.011)
         assert each["category_id"] == category[int(seen.labels[0, row]) - 1]
-        assert each["score"] == pytest.approx(float(seen.confidence[0, row]))
+        assert each["score"] == pytest.approx(float(seen.confidence[0, row]), rel=1e-3)
 
 
 def test_category_names_may_be_spelled_differently():

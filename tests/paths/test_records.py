@@ -346,7 +346,7 @@ def test_rows_and_fixations_match_the_looks(make):
     assert [row["detections"] for row in rows] == [0, 1, 2]
     assert [row["seen"] for row in rows] == [None, *(CLASSES[int(d.labels[0, 0])] for d in record.detections[1:])]
     fixations = record.as_fixations("a.jpg")
-    assert fixations.points.tolist() == [[row["x"], row["y"]] for row in rows]
+    assert fixations.points == pytest.approx(np.array([[row["x"], row["y"]] for row in rows]), abs=0.005)
     assert (fixations.target, fixations.found) == (record.target_name, record.found)
 
 
@@ -526,8 +526,8 @@ def test_objects_of_a_head_have_the_directions_to_turn_to():
     width, height = record.size
     for row in record.object_rows():
         pan, tilt = 360 * row["x"] / width - 180, 90 - 180 * row["y"] / height
-        assert (row["pan"] - pan) % 360 == pytest.approx(0, abs=1e-3) or (row["pan"] - pan) % 360 > 360 - 1e-3
-        assert row["tilt"] == pytest.approx(tilt, abs=1e-3)
+        assert (row["pan"] - pan) % 360 == pytest.approx(0, abs=0.02) or (row["pan"] - pan) % 360 > 360 - 0.02
+        assert row["tilt"] == pytest.approx(tilt, abs=0.02)
     flat = head_path(Flat(torch.rand(3, 48, 64), (40, 30), degree=1.0, fields=(30.0,)))
     for row in flat.object_rows():
-        assert (row["pan"], row["tilt"]) == pytest.approx((row["x"] - 32, 24 - row["y"]), abs=1e-4)
+        assert (row["pan"], row["tilt"]) == pytest.approx((row["x"] - 32, 24 - row["y"]), abs=0.01)

@@ -79,9 +79,9 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
 
 
 def test_numbers_are_rounded_once(zoom_path, large_picture):
-    """As the command rounds them; 0.635 and 61.5 would become 0.64 and 62."""
+    """As the command rounds them; rows have 0.6346, and 0.635 and 61.5 would become 0.64 and 62."""
     boxes = zoom_path.candidates.boxes + torch.tensor([0.0, 0.0, 0.46, 0.0])
-    candidates = replace(zoom_path.candidates, boxes=boxes, scores=torch.tensor([0.63499, 0.4]))
+    candidates = replace(zoom_path.candidates, boxes=boxes, scores=torch.tensor([0.63461, 0.4]))
     page = page_html(
         "field", [zoom_data(replace(zoom_path, candidates=candidates, decision=None), large_picture, name="")]
     )
