@@ -122,7 +122,8 @@ class _PictureJob(ABC):
                 options: PictureOptions = self.options
                 picture = source.opened(options.how)
                 if self.truth is not None:
-                    self.truth.image_id(source.name, picture_size(source.opened("auto")))
+                    stored: Any = source.opened("auto")
+                    self.truth.image_id(source.name, picture_size(stored))
                 how: How = "auto" if isinstance(picture, World) else options.how
                 shared: dict[str, Any] = {"how": how, "passes": options.passes, "seconds": options.seconds}
                 shared |= {"shifts": options.shifts, "duration": options.duration}

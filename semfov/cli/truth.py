@@ -80,7 +80,7 @@ class Truth:
         counts = f"({len(images)} pictures, {len(results)} boxes)"
         if precision is None:
             return f"no AP: {self.path} has no boxes of these classes in these pictures {counts}"
-        return "AP {:.3f}, AP50 {:.3f} against {} {}".format(*precision, self.path, counts)
+        return f"AP {precision[0]:.3f}, AP50 {precision[1]:.3f} against {self.path} {counts}"
 
 
 def _parts(name: str) -> tuple[str, ...]:
