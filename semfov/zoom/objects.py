@@ -35,8 +35,8 @@ def merge(
 ) -> Objects:
     """Merge the detections of several looks at windows into one box for each object.
 
-    The rule is that of `semfov.detection.objects.merge_looks`; the look with the higher magnification is the sharper
-    one.
+    The boxes are those of `semfov.detection.objects.merge_looks`; the look with the higher magnification is the sharper
+    one. The score of an object is the highest that any look shows it with, as where slices are merged by suppression.
 
     Args:
         glances: looks at one picture.
@@ -59,7 +59,25 @@ def merge(
     """
     if not glances:
         return Objects.none()
-    return merge_looks(*_detected(glances, target, shares=False), score=score, iou=iou, inside=inside)
+    every = _detected(glances, target, shares=False)
+    objects = merge_looks(*every, score=score, iou=iou, inside=inside)
+    boxes, scores, labels, *_ = every
+    highest = _highest_scores(objects, boxes, scores, labels, iou)
+    return replace(objects, scores=highest)[highest.argsort(descending=True, stable=True)]
+
+
+def _highest_scores(objects: Objects, boxes: Tensor, scores: Tensor, labels: Tensor, iou: float) -> Tensor:
+    """The highest score of a box of the same class that overlaps each object enough; boxes `(L, 4)` → `(M,)`."""
+    count = len(objects)
+    corners = torch.cat([objects.boxes, boxes.to(objects.boxes)]).float().numpy()
+    object_, box, shared, area = _overlapping(corners)
+    pairs = (object_ < count) & (box >= count)
+    object_, box, shared = object_[pairs], box[pairs], shared[pairs]
+    union = area[object_] + area[box] - shared
+    same = (shared >= iou * union) & (objects.labels.numpy()[object_] == labels.numpy()[box - count])
+    highest = objects.scores.numpy().copy()
+    np.maximum.at(highest, object_[same], scores.numpy()[box[same] - count])
+    return torch.from_numpy(highest)
 
 
 def merge_with_facts(

@@ -143,6 +143,23 @@ def test_merging_keeps_small_objects_in_front_of_large_ones():
     assert len(merge([])) == 0
 
 
+def test_the_score_of_an_object_is_the_highest_of_its_looks():
+    """As where slices are merged by suppression; its box is that of the sharpest look."""
+
+    def look(magnification, box, score):
+        vector = torch.tensor([[[1 - score, score, 0.0]]])
+        seen = Detections(torch.tensor([[box]]), vector, torch.ones(1, 1).bool())
+        return Glance(
+            Window((50.0, 50.0, magnification), 0, (0, 0, 8, 8)), seen, torch.zeros(1).bool(), torch.zeros(2), None
+        )
+
+    whole, closer = look(0.2, [10.0, 10, 50, 50], 0.75), look(0.8, [11.0, 12, 51, 50], 0.5)
+    elsewhere = look(0.8, [70.0, 10, 90, 50], 0.625)
+    objects = merge([whole, closer, elsewhere])
+    assert objects.scores.tolist() == [0.75, 0.625]
+    assert objects.boxes.tolist() == [[11.0, 12, 51, 50], [70.0, 10, 90, 50]]
+
+
 def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     found = {}
     for cut in ("keep", "drop", "background"):
