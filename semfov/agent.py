@@ -18,6 +18,7 @@ from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.prior import check_prior
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
@@ -310,6 +311,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int | None = None,
+        prior: float | None = None,
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
@@ -352,6 +354,8 @@ class ActivePerception(nn.Module):
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
             closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 3 in a photograph,
                 all that there are passes for in a large picture, 2 for a fovea. 0, and no verification, make none.
+            prior: how often the target is there: the share of the pictures that you search, such as 0.15. None assumes
+                half of them. The probabilities of the decision, which thresholds are compared with, depend on it.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
             bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
@@ -365,6 +369,7 @@ class ActivePerception(nn.Module):
         """
         check_order(picture, target, self.classes[1:])
         check_thresholds(confirm, give_up, closer)
+        check_prior(prior)
         # Class numbers may be those of NumPy or a tensor, which have no length.
         targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
         foveal = start is not None or boxes is not None
@@ -378,11 +383,12 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
             settings: dict[str, Any] = {"start": start, "seed": seed, "boxes": boxes, "confirm": confirm}
-            settings |= {"give_up": give_up, "shifts": shifts, "closer": MOST_CLOSER if closer is None else closer}
-            return self.fovea.search(image, target, bounds, **settings)
+            settings |= {"give_up": give_up, "shifts": shifts, "prior": prior}
+            most = MOST_CLOSER if closer is None else closer
+            return self.fovea.search(image, target, bounds, closer=most, **settings)
         check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
               target)  # fmt: skip
-        arguments = without_none(confirm=confirm, give_up=give_up, **limits)
+        arguments = without_none(confirm=confirm, give_up=give_up, prior=prior, **limits)
         if kind == "head":
             only_for(kind, "fovea", "confirm", closer=closer)
             arguments |= without_none(start=start, duration=duration)
@@ -561,6 +567,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int | None = None,
+        prior: float | None = None,
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
@@ -578,6 +585,7 @@ class ActivePerception(nn.Module):
             give_up: probability below which a look is not worth a frame; None takes that of the belief alone, as a
                 belief that fades can reach it, or with rate 0 that of `search`.
             closer: largest number of closer looks, 0 to 100, in ln 2 / rate frames; None takes that of `search`.
+            prior: how often the target is there, as a share of frames; None assumes half of them.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.
 
@@ -590,9 +598,10 @@ class ActivePerception(nn.Module):
         numbers, one = class_numbers(target, self.classes[1:], "target"), not isinstance(target, list | tuple)
         check_thresholds(confirm, give_up, closer)
         sought, found = numbers[0] if numbers and one else None, () if one else numbers
-        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer, "color": color}
+        check(prior is None or (one and len(numbers) > 0), "prior", "None without one class to search for", prior)
+        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer, "prior": prior}
         settings |= {"how": lookup(how, get_args(How), "kind of look"), "rate": rate, "start": start, "seed": seed}
-        return LivePerception(self.fovea, self.zoom, sought, found, white=white, **settings)
+        return LivePerception(self.fovea, self.zoom, sought, found, white=white, color=color, **settings)
 
     def _open(
         self, picture: PictureLike, how: How, shifts: int | None, duration: float | None, *given: Any, **wanted: bool

@@ -33,7 +33,7 @@ class LivePerception:
         start: first cell of a fovea; None draws one at random.
         seed: seed of the generator that draws the start and breaks ties.
         white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
-        **settings: `confirm`, `give_up`, `closer` and `color`, as for `ActivePerception.live`.
+        **settings: `confirm`, `give_up`, `closer`, `prior` and `color`, as for `ActivePerception.live`.
 
     Attributes:
         how: the kind of look; `auto` before the first frame.
@@ -75,9 +75,15 @@ class LivePerception:
         self._photographs = start is None and evidence is not None and evidence.photograph is not None
         lookup(settings.get("color", "rgb"), get_args(Color), "order of channels")
         given, (slow, fast) = without_none(**settings), (_WINDOW_RATE, _FOVEA_RATE) if rate is None else (rate, rate)
+        by_kind = {"fovea": given, "windows": given}
+        without_prior = {name: value for name, value in given.items() if name != "prior"}
+        if self.how == "fovea":
+            by_kind["windows"] = without_prior
+        elif self.how == "windows" or self._photographs:  # a kind that is not used may know no prior
+            by_kind["fovea"] = without_prior
         self._episodes: dict[str, Episode[Any]] = {
-            "fovea": FoveaEpisode(fovea, target, rate=fast, start=start, seed=seed, **given),
-            "windows": windows.episode(target, targets, rate=slow, **given),
+            "fovea": FoveaEpisode(fovea, target, rate=fast, start=start, seed=seed, **by_kind["fovea"]),
+            "windows": windows.episode(target, targets, rate=slow, **by_kind["windows"]),
         }
         self._check_start()
 

@@ -6,8 +6,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import AnyOf, Observer
+from semfov.belief.observers import AnyOf, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.prior import Prior
 from semfov.data.classes import class_index
 from semfov.errors import check
 from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
@@ -28,6 +29,14 @@ class Strategy(nn.Module):
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
         return self.policy(target, grid)
+
+    def with_prior(self, share: float, target: int) -> tuple["Strategy", Prior]:
+        """Search for a class 1..K that is there in this share of searches."""
+        observer = self.observer
+        check(not isinstance(observer, AnyOf), "prior", "None for a search for any of several classes", share)
+        prior = Prior.of(share, observer.model.shares if isinstance(observer, Target) else None, target)
+        assert isinstance(observer, Target)
+        return Strategy(Target(observer.model, together=observer.together, prior=prior), self.policy), prior
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
         """Prepare the search for a target."""

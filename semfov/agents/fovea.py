@@ -15,6 +15,7 @@ from semfov.agents.episode import Episode, EpisodeLimits, on_cpu
 from semfov.belief import Grid, Verification
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike, class_meant
+from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import (
     MOST_CLOSER,
@@ -142,6 +143,7 @@ class FoveaEpisode(Episode[Scanpath]):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int = MOST_CLOSER,
+        prior: float | None = None,
         color: Color = "rgb",
         viewed: GazePrediction | None = None,
         cells: Sequence[int] | None = None,
@@ -150,6 +152,11 @@ class FoveaEpisode(Episode[Scanpath]):
         usual = agent.exploring if target is None else agent.searching
         self.agent, self.eye, self.color, self.viewed = agent, agent.eye, color, viewed
         chosen, mapper = usual if strategy is None else strategy, agent.exploring.observer
+        self._prior = Prior()
+        if prior is not None:
+            check(target is not None, "prior", "None without a target", prior)
+            assert target is not None
+            chosen, self._prior = chosen.with_prior(prior, target)
         # The belief of one episode is on the CPU, wherever the eye is.
         self.strategy = on_cpu(chosen)
         self._beside = None if mapper is chosen.observer else on_cpu(mapper)
@@ -203,7 +210,7 @@ class FoveaEpisode(Episode[Scanpath]):
             forgetting=self.forgetting,
         )
         if self.verification is not None and self.target is not None:
-            places = CandidateCells(grid, self.target, self.forgetting)
+            places = CandidateCells(grid, self.target, self.forgetting, self._prior)
             self._verifier = Verifier(self.verification, places, self._close_up, self.thresholds, self.closer)
             self.criterion = self._verifier.criterion
         elif self.forgetting is not None and self.target is not None and self.thresholds is not None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike
@@ -108,8 +109,9 @@ class HeadAgent(nn.Module):
         start: int | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
+        prior: float | None = None,
         foresight: float = FORESIGHT,
-        prior: float = PRIOR,
+        chance: float = PRIOR,
         seed: int = 0,
         color: Color = "rgb",
     ) -> HeadPath:
@@ -130,9 +132,10 @@ class HeadAgent(nn.Module):
             on_look: called after each look with the record so far; returning False ends the search.
             start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             confirm: probability at which the search ends as found; None takes 0.7.
-            give_up: probability below which a cell is not worth a look; None takes `prior`.
+            give_up: probability below which a cell is not worth a look; None takes that of a cell that was never seen.
+            prior: how often the target is there, as a share of the scenes that are searched; None: in half of them.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
-            prior: probability that a cell that was never seen holds the target.
+            chance: probability that a cell that was never seen holds the target, without a `prior`.
             seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
@@ -149,9 +152,12 @@ class HeadAgent(nn.Module):
         limits = EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
         views = self.views(scene, color)
         evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
-        gain, observer = SearchGain(views, foresight), SceneObserver(Target(evidence), views, prior=prior)
+        known = Prior.of(prior, evidence.shares, index)
+        never_seen = known(chance)
+        gain = SearchGain(views, foresight)
+        observer = SceneObserver(Target(evidence, prior=known), views, prior=never_seen)
         sure = _CONFIRM if confirm is None else confirm
-        thresholds = Thresholds(sure, prior if give_up is None else give_up, sure)
+        thresholds = Thresholds(sure, never_seen if give_up is None else give_up, sure)
         return _HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
+from semfov.belief.prior import Prior
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import open_large
@@ -106,6 +107,7 @@ class ZoomAgent(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int | None = None,
+        prior: float | None = None,
     ) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one (`WindowEpisode`).
 
@@ -125,6 +127,7 @@ class ZoomAgent(nn.Module):
                 the threshold of the evidence.
             closer: largest number of closer looks, 0 to 100; None takes 3 in a photograph, and in a larger picture as
                 many as there are passes for. 0 decides without them, as does evidence without fitted verification.
+            prior: how often the class is there, as a share of the pictures that are searched; None: in half of them.
 
         Returns:
             The looks, the objects of the class, and the decision.
@@ -137,7 +140,7 @@ class ZoomAgent(nn.Module):
         episode = self.episode(
             class_index(target, self.classes[1:], "target"),
             limits=EpisodeLimits(WindowEpisode.usual_passes if passes is None else passes, seconds, on_look),
-            confirm=confirm, give_up=give_up, closer=closer,
+            confirm=confirm, give_up=give_up, closer=closer, prior=prior,
         )  # fmt: skip
         return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
 
@@ -256,6 +259,7 @@ class WindowEpisode(Episode[ZoomPath]):
         confirm: float | None = None,
         give_up: float | None = None,
         closer: int | None = None,
+        prior: float | None = None,
         batch: int = 1,
         worth: float = _NEW_OBJECTS,
         least: float | None = None,
@@ -272,9 +276,10 @@ class WindowEpisode(Episode[ZoomPath]):
         if evidence is not None and target is not None:
             self._decisions = WindowDecisions(
                 evidence, target, self._close_up,
-                confirm=confirm, give_up=give_up, closer=closer, forgetting=self.forgetting,
+                confirm=confirm, give_up=give_up, closer=closer, forgetting=self.forgetting, prior=prior,
             )  # fmt: skip
         elif self.searches:
+            Prior.of(prior, None, 0)  # without evidence there is no probability
             self.criterion = f"a detection scores {self._confirm:g}"
         self._glances: Glances | None = None
         self._last: WindowStep[Any] | None = None

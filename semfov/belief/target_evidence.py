@@ -11,6 +11,7 @@ from torch import Tensor
 from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import LOOK_FEATURES, look_features
+from semfov.belief.prior import SHARES
 from semfov.detection.detections import Detections
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 
@@ -58,6 +59,7 @@ class TargetEvidence(Evidence):
         readout_width: hidden units of h and of j.
         components: K + 1, number of classes of the detector with background.
         thresholds: thresholds at which searches decide; None if none were chosen.
+        shares: `(K,)`, by class, shares of the searches that it was trained on whose target was there; None: not known.
         metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was trained for).
 
     >>> model = TargetEvidence(8, 4, components=3)  # not trained yet
@@ -65,6 +67,8 @@ class TargetEvidence(Evidence):
     >>> model(seen, torch.zeros(1, 2), Grid(4, 4, (80, 80)), target=1).shape
     torch.Size([1, 16])
     """
+
+    shares: Tensor | None
 
     kind: ClassVar[str] = "target-evidence"
     title: ClassVar[str] = "model of target evidence"
@@ -75,11 +79,12 @@ class TargetEvidence(Evidence):
             **perceptron("read", READOUT, "R"),
             **perceptron("guide", READOUT + 1, "R"),
             **perceptron("judge", _PRESENCE, "R"),
-            "prior": Field(("C",), low=-1e3, high=1e3),
+            "prior": Field(("K+1",), low=-1e3, high=1e3),
+            "shares": SHARES,
         },
         {
             "widths": Array((Number(size="L"), Number(size="R"))),
-            "components": Number(size="C"),
+            "components": Number(size="K+1"),
             "thresholds": THRESHOLDS,
         },
     )
@@ -91,10 +96,12 @@ class TargetEvidence(Evidence):
         *,
         components: int = 81,
         thresholds: Thresholds | None = None,
+        shares: Tensor | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(look_width, readout_width, components=components, metadata=metadata)
         self.thresholds = thresholds
+        self.register_buffer("shares", shares)
         self.guide = network(READOUT + 1, readout_width)
         self.judge = network(_PRESENCE, readout_width)
 
@@ -168,6 +175,13 @@ class TargetEvidence(Evidence):
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        model = super()._restore(record, tensors)
-        model.thresholds = record["thresholds"] and Thresholds(**record["thresholds"])
+        at = record["thresholds"]
+        model = cls(
+            *record["widths"],
+            components=record["components"],
+            thresholds=at and Thresholds(**at),
+            shares=tensors.get("shares"),
+            metadata=record["metadata"],
+        )
+        model.load_state_dict(tensors)
         return model

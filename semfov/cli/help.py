@@ -68,6 +68,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
 {_LOOKS}
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
   --closer N           most closer looks at places that seem to hold the target (0: none)
+  --prior P            how often the target is there: the share of the pictures that hold it (default: half)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
@@ -170,6 +171,7 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   --rate R             rate at which evidence fades from frame to frame (0: never)
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
   --closer N           most closer looks in the time until half of the evidence has faded (0: none)
+  --prior P            how often the target is there: the share of the frames that hold it (default: half)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
   --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects

@@ -41,7 +41,8 @@ def look_live(options: LiveOptions) -> int:
         source = int(source)  # `semfov live 0`, as in OpenCV
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
-    settings = {name: getattr(options, name) for name in ("how", "rate", "seed", "confirm", "give_up", "closer")}
+    names = ("how", "rate", "seed", "confirm", "give_up", "closer", "prior")
+    settings = {name: getattr(options, name) for name in names}
     first = cell_at(start, (agent.columns, agent.rows))
     running = agent.live(_sought(options, agent.classes[1:]), start=first, **settings)
     with held_outputs(options):

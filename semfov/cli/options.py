@@ -147,6 +147,7 @@ class SearchOptions(PictureOptions):
             belief was fitted).
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input; 0: none. Each takes one of the passes.
+        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (none: half of them).
     """
 
     target: str | None = None
@@ -154,6 +155,7 @@ class SearchOptions(PictureOptions):
     confirm: Share | None = None
     give_up: Share | None = None
     closer: _MostCloserLooks | None = None
+    prior: Share | None = None
 
 
 @dataclass(frozen=True)
@@ -207,6 +209,7 @@ class LiveOptions(AgentOptions):
         give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
         closer: largest number of closer looks in the time until half of the evidence has faded (none: 2 for a fovea, 3
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
+        prior: how often the target is there: the share of the frames that hold it (none: half of them).
         white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
         out: video to write, `.mp4` or `.avi`, or a folder for it, with gaze and belief, or windows and objects, drawn
             into each frame.
@@ -222,6 +225,7 @@ class LiveOptions(AgentOptions):
     confirm: Share | None = None
     give_up: Share | None = None
     closer: _MostCloserLooks | None = None
+    prior: Share | None = None
     white: str | None = None
     out: Path | None = None
 

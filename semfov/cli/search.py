@@ -350,7 +350,7 @@ class _SearchJob(_PictureJob):
     def look(self, picture: PictureLike, shared: dict[str, Any], source: PictureSource) -> Record:
         """Search a picture."""
         agent, options, weights = self.agent, self.options, self.weights or {}
-        settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "seed")}
+        settings = {name: getattr(options, name) for name in ("confirm", "give_up", "closer", "prior", "seed")}
         foveal = len(weights) > 1 or self.start is not None or shared.get("shifts") is not None
         kind = agent.kind_of_look(picture, shared["how"], foveal=foveal)
         if kind != "fovea" and len(weights) > 1:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
+from semfov.belief.prior import Prior
 from semfov.belief.verification import closer_features
 from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
@@ -47,7 +48,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
     """Class that closer looks are made for, 1..K; in a search for several classes the most probable one."""
 
     presence: float
-    """Probability that the picture holds the target, after the last look."""
+    """Probability that the picture holds the target, after the last look, with the `prior`."""
+
+    prior: Prior
+    """How often the target is there. All probabilities are those with this prior."""
 
     grid: Grid | None = None
     """The cells, where places are cells."""
@@ -57,8 +61,9 @@ class CandidatePlaces(ABC, Generic[LookType]):
     _number: int | None = None
     """The look after which the last closer look was made, or the one that it is."""
 
-    def __init__(self, forgetting: Forgetting | None = None) -> None:
+    def __init__(self, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
+        self.prior = Prior() if prior is None else prior
         self._frame = 0.0
         # Each with its frame: what looks show, boxes `(2, 4)` and cells `(X·Y,)` of examined places, and their
         # probabilities.
@@ -102,9 +107,11 @@ class CandidatePlaces(ABC, Generic[LookType]):
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
         """Look closely at a candidate, unless a look showed it so, and dismiss it; → `(7,)`."""
+        # The regressions read the probabilities of the searches that they were fitted to.
+        before = self.prior.inverse
         features, box = closer_features(
-            self.presence,
-            candidate.probability,
+            before(self.presence),
+            before.place(candidate.probability, self.presence),
             candidate.evidence,
             self.look_at(candidate, close_up),
             candidate.box,
@@ -143,8 +150,10 @@ class CandidateCells(CandidatePlaces[Step]):
     less, and examined places are listed again when half of the evidence is left (`semfov.episode.Forgetting`).
     """
 
-    def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:
-        super().__init__(forgetting)
+    def __init__(
+        self, grid: Grid, target: int, forgetting: Forgetting | None = None, prior: Prior | None = None
+    ) -> None:
+        super().__init__(forgetting, prior)
         self.grid, self._target = grid, target
 
     grid: Grid

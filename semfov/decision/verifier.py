@@ -94,8 +94,9 @@ class Verifier(Generic[LookType]):
         assert self.candidate is not None
         features, box = self.places.examine(self.candidate, self.close_up)
         with torch.no_grad():
-            place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        look = self.places.record(box, place, presence)
+            fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        prior = self.places.prior
+        look = self.places.record(box, prior.place(fitted_place, fitted_presence), prior(fitted_presence))
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [
             old

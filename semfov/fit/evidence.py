@@ -16,7 +16,7 @@ from semfov.belief.look_features import highest_score, look_features
 from semfov.belief.observers import Semantic
 from semfov.belief.observers.target import Target, TargetBelief, TargetLook
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.data.scene import legal_targets
+from semfov.data.scene import Scenes, legal_targets
 from semfov.decision import OUTCOMES, confirms, decide, place_known
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
@@ -31,7 +31,14 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import FloatArray, area_under_roc, cumulative_performance
 from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.protocols import choose_classes, choose_searches, episodes_of, run_episodes, search_steps
+from semfov.runs.protocols import (
+    choose_classes,
+    choose_searches,
+    episodes_of,
+    numbers_drawn,
+    run_episodes,
+    search_steps,
+)
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import mean_or_dash, share, table
@@ -111,9 +118,16 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
+    model.shares = search_shares(run.scenes, config)
     judged, model.thresholds = _judge_evidence(config, model, examples[held_out], grid)
     counts = int((~held_out).sum()), int(held_out.sum())
     return Fit(model, judged, *counts, _evidence_report(judged, model.thresholds, *counts))
+
+
+def search_shares(scenes: Scenes, config: FitSearchConfig) -> Tensor:
+    """Share of the searches for each class whose target is there, `(K,)`, half a search for and against added."""
+    there, missing = numbers_drawn(scenes, config.classes, config.max_target_area, config.absent)
+    return ((there + 0.5) / (there + missing + 1)).float()
 
 
 def _train_evidence(

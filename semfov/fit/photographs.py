@@ -15,7 +15,7 @@ from semfov.fit.verification import choose_confirm, examine, fit, verification_r
 from semfov.fit.windows_certainty import Exploration, fit_spread, left_out, logistic_regression
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
-from semfov.runs.protocols import choose_classes
+from semfov.runs.protocols import choose_classes, numbers_drawn
 from semfov.runs.zoom_store import StoredGlances
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
@@ -28,8 +28,11 @@ _FOLDS = 5
 _CHECKED = (1, 5)
 """Numbers of looks, at the whole and at all slices, after which the expected number is compared with the annotated one.
 """
+_PRESENT = 2  # largest number of present classes to search for in a photograph
 _ABSENT = 20
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
+_NEAR = 5.0  # strength with which the shares of searches stay near those that the frequencies predict
+_NEWTON_STEPS = 50
 _FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as found; it determines the threshold
 
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
@@ -89,15 +92,19 @@ def fit_photographs(
     evidence = PhotographEvidence(model.classes, window=config.window).eval().requires_grad_(False)
     evidence.usual.copy_(_usual(held.sum(0), count))
     searches: list[_WholeSearch] = []
+    shown: list[Tensor] = []
+    looked = single[: config.photographs]
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
-    for number, index in enumerate(track(single[: config.photographs], "looking at photographs", "photograph")):
+    for number, index in enumerate(track(looked, "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
         glances = StoredGlances(eye, pictures, index, None)
         with torch.inference_mode():
             looks = glances.see([Window.overview(glances.lattice), *usual_slices(glances.lattice)])
-        usual = choose_classes(pictures, index, annotation, 2, _AREA, config.seed)
+        shown.append(looks[0].show)
+        usual = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
-        for place, target in enumerate(choose_classes(pictures, index, annotation, 2, _AREA, config.seed, _ABSENT)):
+        more = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
+        for place, target in enumerate(more):
             boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
             searches.append(_WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, glances.lattice, annotation)
@@ -116,10 +123,52 @@ def fit_photographs(
     offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), others], -1), present)
     evidence.whole.weight.copy_(torch.tensor([weights]))
     evidence.whole.bias.fill_(offset)
+    drawn = shares_by_frequency(evidence.usual, pictures)
+    evidence.shares = measured_shares(evidence, torch.stack(shown), held[looked], drawn)
     text = _fit_closer(evidence, searches, config, prior)
     model.photograph = evidence
-    model.metadata["photograph"] = {"photographs": len(single[: config.photographs]), "frequencies": count}
+    model.metadata["photograph"] = {"photographs": len(looked), "frequencies": count}
     return "\n".join([text, *told])
+
+
+def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
+    r"""Share π of the searches for each class whose target is there, `(K,)`, as the frequency alone predicts it.
+
+    .. math:: \operatorname{logit} \pi_t = b_0 \operatorname{logit} q_t + c_0
+
+    `PhotographEvidence` knows of a class no more than its frequency q, so that this is the prior that it has learned.
+    The shares of single classes differ: those that fill a photograph are not searched for there.
+    """
+    there, missing = numbers_drawn(pictures, _PRESENT, _AREA)
+    present = torch.cat([torch.ones(len(there)), torch.zeros(len(missing))])
+    offset, slope = logistic_regression(usual.repeat(2)[:, None], present, times=torch.cat([there, missing]))
+    return (slope * usual.double() + offset).sigmoid().clamp(1e-4, 1 - 1e-4).float()
+
+
+def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, shares: Tensor) -> Tensor:
+    r"""Shares `(K,)` with which searches of all photographs for each class have the right probabilities, near others.
+
+    Some classes are hinted at more often than others where they are not, such as chairs: their score tells less than
+    that of a class as frequent. The shift δ of the log odds of each class maximises the likelihood of all photographs,
+
+    .. math:: \sum_i \ln P(y_{it} \mid \operatorname{logit} P_{it} + \delta_t)
+              - \frac{\lambda}{2} (\delta_t - \operatorname{logit} q_t + \operatorname{logit} \pi_t)^2
+
+    with the share q of these photographs, and gives :math:`\operatorname{logit} q_t - \delta_t` as log odds.
+
+    Shapes: scores `(P, K)`, highest ones in the looks at the whole; held `(P, K)`; shares `(K,)`.
+    """
+    odds = evidence.presence(scores, (torch.arange(scores.shape[-1]) + 1).expand(scores.shape)).double()
+    present = held.double()
+    usual = _usual(held.sum(0), len(held))
+    expected = usual - shares.double().logit()
+    shift = expected.clone()
+    for _ in range(_NEWTON_STEPS):
+        chance = (odds + shift).sigmoid()
+        gradient = (present - chance).sum(0) - _NEAR * (shift - expected)
+        curvature = (chance * (1 - chance)).sum(0) + _NEAR
+        shift = shift + (gradient / curvature).clamp(-1, 1)
+    return (usual - shift).sigmoid().clamp(1e-4, 1 - 1e-4).float()
 
 
 def _explored(looks: Sequence[Glance], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:

@@ -112,14 +112,21 @@ def explorations_of_kinds(
     return explored
 
 
-def logistic_regression(facts: Tensor, right: Tensor, *, ridge: float = 1.0, steps: int = 30) -> list[float]:
-    """Fit a logistic regression by maximum likelihood, with Newton's method: offset and weights; facts `(n, m)`."""
+def logistic_regression(
+    facts: Tensor, right: Tensor, *, times: Tensor | None = None, ridge: float = 1.0, steps: int = 30
+) -> list[float]:
+    """Fit a logistic regression by maximum likelihood, with Newton's method: offset and weights.
+
+    Shapes: facts `(n, m)`, right `(n,)`, times `(n,)`: how often each case counts; None: once.
+    """
     # Half a case for and against without any facts keeps the result finite where all cases are right or all wrong.
     inputs = torch.cat([facts.double(), facts.new_zeros(2, facts.shape[1], dtype=torch.float64)])
     inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
     there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
     weight = torch.ones(len(inputs), dtype=torch.float64)
     weight[-2:] = 0.5
+    if times is not None:
+        weight[:-2] = times
     prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
     prior[0] = 1e-6
     coefficients = torch.zeros_like(prior)

@@ -87,6 +87,26 @@ def choose_classes(
     return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
 
 
+def numbers_drawn(scenes: Scenes, classes: int, max_area: float, absent: int | None = None) -> tuple[Tensor, Tensor]:
+    """Count the searches for each class that `choose_classes` draws: where it is there, and where it is not, `(K,)`.
+
+    The numbers are expected ones. Present classes are drawn from what a photograph holds, and absent ones evenly from
+    all others, so that a search for a common class is mostly for one that is there.
+    """
+    kinds = len(scenes.classes)
+    there, missing = torch.zeros(kinds, dtype=torch.float64), torch.zeros(kinds, dtype=torch.float64)
+    for index in range(len(scenes)):
+        annotation = scenes.annotation(index)
+        legal = torch.tensor(legal_targets(annotation, max_area), dtype=torch.long)
+        others = torch.ones(kinds, dtype=torch.bool)
+        others[annotation.labels - 1] = False
+        present = min(classes, len(legal))
+        there[legal - 1] += present / max(len(legal), 1)
+        wanted = present if absent is None else absent
+        missing[others] += min(1.0, wanted / max(int(others.sum()), 1))
+    return there, missing
+
+
 class DrawnSearch(NamedTuple):
     """A search for a drawn class, which the photograph may hold; `spare` ones serve only some purposes of a fit."""
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from semfov.belief.prior import Prior
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
@@ -45,7 +46,7 @@ def look_closely(glances: Glances, box: Tensor, window: tuple[float, float] = US
 
 
 class WindowLook(NamedTuple):
-    """One look of a search, and what is known of the target after it."""
+    """One look of a search, and what is known of the target after it, by the prior of the fit."""
 
     detections: Detections
     number: int
@@ -59,15 +60,18 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
 
-    with the highest score :math:`s^*` of the search, which gives the probability P of the picture. In a stream scores
-    fade, and places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
+    with the highest score :math:`s^*` of the search, which gives the probability P of the picture, both by the prior of
+    the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
+    places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
     """
 
     least = DETECTION_SCORE
     """Score from which on a box seems to hold the target."""
 
-    def __init__(self, target: int, likely: float, forgetting: Forgetting | None = None) -> None:
-        super().__init__(forgetting)
+    def __init__(
+        self, target: int, likely: float, forgetting: Forgetting | None = None, prior: Prior | None = None
+    ) -> None:
+        super().__init__(forgetting, prior)
         self.target, self.likely = target, likely
         self._next = 0
 
@@ -75,8 +79,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def see(self, look: WindowLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
-        self._look, self._next, self._left = look, look.number, look.left
-        self.detections, self.presence = look.detections, look.presence
+        self._look, self._next = look, look.number
+        self._left = self.prior.place(look.left, look.presence)
+        self.detections, self.presence = look.detections, self.prior(look.presence)
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
@@ -118,8 +123,8 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
 
     def _chance(self, score: float) -> float:
         """Probability that the target is where the highest score is this one."""
-        picture, place, top = torch.tensor([self.presence, score, self._look.best]).logit(_SMALLEST)
-        return float((picture + place - top).sigmoid())
+        picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
+        return self.prior.place(float((picture + place - top).sigmoid()), self._look.presence)
 
 
 class PhotographPlaces(CandidateBoxes):
@@ -134,8 +139,9 @@ class PhotographPlaces(CandidateBoxes):
         lattice: Lattice,
         forgetting: Forgetting | None = None,
         window: tuple[float, float] = USUAL_WINDOW,
+        prior: Prior | None = None,
     ) -> None:
-        super().__init__(target, 0.0, forgetting)
+        super().__init__(target, 0.0, forgetting, prior)
         self._lattice, self._window = lattice, window
         self._shown = dict[Window, tuple[int, Detections]]()  # by window, the number of the look and what it shows
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from semfov.belief.prior import Prior, check_prior
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
@@ -14,7 +15,7 @@ from semfov.episode import Forgetting
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook
 from semfov.zoom.episode import WindowStep
-from semfov.zoom.evidence import GlimpseEvidence, features
+from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence, features
 from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
@@ -78,7 +79,7 @@ class SearchFacts:
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:
-        """Predict whether the picture holds the target."""
+        """Predict whether the picture holds the target, by the prior of the fit."""
         photograph, target = self.belief.photograph, torch.tensor(self.belief.target)
         if photograph is not None:
             return float(photograph.presence(torch.tensor(self.best), target).sigmoid())
@@ -103,7 +104,10 @@ class WindowDecisions:
         give_up: float | None = None,
         closer: int | None = None,
         forgetting: Forgetting | None = None,
+        prior: float | None = None,
     ) -> None:
+        check_prior(prior)
+        self._share, self.prior = prior, Prior()
         self.evidence, self.target, self._close_up = evidence, target, close_up
         self._given, self._most, self._forgetting = (confirm, give_up), closer, forgetting
         self.thresholds = _DEFAULTS
@@ -121,6 +125,7 @@ class WindowDecisions:
         photograph = belief.photograph
         at = evidence.thresholds if photograph is None else photograph.verification.thresholds
         model = evidence.verification if photograph is None else photograph.verification
+        self.prior = self._prior_in(photograph)
         self.thresholds = (at or _DEFAULTS).changed(give_up=give_up)
         usual = CLOSER if photograph is None else MOST_IN_PHOTOGRAPH
         most = usual if self._most is None else self._most
@@ -129,9 +134,9 @@ class WindowDecisions:
             at = model.thresholds.changed(confirm, worth)
             places: CandidateBoxes
             if photograph is None:
-                places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting)
+                places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting, self.prior)
             else:
-                places = PhotographPlaces(self.target, belief.lattice, self._forgetting, photograph.window)
+                places = PhotographPlaces(self.target, belief.lattice, self._forgetting, photograph.window, self.prior)
                 at = at.changed(place=worth)  # all further looks are closer ones
             self.verifier = Verifier(model, places, self._close_up, at, most)
             self.criterion = self.verifier.criterion
@@ -139,6 +144,13 @@ class WindowDecisions:
             self.thresholds = self.thresholds.changed(confirm)
             self.criterion = f"p is {self.thresholds.confirm:g} and a detection shows the target"
         return SearchFacts(belief)
+
+    def _prior_in(self, photograph: PhotographEvidence | None) -> Prior:
+        """Compare the share that was given with that of the fit, which for large pictures is one half."""
+        if self._share is None or photograph is None:
+            # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
+            return Prior() if self._share is None else Prior(self._share)
+        return Prior.of(self._share, photograph.shares, self.target)
 
     def wait(self, frames: float = 1) -> None:
         """Let the time of frames pass. In a stream, call it before every frame."""
@@ -151,17 +163,30 @@ class WindowDecisions:
         self._facts.see(turn.looks)
         self._ahead, self._presence = turn.ahead, None
         facts, self.outcome = self._facts, 0
-        unseen = not facts.detected and self._ahead >= self.thresholds.give_up
-        if unseen and turn.belief.photograph is None and not self.looks:
+        large = turn.belief.photograph is None
+        if large and not facts.detected and not self.looks and self._left() >= self.thresholds.give_up:
             return  # no probability ends the search
-        self._presence = facts.presence(self._ahead)
+        presence = self._fitted_presence()
         if self.verifier is None:
-            state = torch.tensor([self._presence]), torch.tensor([facts.detected]), torch.tensor([self._ahead])
-            self.outcome = int(settle(*state, self.thresholds))
+            there, looked = torch.tensor([self.prior(presence)]), torch.tensor([facts.detected])
+            self.outcome = int(settle(there, looked, torch.tensor([self._left()]), self.thresholds))
             return
-        look = WindowLook(turn.glance.candidates, number, self._presence, facts.best, self._ahead)
+        look = WindowLook(turn.glance.candidates, number, presence, facts.best, self._ahead)
         self.verifier.see(look, last=last)
         self._settle(self.verifier)
+
+    def _fitted_presence(self) -> float:
+        """Probability that the picture holds the target after the last look, by the prior of the fit."""
+        assert self._facts is not None
+        if self._presence is None:
+            self._presence = self._facts.presence(self._ahead)
+        return self._presence
+
+    def _left(self) -> float:
+        """Value of the best look that is left."""
+        if self.prior.changes_nothing:
+            return self._ahead  # without the presence, which takes time
+        return self.prior.place(self._ahead, self._fitted_presence())
 
     @property
     def candidate(self) -> CandidatePlace | None:
@@ -189,6 +214,6 @@ class WindowDecisions:
         assert self._facts is not None
         if self.verifier is not None and self.verifier.looks:
             return self.verifier.decision(over=over)
-        presence = self._facts.presence(self._ahead) if self._presence is None else self._presence
         outcome = OUTCOMES[self.outcome]
-        return Decision(outcome, presence, None, self._facts.box if outcome == "found" else None)
+        box = self._facts.box if outcome == "found" else None
+        return Decision(outcome, self.prior(self._fitted_presence()), None, box)

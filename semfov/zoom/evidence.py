@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.belief.evidence import neighbourhood_peak, network
+from semfov.belief.prior import SHARES
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
@@ -134,9 +135,11 @@ class PhotographEvidence(nn.Module):
     .. math:: \operatorname{logit} P(t) = a \operatorname{logit} s + b \operatorname{logit} q_t + c
 
     `verification`, `certainty` and the `window` of a closer look are those of photographs; usual `(K,)` is logit q.
+    shares `(K,)` are those of the searches of the fit whose target was there (`semfov.belief.prior`); None: not known.
     """
 
     usual: Tensor
+    shares: Tensor | None
 
     def __init__(
         self,
@@ -145,10 +148,12 @@ class PhotographEvidence(nn.Module):
         thresholds: Thresholds | None = None,
         certainty: Certainty | None = None,
         window: tuple[float, float] = USUAL_WINDOW,
+        shares: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.window = window
         self.register_buffer("usual", torch.zeros(classes))
+        self.register_buffer("shares", shares)
         self.whole = nn.Linear(2, 1)
         self.verification = Verification(thresholds=thresholds)
         self.certainty = certainty
@@ -237,6 +242,7 @@ class GlimpseEvidence(Pretrained):
             "survey.border": Field((4,), low=-1e3, high=1e3),
             **{name: Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in _VERIFIED.items()},
             **{f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in _OWN.items()},
+            "photograph.shares": SHARES,
         },
         {
             "classes": Number(size="K"),
@@ -454,7 +460,13 @@ class GlimpseEvidence(Pretrained):
             **{name: record[name] for name in ("classes", "width", "patience", "foresight", "metadata")},
             **_chosen(record),
             verification=verified and Verification(thresholds=_chosen(verified)["thresholds"]),
-            photograph=own and PhotographEvidence(record["classes"], **_chosen(own), window=(least, context)),
+            photograph=own
+            and PhotographEvidence(
+                record["classes"],
+                **_chosen(own),
+                window=(least, context),
+                shares=tensors.get("photograph.shares"),
+            ),
         )
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)

@@ -36,7 +36,7 @@ from semfov.fit.map import (
 )
 from semfov.gaze.acquisition import CloserLook, TargetPosterior
 from semfov.gaze.choice import Given
-from semfov.runs.protocols import choose_classes
+from semfov.runs.protocols import choose_classes, numbers_drawn
 from tests.small import cells_of, looking
 
 GRID = Grid(4, 4, (640, 480))
@@ -101,6 +101,22 @@ def test_as_many_absent_as_present_classes_are_chosen(run, examples):
     draws = {seed: choose_classes(run.scenes, 0, run.scenes.annotation(0), 1, 1.0, seed) for seed in range(20)}
     assert len({tuple(draw) for draw in draws.values()}) > 5
     assert choose_classes(run.scenes, 0, run.scenes.annotation(0), 2, 0.0, 0) == []
+
+
+@pytest.mark.parametrize("absent", [None, 3])
+def test_the_numbers_of_drawn_searches_are_means_over_draws(absent):
+    scenes = EmbeddedScenes(CLASSES, count=4)
+    there, missing = numbers_drawn(scenes, 2, 0.5, absent)
+    counts, draws = torch.zeros(2, len(CLASSES)), 400
+    for index in range(len(scenes)):
+        annotation = scenes.annotation(index)
+        held = set(annotation.labels.tolist())
+        for seed in range(draws):
+            for target in choose_classes(scenes, index, annotation, 2, 0.5, seed, absent):
+                counts[int(target not in held), target - 1] += 1 / draws
+    # The standard error of a mean of 4 x 400 draws is 0.05 at most.
+    assert torch.allclose(counts[0].double(), there, atol=0.2)
+    assert torch.allclose(counts[1].double(), missing, atol=0.2)
 
 
 def test_looks_of_examples_match_stored_looks(run, examples):

@@ -185,9 +185,9 @@ def test_every_limit_ends_an_episode_and_a_search_has_a_decision_all_the_same(ag
 
 
 def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
-    whole = agent.search(Panorama(panorama), "green", prior=0.3, confirm=1.0, passes=8)
+    whole = agent.search(Panorama(panorama), "green", chance=0.3, confirm=1.0, passes=8)
     sure = [float(chances.max()) < 0.5 for chances in whole.maps]
-    path = agent.search(Panorama(panorama), "green", prior=0.3, give_up=0.99, confirm=1.0, passes=8)
+    path = agent.search(Panorama(panorama), "green", chance=0.3, give_up=0.99, confirm=1.0, passes=8)
     assert [*sure, True].index(True) == len(path) - 1 if any(sure) else len(path) == 8
     assert path.decision.outcome == ("absent" if any(sure) else "undecided")
 

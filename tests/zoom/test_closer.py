@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from semfov import Detections, WindowEye, ZoomAgent
+from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
@@ -309,6 +310,10 @@ def test_a_file_keeps_the_evidence_for_photographs(tmp_path):
     assert again.photograph.verification.thresholds == plain.thresholds
     assert again.photograph.window == (0.5, 3.0)
     assert again.photograph.certainty == model.photograph.certainty
+    assert again.photograph.shares is None
+    model.photograph.shares = SHARES
+    model.save(tmp_path / "own.safetensors")
+    assert torch.equal(GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors").photograph.shares, SHARES)
     GlimpseEvidence(3, 8).save(tmp_path / "without.safetensors")
     assert GlimpseEvidence.from_pretrained(tmp_path / "without.safetensors").photograph is None
 
@@ -501,6 +506,60 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
         assert {look.number for look in each.closer} == set(range(1, each.passes))
         rows = [row["closer"] for row in each.rows()]
         assert rows == [None, *(max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes))]
+
+
+SHARES = torch.tensor([0.7, 0.4, 0.2])
+
+
+def evidence_with_shares(**thresholds):
+    model = own_evidence(**thresholds)
+    model.photograph.shares = SHARES
+    return model
+
+
+def test_a_prior_changes_the_log_odds_of_a_search_by_that_of_the_fit(detector, photograph):
+    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
+    for number, target in enumerate(("red", "green", "blue")):
+        usual = agent.search(photograph, target, closer=0).decision.probability
+        for prior in (0.05, 0.6, float(SHARES[number])):
+            rare = agent.search(photograph, target, closer=0, prior=prior).decision.probability
+            expected = usual / (1 - usual) * (prior / (1 - prior)) / (SHARES[number] / (1 - SHARES[number]))
+            assert rare / (1 - rare) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_prior(detector, photograph):
+    model, share = evidence_with_shares(give_up=0.0), 0.1
+    agent = ZoomAgent(WindowEye(detector), model)
+    usual, rare = agent.search(photograph, "red"), agent.search(photograph, "red", prior=share)
+    prior = Prior(share, float(SHARES[0]))
+    assert len(usual.closer) == len(rare.closer) > 1
+    for before, after in zip(usual.closer, rare.closer, strict=True):
+        assert torch.equal(before.box, after.box)
+        assert after.presence == pytest.approx(prior(before.presence), rel=1e-5)
+        assert after.place == pytest.approx(prior.place(before.place, before.presence), rel=1e-5)
+    assert rare.decision.probability < usual.decision.probability
+
+
+def test_thresholds_are_compared_with_the_probability_for_the_prior(detector, photograph):
+    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
+    assert agent.search(photograph, "red").decision.outcome == "found"
+    rare = agent.search(photograph, "red", prior=1e-6)
+    # No place is worth a pass where hardly any photograph holds the class.
+    assert (rare.passes, rare.decision.outcome) == (1, "absent")
+
+
+def test_a_prior_in_a_large_picture_is_compared_with_one_half(detector, picture):
+    agent = ZoomAgent(WindowEye(detector), evidence(0.4))
+    usual, rare = (agent.search(picture, "red", passes=1, closer=0, prior=prior).decision for prior in (None, 0.1))
+    assert rare.probability == pytest.approx(Prior(0.1, 0.5)(usual.probability), rel=1e-5)
+
+
+def test_a_prior_needs_the_shares_of_the_fit(detector, photograph):
+    for models in (own_evidence(), None):
+        agent = ZoomAgent(WindowEye(detector), models)
+        refused("prior: expected None for models", agent.search, photograph, "red", prior=0.2)
+    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
+    refused("prior: expected a share above 0 and below 1", agent.search, photograph, "red", prior=1.0)
 
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):

@@ -11,6 +11,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers.base import Look, own
 from semfov.belief.observers.gathering import EvidenceLook, GatheredBelief, Gatherer
+from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
@@ -45,6 +46,7 @@ class Target(Gatherer[TargetEvidence]):
     Args:
         model: the learned evidence.
         together: compute all episodes of a batch at once; faster, but the rounding then depends on the batch.
+        prior: how often the target is there; None: as often as in the searches that the model was trained on.
 
     >>> observer, grid = Target(TargetEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
     >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
@@ -54,6 +56,10 @@ class Target(Gatherer[TargetEvidence]):
     """
 
     by_target = True
+
+    def __init__(self, model: TargetEvidence, *, together: bool = False, prior: Prior | None = None) -> None:
+        super().__init__(model, together=together)
+        self.prior = Prior() if prior is None else prior
 
     @property
     def thresholds(self) -> Thresholds | None:
@@ -89,4 +95,9 @@ class Target(Gatherer[TargetEvidence]):
         values = self.each(probabilities, *inputs, look.target)
         number = all_looks["closest"].shape[-1]
         present, following, anywhere = values[:, :number], values[:, number:-1], values[:, -1]
-        return TargetBelief(**all_looks, present=present, following=following, anywhere=anywhere)
+        return TargetBelief(
+            **all_looks,
+            present=self.prior.place(present, anywhere[:, None]),
+            following=self.prior(following),
+            anywhere=self.prior(anywhere),
+        )

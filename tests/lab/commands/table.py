@@ -126,6 +126,12 @@ COMMANDS = {
              "raise data.max_target_area"),
         ),
     ),
+    "eval.prior": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--commonest", "2", "--drawn", "1", "--max_target_area", "0.5",
+                  "--windows", "HERE/zoom.safetensors"),
+        files=("records.jsonl", "prior.md"),
+        refused=((("--commonest", "0"), "commonest: expected a whole number from 1"),),
+    ),
     "eval.calibration": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "1", "--grid", "[3,2]", "--target_area", "0.5",
                   "--model", "HERE/observation.safetensors",
@@ -204,6 +210,7 @@ COMMANDS = {
     ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
+    "train.fit_shares": Command(workers=False),
     "semfov.cli.main fit": Command(
         settings=("HERE/colours.onnx", *PHOTOGRAPHS, "--data.limit", "8", "--columns", "3", "--rows", "2",
                   "--holdout", "4", "--steps", "4", "--map_steps", "2", "--fixations", "2",

@@ -1,0 +1,179 @@
+"""How often the target is there: `python -m eval.prior` measures probabilities of one class over many photographs.
+
+    python -m eval.prior --data.root DIR --data.annotations instances.json --detector.name yolox-nano --out runs/prior
+
+Without photographs it uses the embedded scenes. All photographs are searched by windows for each of the classes that
+are in most of them, once without `prior` and once with the share of the photographs that hold the class. Then each one
+is searched for some classes that are drawn evenly from all, likewise, and for one that it holds and one that it does
+not hold. The table has the mean probability, the Brier score and the expected calibration error beside the share of the
+searches whose target is there. If the command is stopped, repeat it to continue.
+"""
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from eval.comparison.records import gather
+from eval.comparison.summary import announce, write_summary
+from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import WindowEpisode
+from semfov.data.classes import class_index
+from semfov.episode.stopwatch import Stopwatch
+from semfov.metrics.calibration import BinarySums
+from semfov.runs.command import command
+from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
+from semfov.runs.protocols import choose_classes
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun, finish
+from semfov.runs.seeds import generator_for
+from semfov.runs.settings import Count, Seed, Share, Whole
+from semfov.runs.setup import check_sources, make_detector, make_scenes
+from semfov.runs.tables import table
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Glances
+
+RANDOM, PAIR = "a class drawn from all", "one there, one not"
+"""Names of the questions that are not about one class."""
+
+
+@dataclass(frozen=True)
+class PriorConfig(WorkConfig):
+    """Search many photographs for the same class.
+
+    Args:
+        data: the photographs.
+        classes: classes to search all photographs for, by name (None: the `commonest`).
+        commonest: number of classes, those that most photographs hold, that all photographs are searched for.
+        drawn: number of classes, drawn evenly from all, that each photograph is searched for.
+        max_target_area: share of a photograph that a class covers at most to be searched for in pairs of one that is
+            there and one that is not.
+        windows: evidence for windows, by name or file (None: the one that is shipped for the detector).
+        seed: seed of the classes that are drawn.
+        out: folder for the table and the records.
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
+    classes: tuple[str, ...] | None = None
+    commonest: Count = 11
+    drawn: Whole = 3
+    max_target_area: Share = 0.2
+    windows: str | None = None
+    seed: Seed = 0
+    out: Path = Path("runs/prior")
+
+
+class PriorRun(SceneRun):
+    """Searches of photographs for the commonest classes, for drawn ones, and for pairs of classes."""
+
+    config: PriorConfig
+
+    def __init__(self, config: PriorConfig) -> None:
+        self.config = config
+        check_sources(config.data, config.detector)
+        self.eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
+        self.scenes = make_scenes(config.data, self.eye.detector.classes)
+        name = self.eye.detector.name if config.windows is None else config.windows
+        self.evidence = GlimpseEvidence.from_pretrained(name).requires_grad_(False)
+        self.evidence.check_compatible(self.eye.settings())
+        held = torch.zeros(len(self.scenes.classes))
+        for index in range(len(self.scenes)):
+            held[self.scenes.annotation(index).labels.unique() - 1] += 1
+        # Half a photograph for and against: no class is in none of the photographs, or in all.
+        self.shares: Tensor = (held + 0.5) / (len(self.scenes) + 1)
+        self.always = [int(number) + 1 for number in held.argsort(descending=True)[: config.commonest]]
+        if config.classes is not None:
+            self.always = [class_index(name, self.scenes.classes, "classes") for name in config.classes]
+
+    def depends_on(self) -> dict[str, Any]:
+        config = self.config
+        settings = [config.classes, config.commonest, config.drawn, config.max_target_area, config.seed]
+        return {"eye": self.eye.settings(), "settings": settings, "windows": self.evidence}
+
+    def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
+        watch, annotation = Stopwatch(), self.scenes.annotation(index)
+        glances = StoredGlances(self.eye, self.scenes, index, None)
+        generator = generator_for("prior", self.config.seed, self.scenes.ids[index])
+        drawn = (torch.randperm(len(self.scenes.classes), generator=generator) + 1)[: self.config.drawn].tolist()
+        pair = choose_classes(self.scenes, index, annotation, 1, self.config.max_target_area, self.config.seed)
+        always = [(f"always {self.scenes.classes[target - 1]}", target) for target in self.always]
+        questions = [*always, *((RANDOM, target) for target in drawn), *((PAIR, target) for target in pair)]
+        records = []
+        for question, target in questions:
+            prior = None if question == PAIR else float(self.shares[target - 1])
+            records.append(
+                {
+                    "scene": self.scenes.ids[index],
+                    "question": question,
+                    "target": self.scenes.classes[target - 1],
+                    "present": bool((annotation.labels == target).any()),
+                    "without": self._search(glances, target, None),
+                    "with": None if prior is None else self._search(glances, target, prior),
+                }
+            )
+        watch.lap("search")
+        return records, watch.seconds
+
+    def _search(self, glances: Glances, target: int, prior: float | None) -> ResultRecord:
+        """Search the photograph for a class, and record the decision."""
+        limits = EpisodeLimits(WindowEpisode.usual_passes)
+        names = ("background", *self.scenes.classes)
+        path = WindowEpisode(names, self.evidence, target, limits=limits, prior=prior).open(glances).run()
+        decision = path.decision
+        assert decision is not None
+        return {"outcome": decision.outcome, "probability": decision.probability, "passes": path.passes}
+
+
+def prior_summary(records: Iterable[ResultRecord]) -> str:
+    """The table, as Markdown."""
+    by_question: dict[str, list[ResultRecord]] = {}
+    for record in records:
+        by_question.setdefault(record["question"], []).append(record)
+    measures = ["mean p", "Brier", "ECE", "passes"]
+    rows = [["searches for", "number", "there", *measures, *(f"{name}, `prior=`" for name in measures)]]
+    for question, some in by_question.items():
+        there = torch.tensor([record["present"] for record in some])
+        share = f"{float(there.double().mean()):.3f}"
+        rows.append([question, str(len(some)), share, *_measured(some, "without"), *_measured(some, "with")])
+    return "\n".join(
+        [
+            "Probability that a photograph holds the class, without `prior=`, and with the share of the photographs "
+            "that hold it. `there`: share of the searches whose target is there.",
+            "",
+            *table(rows),
+            "",
+        ]
+    )
+
+
+def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
+    """Mean probability, Brier score, calibration error and mean number of passes; dashes where nothing was searched."""
+    searched = [record for record in records if record[way] is not None]
+    if not searched:
+        return ["-"] * 4
+    probability = torch.tensor([record[way]["probability"] for record in searched], dtype=torch.float64)
+    sums = BinarySums.of(probability, torch.tensor([record["present"] for record in searched]))
+    passes = sum(record[way]["passes"] for record in searched) / len(searched)
+    return [f"{float(probability.mean()):.3f}", f"{sums.brier:.3f}", f"{sums.ece:.3f}", f"{passes:.1f}"]
+
+
+def measure_priors(config: PriorConfig) -> None:
+    """Search all photographs, and write the table and the records."""
+    run = PriorRun(config)
+    finish(run, "searching")
+    records = [*gather(run)]
+    text = prior_summary(records)
+    announce(text, write_summary(config.out, "prior", text, records))
+
+
+main = command(measure_priors, PriorConfig, __doc__)
+
+if __name__ == "__main__":
+    sys.exit(main())

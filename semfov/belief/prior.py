@@ -1,0 +1,102 @@
+"""How often the target is there: probabilities for another share of searches than that of the fit."""
+
+import math
+from dataclasses import dataclass
+from typing import Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from semfov.errors import InputError, check
+from semfov.io.schema import Field, is_number
+
+SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
+"""Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""
+
+_Odds = TypeVar("_Odds", float, Tensor)
+
+
+def with_prior(logit: _Odds, prior: float, fitted: float) -> _Odds:
+    r"""Change log odds from the share of searches that they were fitted with to another one.
+
+    .. math:: \operatorname{logit} P' = \operatorname{logit} P + \operatorname{logit} \pi
+              - \operatorname{logit} \pi_{\mathrm{fit}}
+
+    (Saerens, Latinne and Decaestecker, 2002, *Adjusting the outputs of a classifier to new a priori probabilities*.)
+
+    Args:
+        logit: log odds that the target is there.
+        prior: share π of the searches whose target is there, above 0 and below 1.
+        fitted: that share in the searches of the fit.
+
+    Returns:
+        Log odds, in the shape that was given.
+
+    >>> round(with_prior(0.0, prior=0.2, fitted=0.5), 3)  # nothing is known but the share
+    -1.386
+    """
+    return logit + _logit(prior) - _logit(fitted)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The share of the searches whose target is there, and that share in the searches of the fit.
+
+    Calls change a probability of presence, a float or a tensor (`with_prior`). The same shares change nothing.
+    """
+
+    share: float = 0.5
+    fitted: float = 0.5
+
+    @classmethod
+    def of(cls, share: float | None, shares: Tensor | None, target: int) -> Self:
+        """Compare a share with that of the fit, of shares `(K,)` by class; None changes nothing."""
+        check_prior(share)
+        if share is None:
+            return cls()
+        if shares is None:
+            remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
+            raise InputError(f"prior: expected None for models without the shares of their fit, got {share}; {remedy}")
+        return cls(float(share), float(shares[target - 1]))
+
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether the shares are the same."""
+        return self.share == self.fitted
+
+    @property
+    def inverse(self) -> "Prior":
+        """The change back to the probabilities of the fit."""
+        return Prior(self.fitted, self.share)
+
+    def __call__(self, presence: _Odds) -> _Odds:
+        if self.changes_nothing:
+            return presence
+        if isinstance(presence, Tensor):
+            return with_prior(presence.logit(), self.share, self.fitted).sigmoid()
+        return float(self(torch.tensor(presence, dtype=torch.float64)))
+
+    def place(self, place: _Odds, presence: _Odds) -> _Odds:
+        r"""Change the probability of a place, whose share of that of the picture stays.
+
+        .. math:: P'(\text{place}) = P(\text{place}) \frac{P'}{P}
+
+        Whether the target is at a place, given that the picture holds it, does not depend on how often pictures do.
+        """
+        if self.changes_nothing:
+            return place
+        if isinstance(place, Tensor):
+            whole = torch.maximum(torch.as_tensor(place), torch.as_tensor(presence))
+            return place * (self(whole) / whole.clamp(min=torch.finfo(whole.dtype).tiny))
+        pair = torch.tensor([place, presence], dtype=torch.float64)
+        return float(self.place(pair[0], pair[1]))
+
+
+def check_prior(prior: float | None) -> None:
+    """Raise `InputError` unless a share of searches is None, or above 0 and below 1."""
+    inside = prior is None or (is_number(prior) and 0 < prior < 1)
+    check(inside, "prior", "a share above 0 and below 1, or None", prior)
+
+
+def _logit(share: float) -> float:
+    return math.log(share) - math.log1p(-share)

@@ -1,0 +1,131 @@
+"""Probabilities for another share of searches whose target is there."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
+
+from semfov.belief import Grid
+from semfov.belief.observers import Target
+from semfov.belief.prior import Prior, check_prior, with_prior
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.detection import Detections
+from semfov.errors import InputError
+from semfov.fit.photographs import measured_shares
+from semfov.gaze.policies import Policy
+from semfov.strategy import Strategy
+from semfov.zoom.evidence import PhotographEvidence
+from tests.refusals import refused
+
+shares = st.floats(0.01, 0.99)
+chances = st.floats(1e-6, 1 - 1e-6)
+
+
+def bayes(likelihoods, prior):
+    """Posterior of presence, from the likelihoods of what was seen with the target there and not."""
+    there, missing = likelihoods
+    return prior * there / (prior * there + (1 - prior) * missing)
+
+
+@given(st.tuples(st.floats(1e-3, 1), st.floats(1e-3, 1)), shares, shares)
+def test_log_odds_for_another_prior_are_those_of_bayes_rule(likelihoods, fitted, prior):
+    odds = torch.tensor(bayes(likelihoods, fitted), dtype=torch.float64).logit()
+    assert float(with_prior(odds, prior, fitted).sigmoid()) == pytest.approx(bayes(likelihoods, prior), abs=1e-9)
+    assert with_prior(float(odds), prior, fitted) == pytest.approx(float(with_prior(odds, prior, fitted)))
+
+
+@given(chances, chances, shares, shares)
+def test_a_place_keeps_its_share_of_the_picture(place, presence, fitted, share):
+    prior = Prior(share, fitted)
+    assert prior(presence) == pytest.approx(bayes((presence / fitted, (1 - presence) / (1 - fitted)), share), abs=1e-9)
+    whole = max(place, presence)
+    assert prior.place(place, presence) == pytest.approx(place / whole * prior(whole))
+    assert prior.place(place, presence) <= prior(whole) + 1e-12
+    assert prior.inverse(prior(presence)) == pytest.approx(presence, rel=1e-6)
+    assert prior.inverse.place(prior.place(place, whole), prior(whole)) == pytest.approx(place, rel=1e-6)
+
+
+def test_without_a_share_nothing_changes():
+    chances = torch.rand(9)
+    for prior in (Prior(), Prior.of(None, None, 1), Prior(0.3, 0.3)):
+        assert prior(chances) is chances
+        assert prior.place(chances, chances) is chances
+    assert Prior.of(0.2, torch.tensor([0.5, 0.75]), 2) == Prior(0.2, 0.75)
+
+
+def test_certain_probabilities_stay():
+    prior = Prior(0.1, 0.7)
+    assert [prior(0.0), prior(1.0), prior.place(0.0, 0.0)] == [0.0, 1.0, 0.0]
+
+
+def test_bad_input():
+    for share in (0, 1, 1.5, -0.1, math.nan, True, "0.2"):
+        refused("prior: expected a share above 0 and below 1, or None", check_prior, share)
+    refused("prior: expected None for models without the shares of their fit, got 0.2", Prior.of, 0.2, None, 1)
+
+
+def belief_of(prior):
+    model = TargetEvidence(8, 6, components=4).double().eval().requires_grad_(False)
+    observer, grid = Target(model, prior=prior), Grid(4, 3, (80, 60))
+    boxes = torch.tensor([[[5.0, 5, 30, 30]]], dtype=torch.float64)
+    scores = torch.tensor([[[0.1, 0.7, 0.1, 0.1]]], dtype=torch.float64)
+    seen, fixation = Detections(boxes, scores, torch.ones(1, 1).bool()), torch.tensor([[30.0, 10.0]]).double()
+    return observer(observer.start(1, grid, fixation[:, 0]), seen, fixation, grid, target=1)
+
+
+def test_a_belief_has_the_numbers_of_another_prior():
+    torch.manual_seed(0)
+    plain = belief_of(None)
+    torch.manual_seed(0)
+    rare = belief_of(Prior(0.1, 0.6))
+    for value, before in ((rare.presence(1), plain.presence(1)), (rare.chance(1), plain.chance(1))):
+        assert torch.allclose(value, with_prior(before.logit(), 0.1, 0.6).sigmoid())
+    whole = torch.maximum(plain.probability(1), plain.presence(1)[:, None])
+    expected = plain.probability(1) / whole * with_prior(whole.logit(), 0.1, 0.6).sigmoid()
+    assert torch.allclose(rare.probability(1), expected)
+
+
+def test_a_strategy_reads_the_shares_of_its_evidence():
+    model = TargetEvidence(8, 6, components=4, shares=torch.tensor([0.5, 0.75, 0.1]))
+    strategy = Strategy(Target(model), Policy("non-predictive"))
+    changed, prior = strategy.with_prior(0.3, 2)
+    assert prior == Prior(0.3, 0.75)
+    assert changed.observer.prior == prior
+    assert strategy.observer.prior == Prior()
+    several, _, _ = strategy.sought(["person", "bicycle"], ("background", "person", "bicycle", "car"))
+    with pytest.raises(InputError, match="prior: expected None for a search for any of several classes"):
+        several.with_prior(0.3, 2)
+
+
+def test_measured_shares_maximise_the_penalised_likelihood_of_each_class():
+    """The shift of each class is that of scipy's minimiser."""
+    torch.manual_seed(0)
+    evidence = PhotographEvidence(3).requires_grad_(False)
+    evidence.usual.copy_(torch.tensor([0.0, -1.0, -2.0]))
+    held = torch.rand(60, 3) < torch.tensor([0.5, 0.3, 0.1])
+    scores = (0.1 + 0.6 * held + 0.3 * torch.rand(60, 3)).clamp(max=0.99)
+    before = torch.tensor([0.6, 0.5, 0.2])
+    shares = measured_shares(evidence, scores, held, before)
+    for number in range(3):
+        odds = evidence.presence(scores[:, number], torch.tensor(number + 1)).double()
+        there = held[:, number]
+        usual = float(((there.sum() + 0.5) / 61).double().logit())
+        expected = usual - float(before[number].double().logit())
+
+        def cost(shift, odds=odds, there=there, expected=expected):
+            right = torch.where(there, odds + shift, -odds - shift)
+            return float(-torch.nn.functional.logsigmoid(right).sum()) + 2.5 * (shift - expected) ** 2
+
+        shift = minimize_scalar(cost, bounds=(-20, 20), method="bounded", options={"xatol": 1e-8}).x
+        assert usual - shift == pytest.approx(float(shares[number].double().logit()), abs=1e-3)
+
+
+def test_a_file_keeps_the_shares(tmp_path):
+    model = TargetEvidence(8, 6, components=4, shares=torch.tensor([0.5, 0.75, 0.1]))
+    model.save(tmp_path / "with.safetensors")
+    assert torch.equal(TargetEvidence.from_pretrained(tmp_path / "with.safetensors").shares, model.shares)
+    TargetEvidence(8, 6, components=4).save(tmp_path / "without.safetensors")
+    assert TargetEvidence.from_pretrained(tmp_path / "without.safetensors").shares is None

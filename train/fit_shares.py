@@ -1,0 +1,89 @@
+"""How often the targets of a fit's searches were there: `python -m train.fit_shares` writes it into fitted models.
+
+    python -m train.fit_shares --data.root DIR --data.annotations instances.json --windows FILE --evidence FILE
+
+The photographs are those that the models were fitted to. The shares follow from the rule by which a fit draws its
+searches. Evidence for windows looks at the photographs `looked`, one pass each, to correct them by class. Fits write
+the shares themselves, so this is for models that were fitted without them.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.data.scene import Scenes
+from semfov.errors import check
+from semfov.fit.evidence import FitSearchConfig, search_shares
+from semfov.fit.photographs import measured_shares, shares_by_frequency
+from semfov.runs.command import command
+from semfov.runs.config import DataConfig
+from semfov.runs.progress import track
+from semfov.runs.setup import make_detector, make_scenes
+from semfov.runs.zoom_store import StoredGlances
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.glances import Window
+
+
+@dataclass(frozen=True)
+class FitSharesConfig(FitSearchConfig):
+    """Write the shares of the searches of a fit into its models.
+
+    Args:
+        windows: file of evidence for windows (None: none).
+        looked: the photographs that evidence for windows was fitted to.
+        evidence: file of evidence for a target (None: none), whose searches were drawn by the settings.
+    """
+
+    windows: Path | None = None
+    looked: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    evidence: Path | None = None
+    out: Path = Path("runs/fit_shares")
+
+
+@torch.inference_mode()
+def _whole_looks(eye: WindowEye, scenes: Scenes) -> tuple[Tensor, Tensor]:
+    """The highest scores of looks at whole photographs, and the classes that these hold, `(P, K)`."""
+    scores, held = [], torch.zeros(len(scenes), len(scenes.classes), dtype=torch.bool)
+    for index in track(range(len(scenes)), "looking at photographs", "photograph"):
+        glances = StoredGlances(eye, scenes, index, None)
+        scores.append(glances.see([Window.overview(glances.lattice)])[0].show)
+        held[index, scenes.annotation(index).labels - 1] = True
+    return torch.stack(scores), held
+
+
+def fit_shares(config: FitSharesConfig) -> None:
+    """Write the shares, and print their range."""
+    detector = make_detector(config.detector)
+    scenes = make_scenes(config.data, detector.classes)
+    if config.windows is not None:
+        model = GlimpseEvidence.from_pretrained(config.windows)
+        photograph = model.photograph
+        check(photograph is not None, "windows", "evidence with that for photographs", config.windows)
+        assert photograph is not None
+        drawn = shares_by_frequency(photograph.usual, scenes)
+        looked = make_scenes(config.looked, detector.classes)
+        scores, held = _whole_looks(WindowEye(detector).eval().requires_grad_(False), looked)
+        photograph.shares = measured_shares(photograph, scores, held, drawn)
+        model.save(config.windows)
+        print(f"{config.windows}: {_span(photograph.shares)}")
+    if config.evidence is not None:
+        evidence = TargetEvidence.from_pretrained(config.evidence)
+        evidence.shares = search_shares(scenes, config)
+        evidence.save(config.evidence)
+        print(f"{config.evidence}: {_span(evidence.shares)}")
+
+
+def _span(shares: Tensor) -> str:
+    """The least and the largest share in words."""
+    return f"the target was there in {float(shares.min()):.3f} to {float(shares.max()):.3f} of the searches for a class"
+
+
+main = command(fit_shares, FitSharesConfig, __doc__)
+
+if __name__ == "__main__":
+    sys.exit(main())
