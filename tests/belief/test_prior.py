@@ -110,7 +110,7 @@ def test_measured_shares_maximise_the_penalised_likelihood_of_each_class():
     before = torch.tensor([0.6, 0.5, 0.2])
     shares = measured_shares(evidence, scores, held, before)
     for number in range(3):
-        odds = evidence.presence(scores[:, number], torch.tensor(number + 1)).double()
+        odds = evidence.presence(scores[:, number], torch.full((60,), number + 1)).double()
         there = held[:, number]
         usual = float(((there.sum() + 0.5) / 61).double().logit())
         expected = usual - float(before[number].double().logit())
