@@ -83,7 +83,7 @@ class LivePerception:
             by_kind["fovea"] = without_prior
         self._episodes: dict[str, Episode[Any]] = {
             "fovea": FoveaEpisode(fovea, target, rate=fast, start=start, seed=seed, **by_kind["fovea"]),
-            "windows": windows.episode(target, targets, rate=slow, **by_kind["windows"]),
+            "windows": windows.episode(target, targets, rate=slow, follows=True, **by_kind["windows"]),
         }
         self._check_start()
 

@@ -19,7 +19,7 @@ ROOT = PACKAGE.parent
 
 # A subpackage imports only from itself and from the subpackages before it.
 SUBPACKAGES = [
-    "version", "words", "errors", "threads", "io", "data", "sensor", "detection", "observation", "belief", "gaze",
+    "version", "words", "errors", "threads", "io", "data", "motion", "sensor", "detection", "observation", "belief", "gaze",
     "eye", "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
     "agent", "metrics", "viz", "report", "runs", "envs", "fit", "cli", "__main__",
 ]  # fmt: skip

@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 from math import isfinite
 from time import perf_counter
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -20,16 +20,18 @@ from semfov.decision import Decision, check_thresholds
 from semfov.detection import LEAST, Detections
 from semfov.detection.load import load_detector, loader_options
 from semfov.errors import check, check_number, check_options, check_whole
+from semfov.motion import CameraMotion
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath
 from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
+from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import WindowDecisions
-from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
+from semfov.zoom.episode import KeptLook, WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import Cut, WindowEye
+from semfov.zoom.eye import Cut, WindowEye, WindowView
 from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge, probable_objects
@@ -221,17 +223,6 @@ class ZoomAgent(nn.Module):
         return WindowEpisode(self.classes, evidence, target, targets, eye=self.eye, **settings)
 
 
-class _Look(NamedTuple):
-    """A look at a window: its numbers of pass and frame, the value that it was chosen for, and the time at its end."""
-
-    number: int
-    frame: float
-    glance: Glance
-    value: float
-    seconds: float
-    closely: bool = False
-
-
 class WindowEpisode(Episode[ZoomPath]):
     r"""Looks at windows: of a picture, of the frames of a stream, or where it is told to.
 
@@ -265,6 +256,7 @@ class WindowEpisode(Episode[ZoomPath]):
         least: float | None = None,
         color: Color = "rgb",
         eye: WindowEye | None = None,
+        follows: bool = False,
     ) -> None:
         super().__init__(classes, target, targets, limits, rate)
         self.evidence, self.eye, self.color = evidence, eye, color
@@ -283,7 +275,9 @@ class WindowEpisode(Episode[ZoomPath]):
             self.criterion = f"a detection scores {self._confirm:g}"
         self._glances: Glances | None = None
         self._last: WindowStep[Any] | None = None
-        self._looks: list[_Look] = []
+        self._newest: KeptLook | None = None
+        self._closer_looks: list[KeptLook] = []
+        self._camera = CameraMotion() if follows else None
         self._frame = 0.0
         self._concluded: Decision | None = None
         self._began = perf_counter()
@@ -333,9 +327,8 @@ class WindowEpisode(Episode[ZoomPath]):
                 self._check_size(view.picture.size)
                 if self._glances is None:
                     self.open(LiveGlances(self.eye, view))
-                assert isinstance(self._glances, LiveGlances)
                 self._frame += self.passed
-                self._glances.show(view, self._frame)
+                self._follow(view)
                 if self._decisions is not None:
                     self._decisions.wait(self.passed)
             assert self._glances is not None
@@ -344,7 +337,7 @@ class WindowEpisode(Episode[ZoomPath]):
             candidate = None if self._decisions is None else self._decisions.candidate
             if self._decisions is not None and candidate is not None:
                 self._decisions.look()
-                self._looks[-1] = self._looks[-1]._replace(value=candidate.probability)
+                self._closer_looks[-1].value = candidate.probability
             elif not self._turn():
                 return None
             if self.forgetting is None:
@@ -352,15 +345,38 @@ class WindowEpisode(Episode[ZoomPath]):
                     self.ending = "decision"
                 elif self.searches and self.evidence is None and self.decision is not None:
                     self.ending = "detection" if self.decision.outcome == "found" else None
-            seen, lattice = self._looks[-1], self._glances.lattice
+            assert self._newest is not None
+            seen, lattice = self._newest, self._glances.lattice
             return RecordedLook(
-                self.passes - 1,
-                seen.glance.window.centre(lattice),
-                seen.glance.window.region(lattice),
-                seen.glance.detections,
+                seen.number,
+                seen.taken.window.centre(lattice),
+                seen.taken.window.region(lattice),
+                seen.taken.detections,
                 seen.seconds,
                 seen.value if isfinite(seen.value) else None,
             )
+
+    def _follow(self, view: WindowView) -> None:
+        """Take the next frame of a stream, and carry what is known along with the camera."""
+        assert isinstance(self._glances, LiveGlances)
+        if self._camera is None:
+            self._glances.show(view, self._frame)
+            return
+        width, height = view.picture.size
+        camera = self._camera.step(view.picture.pixels((0, 0, width, height)))
+        if self._newest is None:
+            self._glances.show(view, self._frame)
+            return
+        self._glances.show(view, self._frame, camera)
+        if camera.is_still:
+            return
+        if camera.motion is None:
+            self._closer_looks = []
+        else:
+            for look in self._closer_looks:
+                look.carry(camera.motion, self._glances.lattice)
+        if self._decisions is not None:
+            self._decisions.follow(camera.motion)
 
     def _turn(self) -> bool:
         """Make the next look of the search or the exploration; returns whether one was left."""
@@ -368,13 +384,10 @@ class WindowEpisode(Episode[ZoomPath]):
         if turn is None:
             return False
         self._last = turn
-        self._looks.append(_Look(self.passes, self._frame, turn.glance, turn.worth, perf_counter() - self._began))
+        self._number(turn.look)
         if self.forgetting is not None:
-            counting, oldest = {id(look) for look in turn.looks}, self._frame - self.forgetting.span
-            self._looks = [
-                look for look in self._looks if (look.frame >= oldest if look.closely else id(look.glance) in counting)
-            ]
-        self.passes += 1
+            oldest = self._frame - self.forgetting.span
+            self._closer_looks = [look for look in self._closer_looks if look.frame >= oldest]
         if self._decisions is not None:
             last = turn.ahead == 0 or self.limits.room(self.passes) <= 1
             self._decisions.see(turn, self.passes, last=last)
@@ -384,10 +397,16 @@ class WindowEpisode(Episode[ZoomPath]):
     def _close_up(self, box: Tensor) -> Detections:
         """Spend a pass on a closer look at a box."""
         assert self._glances is not None
-        glance = look_closely(self._glances, box, self._closer)
-        self._looks.append(_Look(self.passes, self._frame, glance, 0.0, perf_counter() - self._began, closely=True))
+        look = KeptLook(look_closely(self._glances, box, self._closer), self._frame, 0.0)
+        self._number(look)
+        self._closer_looks.append(look)
+        return look.taken.candidates
+
+    def _number(self, look: KeptLook) -> None:
+        """Give the newest look the number of its pass and the time at its end."""
+        look.number, look.seconds = self.passes, perf_counter() - self._began
+        self._newest = look
         self.passes += 1
-        return glance.candidates
 
     def _end(self, limit: Ending | None) -> None:
         decided: Ending = "decision"
@@ -423,8 +442,14 @@ class WindowEpisode(Episode[ZoomPath]):
 
     @property
     def glances(self) -> list[Glance]:
-        """The looks that count, in their order."""
+        """The looks that count, in their order, where they lie in the present frame."""
         return [look.glance for look in self._looks]
+
+    @property
+    def _looks(self) -> list[KeptLook]:
+        """The looks that count, in their order."""
+        chosen = () if self._last is None else self._last.kept
+        return sorted([*chosen, *self._closer_looks], key=lambda look: look.number)
 
     def record(self) -> ZoomPath:
         picture = self._glances.view.picture if isinstance(self._glances, LiveGlances) else None
@@ -453,10 +478,11 @@ class WindowEpisode(Episode[ZoomPath]):
     def _recorded(self) -> dict[str, Any]:
         """What the record of a picture and that of a frame share."""
         assert self._glances is not None
-        lattice, glances = self._glances.lattice, self.glances
+        lattice, looks = self._glances.lattice, self._looks
+        glances = [look.glance for look in looks]
         fading = self.forgetting is not None and self.forgetting.rate > 0
         closer = () if self._decisions is None else self._decisions.looks
-        places = {look.number: place for place, look in enumerate(self._looks)}
+        places = {look.number: place for place, look in enumerate(looks)}
         current = _without_replaced(glances, lattice) if fading else glances
         sought, unseen = self.targets or self.target, None
         if self.certainty is None:
@@ -465,10 +491,13 @@ class WindowEpisode(Episode[ZoomPath]):
             belief = None if self.searches else self.belief
             # A belief about objects of any class says nothing about those of several.
             remaining = (0.0, 0.0) if belief is None or self.targets else belief.remaining()
-            further = [look.value for look in self._looks[1:] if not look.closely and isfinite(look.value)]
+            chosen = () if self._last is None else self._last.kept
+            further = [look.value for look in chosen[1:] if isfinite(look.value)]
             objects, unseen = probable_objects(
                 current, lattice, sought, self.certainty, remaining=remaining, promised=sum(further), latest=fading
             )
+        if self._camera is not None:
+            objects = objects[inside_frame(objects.boxes, lattice.size)]
         return {
             "lattice": lattice,
             "classes": self.classes,
@@ -476,8 +505,8 @@ class WindowEpisode(Episode[ZoomPath]):
             "targets": self.targets,
             "decision": self.decision,
             "glances": tuple(glances),
-            "values": tuple(look.value for look in self._looks),
-            "seconds": tuple(look.seconds for look in self._looks),
+            "values": tuple(look.value for look in looks),
+            "seconds": tuple(look.seconds for look in looks),
             "candidates": objects,
             "unseen": unseen,
             "spread": SPREAD if self.certainty is None else self.certainty.spread,

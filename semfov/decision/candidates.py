@@ -15,6 +15,7 @@ from semfov.belief.verification import closer_features
 from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 
 SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
@@ -127,6 +128,13 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
         self._examined = [place for place in self._examined if place[0] >= oldest]
         self._known = [known for known in self._known if known[0] >= oldest]
+
+    def follow(self, motion: Motion | None) -> None:
+        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+        if motion is None:
+            self._looks, self._examined, self._known = [], [], []
+            return
+        self._examined = [(frame, motion.boxes(boxes), cells) for frame, boxes, cells in self._examined]
 
     def cell(self, box: Tensor) -> int | None:
         """The cell that a box `(4,)` covers most; None where places are no cells."""

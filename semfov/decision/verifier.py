@@ -14,6 +14,7 @@ from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, Lo
 from semfov.decision.rule import OUTCOMES, CloseUp, Decision, verified
 from semfov.episode import Step
 from semfov.errors import check, check_whole
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 
 MOST_CLOSER = 2
@@ -77,6 +78,17 @@ class Verifier(Generic[LookType]):
         self.places.wait(frames)
         aged = (verdict._replace(age=verdict.age + frames) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
+
+    def follow(self, motion: Motion | None) -> None:
+        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+        self.candidate = None
+        self.places.follow(motion)
+        if motion is None:
+            self.verdicts = []
+            return
+        for number, verdict in enumerate(self.verdicts):
+            moved = replace(verdict.look, box=motion.boxes(verdict.look.box))
+            self.verdicts[number] = verdict._replace(look=moved)
 
     def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely."""

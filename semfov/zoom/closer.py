@@ -12,6 +12,7 @@ from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.glances import Glance, Glances, Window
@@ -105,6 +106,12 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Look closely at a candidate, in the next look of the path."""
         self._number, self._next = self._next, self._next + 1
         return super().look_at(candidate, close_up)
+
+    def follow(self, motion: Motion | None) -> None:
+        """Carry the boxes of the target along, too."""
+        super().follow(motion)
+        if motion is not None:
+            self._looks = [(frame, (motion.boxes(boxes), scores)) for frame, (boxes, scores) in self._looks]
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is at the place of a closer look, by the detections that overlap it."""

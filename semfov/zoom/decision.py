@@ -12,6 +12,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
+from semfov.motion import Motion
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook
 from semfov.zoom.episode import WindowStep
@@ -156,6 +157,11 @@ class WindowDecisions:
         """Let the time of frames pass. In a stream, call it before every frame."""
         if self.verifier is not None:
             self.verifier.wait(frames)
+
+    def follow(self, motion: Motion | None) -> None:
+        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+        if self.verifier is not None:
+            self.verifier.follow(motion)
 
     def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
         """Take in a look, and choose the place that is to be looked at closely."""

@@ -5,9 +5,12 @@ from functools import cached_property, partial
 from typing import Generic, TypeVar
 
 from semfov.episode import Forgetting
+from semfov.motion import CameraStep, Motion
 from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.carrying import carried, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
@@ -21,19 +24,61 @@ _Guess = Callable[[Sequence[Glance], set[Window], Window | None], WindowChoice |
 it if it is not in the belief yet."""
 
 
+_LEAST_SHOWN = 0.75
+"""Share of the frame that the look at the whole must show; below it the camera has moved on, and it is made anew."""
+
+
+class KeptLook:
+    """A look that counts: as it was taken, and where it lies in the present frame of a stream.
+
+    Attributes:
+        taken: the look, in pixels of the frame in which it was taken.
+        glance: the look in pixels of the present frame.
+        frame: number of the frame in which it was taken.
+        value: the value that it was chosen for.
+        number: number of its pass of the detector.
+        seconds: time at its end, on the clock of the episode.
+    """
+
+    def __init__(self, taken: Glance, frame: float, value: float) -> None:
+        self.taken, self.glance = taken, taken
+        self.frame, self.value = frame, value
+        self.number, self.seconds = 0, 0.0
+        self._since: Motion | None = None
+
+    def carry(self, motion: Motion, lattice: Lattice) -> None:
+        """Carry the look along with the camera, to the next frame."""
+        self._since = motion if self._since is None else self._since.then(motion)
+        self.glance = carried(self.taken, self._since, lattice)
+
+
 class WindowStep(Generic[_Belief]):
-    """One step of an episode: a look, its value when it was chosen, and the belief after it."""
+    """One step of an episode: a look, the looks that count with it, and the belief after it."""
 
     def __init__(
         self,
-        glance: Glance,
-        worth: float,
+        look: KeptLook,
         belief: _Belief,
-        looks: Sequence[Glance],
+        kept: Sequence[KeptLook],
         choose: Callable[[], Sequence[WindowChoice]],
     ) -> None:
-        self.glance, self.worth, self.looks, self._choose = glance, worth, looks, choose
+        self.look, self.kept, self._choose = look, kept, choose
         self.belief: _Belief = belief
+
+    @property
+    def glance(self) -> Glance:
+        """The look, as it was taken."""
+        return self.look.taken
+
+    @property
+    def worth(self) -> float:
+        """The value that the look was chosen for."""
+        return self.look.value
+
+    @property
+    def looks(self) -> list[Glance]:
+        """The looks that count, where they lie in the present frame."""
+        return [look.glance for look in self.kept]
 
     @cached_property
     def choices(self) -> Sequence[WindowChoice]:
@@ -47,47 +92,76 @@ class WindowStep(Generic[_Belief]):
 
 
 class _Recent(Generic[_Belief]):
-    """The looks of an episode that count, and the belief of them."""
+    """The looks of an episode that count, the overview first, and the belief of them.
 
-    def __init__(self, belief: _Belief, forgetting: Forgetting | None) -> None:
-        self.belief, self.forgetting = belief, forgetting
-        self.looks: list[Glance] = []
+    Invariant: `belief` holds the looks of `kept`, where they lie in the present frame, and nothing else. `aside` has
+    the looks of a scene that the camera has lost and may find again.
+    """
+
+    def __init__(self, belief: _Belief, lattice: Lattice, forgetting: Forgetting | None) -> None:
+        self.belief, self.lattice, self.forgetting = belief, lattice, forgetting
+        self.kept: list[KeptLook] = []
+        self.aside: list[KeptLook] = []
         self.windows: set[Window] = set()
         self.renewed = False
-        self.frames: list[float] = []
 
-    def add(self, glance: Glance, frame: float) -> None:
+    @property
+    def looks(self) -> list[Glance]:
+        return [look.glance for look in self.kept]
+
+    def add(self, glance: Glance, frame: float, value: float) -> KeptLook:
         """Add a look at a frame, and forget those that it replaces and those that are too old."""
-        self.looks.append(glance)
-        self.frames.append(frame)
-        if self.forgetting is not None and self._forgets(glance, frame):
-            self.windows = {look.window for look in self.looks}
+        look = KeptLook(glance, frame, value)
+        self.kept.append(look)
+        if self.forgetting is not None and self._forget(self.forgetting.span):
+            self._believe_anew()
+        else:
+            self.windows.add(glance.window)
             if self.belief is not None:
-                self.belief.clear()
-                for look in self.looks:
-                    self.belief.add(look)
-            return
-        self.windows.add(glance.window)
-        if self.belief is not None:
-            self.belief.add(glance)
+                self.belief.add(glance)
+        return look
 
-    def _forgets(self, glance: Glance, frame: float) -> bool:
-        """Forget the looks that no longer count; returns whether any were forgotten."""
-        assert self.forgetting is not None
-        first, span = self.looks[0].window, self.forgetting.span
-        again = glance.window in self.windows
-        dated: list[tuple[float, Glance]] = list(zip(self.frames, self.looks, strict=True))
-        if again and glance.window == first:
-            dated = [dated[-1], *dated[1:-1]]
+    def follow(self, camera: CameraStep) -> None:
+        """Carry the looks along with the camera, or set them aside where the frame fits none before."""
+        if camera.motion is not None:
+            self._carry(self.kept, camera.motion)
+        else:
+            self.aside = self.aside or self.kept
+            self.kept = []
+        if camera.recovered is not None:
+            self._carry(self.aside, camera.recovered)
+            self.kept = [*self.aside, *self.kept]
+        if camera.recovered is not None or not camera.waits:
+            self.aside = []
+        self._believe_anew()
+
+    def _carry(self, looks: Sequence[KeptLook], motion: Motion) -> None:
+        for look in looks:
+            look.carry(motion, self.lattice)
+
+    def _believe_anew(self) -> None:
+        self.windows = {look.glance.window for look in self.kept}
+        if self.belief is not None:
+            self.belief.clear()
+            for look in self.kept:
+                self.belief.add(look.glance)
+
+    def _forget(self, span: float) -> bool:
+        """Forget looks that the newest one replaces, and those older than a span; returns whether there were any."""
+        first, newest, count = self.kept[0], self.kept[-1], len(self.kept)
+        if newest is not first and newest.taken.window == first.taken.window:
+            self.kept = [newest, *self.kept[1:-1]]
+            first = newest
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
-        recent = [
-            (when, look)
-            for when, look in dated
-            if look is glance or (look.window != glance.window and (look.window == first or frame - when <= span))
+        self.kept = [
+            look
+            for look in self.kept
+            if look in (first, newest)
+            or (newest.frame - look.frame <= span and look.glance.window != newest.glance.window)
         ]
-        self.frames, self.looks = [when for when, _ in recent], [look for _, look in recent]
-        self.renewed = frame + 1 - self.frames[0] > span
-        return len(recent) < len(dated) or again
+        is_old = newest.frame + 1 - first.frame > span
+        self.renewed = is_old or share_shown(first.glance.window, self.lattice) < _LEAST_SHOWN
+        return len(self.kept) < count
 
 
 def look_by_look(
@@ -105,12 +179,14 @@ def look_by_look(
     before. In a stream a look counts for the frames in which half of its evidence would fade, or until the next look at
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
-    recent, first = _Recent(belief, forgetting), Window.overview(glances.lattice)
+    recent, first = _Recent(belief, glances.lattice, forgetting), Window.overview(glances.lattice)
 
     def choose() -> Sequence[WindowChoice]:
+        if not recent.kept:
+            return [(first, float("inf"))]
         choices = order(recent.looks, recent.windows)
         if forgetting is not None and (recent.renewed or not choices):
-            oldest = min(zip(recent.frames, recent.looks, strict=True), key=lambda dated: dated[0])[1].window
+            oldest = min(recent.kept, key=lambda look: look.frame).taken.window
             return [(first, choices[0][1])] if choices else [(oldest, 0.0)]
         return choices
 
@@ -124,16 +200,21 @@ def look_by_look(
         if likely := guess(recent.looks, recent.windows | {window}, beside):
             glances.prepare(likely[0])
 
-    choices: Sequence[WindowChoice] = [(first, float("inf"))]
+    choices = choose()
     while choices:
-        if guess is not None and forgetting is None and len(choices) == 1 and recent.looks:
+        if guess is not None and forgetting is None and len(choices) == 1 and recent.kept:
             glances.meanwhile = partial(prepare, choices[0][0])
         looks = glances.see([window for window, _ in choices], hints=hints)
-        for glance, (_, worth) in zip(looks, choices, strict=True):
-            recent.add(glance, glances.frame)
-            turn = WindowStep(glance, worth, belief, tuple(recent.looks), choose)
+        for glance, (_, value) in zip(looks, choices, strict=True):
+            look = recent.add(glance, glances.frame, value)
+            turn = WindowStep(look, belief, tuple(recent.kept), choose)
             yield turn
-        choices = turn.choices
+        camera = glances.camera_step()
+        if camera is None or camera.is_still:
+            choices = turn.choices
+        else:
+            recent.follow(camera)
+            choices = choose()
 
 
 def look_for(

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.detection.detections import Detections
+from semfov.motion import CameraStep
 from semfov.zoom.eye import Resampled, WindowEye, WindowLooks, WindowView
 from semfov.zoom.hints import Gist, Hints
 from semfov.zoom.lattice import Lattice
@@ -109,6 +110,10 @@ class Glances(ABC):
     def prepare(self, window: Window) -> None:  # noqa: B027
         """Resample the window that is likely to be looked at next; stored looks need nothing."""
 
+    def camera_step(self) -> CameraStep | None:
+        """Take how the camera moved since this was last asked; None for a picture that stands still."""
+        return None
+
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Look at windows, in one batch where that is possible."""
@@ -120,11 +125,19 @@ class LiveGlances(Glances):
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
         self._prepared: dict[Window, Resampled] = {}
+        self._camera: CameraStep | None = None  # the motion of frames whose looks were closer ones
 
-    def show(self, view: WindowView, frame: float) -> None:
-        """Take the next frame of a stream, which has the size of the first, and the number of frames until it."""
+    def show(self, view: WindowView, frame: float, camera: CameraStep | None = None) -> None:
+        """Take the next frame of a stream, its number, and how the camera moved since the frame before."""
         self.view, self.frame = view, frame
         self._prepared.clear()
+        if camera is not None:
+            self._camera = camera if self._camera is None else self._camera.then(camera)
+
+    def camera_step(self) -> CameraStep | None:
+        """Take how the camera moved since this was last asked."""
+        camera, self._camera = self._camera, None
+        return camera
 
     def prepare(self, window: Window) -> None:
         fixation = torch.tensor([window.fixation], dtype=torch.float64)

@@ -1,0 +1,254 @@
+"""The motion of a camera from frame to frame, estimated from the frames by sparse optical flow."""
+
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.errors import needing
+from semfov.motion.motion import Motion
+
+_LONGER = 480  # longer side in pixels of the reduced frames that are compared
+_CORNERS = 150  # most corners that are followed
+_QUALITY = 0.01  # least quality of a corner, as a share of the best one's
+_APART = 8  # least distance between two corners, in reduced pixels
+_WINDOW = (15, 15)  # window of the flow around a corner, in reduced pixels
+_PYRAMID = 3  # further levels of the flow's pyramid: it follows shifts of about 15 · 2³ reduced pixels
+_RESIDUAL = 1.5  # reduced pixels within which a corner agrees with a motion
+
+_STILL = np.eye(3)
+_STILL_SHIFT = 0.3  # pixels of the frame: a camera that moves less stands still
+_LEAST_IN_VIEW = 0.6  # share of a key frame in view below which there is a new one
+
+_LEAST_CORNERS = 12  # fewer that agree are no evidence
+_LEAST_SHARE = 0.4  # least share of the followed corners that agree
+_MOST_SCALE = 1.3  # largest change of scale between two frames
+_MOST_TURN = 25.0  # largest turn between two frames, in degrees
+
+_BLOCKS = (8, 5)  # columns and rows of blocks in which two frames are compared
+_TEXTURE = 3.0  # least standard deviation of the grey values of a block that can be compared
+_ALIKE = 0.6  # correlation from which on a block agrees
+_LEAST_BLOCKS = 6  # fewer blocks that can be compared are no evidence
+_LEAST_AGREEING = 0.6  # least share of the compared blocks that agree
+
+
+class CameraStep(NamedTuple):
+    """How the camera moved from the last frame to the present one.
+
+    Attributes:
+        motion: maps pixels of the last frame to those of this one; None where the two do not fit together.
+        recovered: maps pixels of the last frame before a disturbance to those of this one, once the two fit.
+        waits: whether frames before a disturbance may still be found again.
+    """
+
+    motion: Motion | None
+    recovered: Motion | None = None
+    waits: bool = False
+
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing has moved, and nothing was lost."""
+        return self.motion is not None and self.recovered is None and self.motion.is_still
+
+    def then(self, later: "CameraStep") -> "CameraStep":
+        """Compose the steps of two successive frames."""
+        motion = None if self.motion is None or later.motion is None else self.motion.then(later.motion)
+        recovered = later.recovered
+        if recovered is None and self.recovered is not None and later.motion is not None:
+            recovered = self.recovered.then(later.motion)
+        return CameraStep(motion, recovered, later.waits)
+
+
+class _Sight:
+    """A frame reduced to grey, `(h, w)`, and pixels of the frame for one of the reduced one, `(x, y)`."""
+
+    def __init__(self, cv2: Any, frame: NDArray[np.uint8]) -> None:
+        self._cv2 = cv2
+        height, width = frame.shape[:2]
+        factor = max(1.0, max(width, height) / _LONGER)
+        size = max(1, round(width / factor)), max(1, round(height / factor))
+        self.ratio = width / size[0], height / size[1]
+        self.grey = cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+
+    @cached_property
+    def corners(self) -> NDArray[np.float32]:
+        """Corners that can be followed, `(n, 1, 2)`."""
+        corners = self._cv2.goodFeaturesToTrack(self.grey, _CORNERS, _QUALITY, _APART)
+        return np.zeros((0, 1, 2), np.float32) if corners is None else corners
+
+
+class CameraMotion:
+    r"""Estimates how the picture of a scene moved since the last frame, or finds that two frames do not fit together.
+
+    Corners of a key frame (Shi and Tomasi, 1994) are followed into the present one by pyramidal Lucas–Kanade flow
+    (Bouguet, 2001), and a similarity is fitted to them by RANSAC (Fischler and Bolles, 1981); all three are OpenCV's.
+    Errors add up from key frame to key frame alone; a frame becomes one when too few corners are left in view.
+
+    A motion is believed if enough corners agree with it, if it is no leap of scale or turn, and if the key frame, moved
+    by it, correlates with the present one in most blocks that have texture. Otherwise there is none: after a cut, in
+    the dark, or behind something that fills the view. The next frames are then compared with the last one before it,
+    too, for `patience` frames, so that a short disturbance loses nothing.
+
+    A similarity describes a scene that is flat or far away. Parallax of near objects counts as their own motion.
+
+    Args:
+        patience: number of frames for which the last frame before a disturbance is kept.
+
+    Raises:
+        InputError: OpenCV is not installed.
+
+    Example::
+
+        camera = CameraMotion()
+        for frame in frames:
+            motion = camera.step(frame).motion  # None for the first frame, and where frames do not fit together
+    """
+
+    def __init__(self, patience: int = 12) -> None:
+        with needing("OpenCV", "motion of the camera", "opencv-python-headless"):
+            import cv2
+        self._cv2: Any = cv2
+        self.patience = patience
+        self._key: _Sight | None = None
+        self._moved = _STILL  # from the key frame to the last frame, in reduced pixels
+        self._last: _Sight | None = None
+        self._lost: _Sight | None = None  # the last frame before a disturbance
+        self._waited = 0
+
+    def step(self, frame: NDArray[np.uint8]) -> CameraStep:
+        """Take the next frame, and estimate its motion.
+
+        Args:
+            frame: `(h, w, 3)` bytes.
+
+        Returns:
+            The motion since the last frame; none for the first frame, and where the two do not fit together.
+        """
+        now = _Sight(self._cv2, frame)
+        last, self._last = self._last, now
+        if last is None or self._key is None:
+            self._key = now
+            return CameraStep(None)
+        motion = self._since_last(self._key, last, now)
+        if motion is None and self._lost is None:
+            self._lost, self._waited = last, 0
+        if self._lost is None:
+            return CameraStep(motion)
+        self._waited += 1
+        found = self._between(self._lost, now, _STILL)
+        recovered = None if found is None else _at_full_size(found, now.ratio)
+        if recovered is not None or self._waited >= self.patience:
+            self._lost = None
+        return CameraStep(motion, recovered, waits=self._lost is not None)
+
+    def _since_last(self, key: _Sight, last: _Sight, now: _Sight) -> Motion | None:
+        """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
+        moved = self._between(key, now, self._moved)
+        if moved is None and last is not key:
+            key, self._moved = last, _STILL
+            moved = self._between(last, now, _STILL)
+        if moved is None:
+            self._key, self._moved = now, _STILL
+            return None
+        since = moved @ np.linalg.inv(self._moved)
+        if _largest_shift(since, now.grey.shape) * max(now.ratio) < _STILL_SHIFT:
+            return Motion.still()
+        renew = _share_in_view(moved, now.grey.shape) < _LEAST_IN_VIEW
+        self._key, self._moved = (now, _STILL) if renew else (key, moved)
+        return _at_full_size(since, now.ratio)
+
+    def _between(self, first: _Sight, now: _Sight, guess: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Estimate the similarity `(3, 3)` between two reduced frames; None where they do not fit together."""
+        if first.grey.shape != now.grey.shape or len(first.corners) < _LEAST_CORNERS:
+            return None
+        cv2 = self._cv2
+        expected = cv2.transform(first.corners, guess[:2]).astype(np.float32)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            first.grey,
+            now.grey,
+            first.corners,
+            expected,
+            winSize=_WINDOW,
+            maxLevel=_PYRAMID,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        followed = found[:, 0] == 1
+        if followed.sum() < _LEAST_CORNERS:
+            return None
+        similarity, agree = cv2.estimateAffinePartial2D(
+            first.corners[followed], there[followed], ransacReprojThreshold=_RESIDUAL
+        )
+        if similarity is None or not _is_plausible(similarity, int(agree.sum()), int(followed.sum())):
+            return None
+        if not self._correlates(first.grey, now.grey, similarity):
+            return None
+        return np.vstack([similarity, _STILL[2]])
+
+    def _correlates(self, first: NDArray[np.uint8], now: NDArray[np.uint8], similarity: NDArray[np.float64]) -> bool:
+        """Whether a frame, moved, looks like the present one in most blocks with texture that both show."""
+        cv2 = self._cv2
+        height, width = now.shape
+        moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
+        shown = cv2.warpAffine(np.ones_like(first), similarity, (width, height), flags=cv2.INTER_NEAREST)
+        columns, rows = _BLOCKS
+        down, across = (
+            np.linspace(0, length, count + 1).astype(int) for length, count in ((height, rows), (width, columns))
+        )
+        correlations = []
+        for top, bottom in pairwise(down):
+            for left, right in pairwise(across):
+                block = slice(top, bottom), slice(left, right)
+                if shown[block].size and shown[block].all():
+                    correlations.append(_correlation(moved[block], now[block]))
+        compared = [value for value in correlations if value is not None]
+        agreeing = sum(value >= _ALIKE for value in compared)
+        return len(compared) >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * len(compared)
+
+
+def _is_plausible(similarity: NDArray[np.float64], agreeing: int, followed: int) -> bool:
+    """Whether enough corners agree with a similarity `(2, 3)`, and it is no leap of scale or turn."""
+    scale = float(np.hypot(similarity[0, 0], similarity[1, 0]))
+    turn = float(np.degrees(np.arctan2(similarity[1, 0], similarity[0, 0])))
+    enough = agreeing >= max(_LEAST_CORNERS, _LEAST_SHARE * followed)
+    return enough and 1 / _MOST_SCALE <= scale <= _MOST_SCALE and abs(turn) <= _MOST_TURN
+
+
+def _correlation(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float | None:
+    """Pearson's correlation of two blocks; None where neither has texture."""
+    a, b = first.astype(np.float32), second.astype(np.float32)
+    spread = float(a.std()), float(b.std())
+    if max(spread) < _TEXTURE:
+        return None
+    if min(spread) == 0:
+        return 0.0
+    return float(((a - a.mean()) * (b - b.mean())).mean() / (spread[0] * spread[1]))
+
+
+def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -> Motion:
+    """The motion of a frame, from that of its reduced copy, whose pixel 0 is the mean of the frame's first ones."""
+    across, down = ratio
+    enlarge = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
+    return Motion(enlarge @ similarity @ np.linalg.inv(enlarge))
+
+
+def _corners_of(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """The corners of a frame `(h, w)`, homogeneous, `(3, 4)`."""
+    height, width = shape
+    return np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], dtype=np.float64)
+
+
+def _largest_shift(similarity: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+    """How far a similarity moves a corner of the frame at most, in pixels."""
+    corners = _corners_of(shape)
+    return float(np.linalg.norm((similarity @ corners - corners)[:2], axis=0).max())
+
+
+def _share_in_view(similarity: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+    """About the share of a frame that is still in view after a motion, by the upright box around it."""
+    height, width = shape
+    x, y, _ = similarity @ _corners_of(shape)
+    across = max(min(x.max(), width) - max(x.min(), 0), 0) / width
+    down = max(min(y.max(), height) - max(y.min(), 0), 0) / height
+    return float(across * down)

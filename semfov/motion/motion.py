@@ -1,0 +1,132 @@
+"""Maps between two frames of a stream: where points and boxes of one frame lie in the other."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from semfov.errors import check
+
+_LEAST_AREA = 1e-6  # least factor by which a map may change areas: below it the frame is a line
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    r"""A projective map from the pixels of one frame to those of another, where the scene is flat or far away.
+
+    .. math:: (x', y', w)^\top = M \, (x, y, 1)^\top, \qquad (x, y) \mapsto (x' / w, \; y' / w)
+
+    A similarity (shift, rotation and scale) has the last row (0, 0, 1). Pixel centres are at integers.
+
+    Attributes:
+        matrix: M, `(3, 3)` float64.
+
+    Raises:
+        InputError: the matrix has another shape, is not finite, or flattens the frame.
+
+    >>> motion = Motion.similarity(shift=(10, 0), scale=2.0)
+    >>> motion.points(torch.tensor([[1.0, 2.0]]))
+    tensor([[12.,  4.]])
+    >>> motion.then(motion.inverse()).is_still
+    True
+    """
+
+    matrix: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Copy the matrix as float64, and check it."""
+        matrix = np.array(self.matrix, dtype=np.float64)
+        expected = "a 3 × 3 matrix that maps a frame to a frame (np.vstack adds (0, 0, 1) to a 2 × 3 one)"
+        check(matrix.shape == (3, 3), "motion", expected, f"shape {matrix.shape}")
+        whole = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > _LEAST_AREA
+        check(whole and matrix[2, 2] != 0, "motion", expected, matrix.tolist())
+        object.__setattr__(self, "matrix", matrix / matrix[2, 2])
+
+    @classmethod
+    def still(cls) -> Self:
+        """Make the motion of a camera that stands still."""
+        return cls(np.eye(3))
+
+    @classmethod
+    def similarity(cls, *, shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0) -> Self:
+        """Make a motion of a shift in pixels, a turn in degrees about the origin, and a scale.
+
+        Args:
+            shift: `(x, y)`, where the origin of the first frame lies in the second one.
+            turn: degrees from the x axis towards the y axis, clockwise on a screen.
+            scale: pixels of the second frame for one of the first.
+
+        Returns:
+            The motion.
+
+        >>> Motion.similarity(turn=90).points(torch.tensor([[1.0, 0.0]])).round(decimals=6)
+        tensor([[0., 1.]])
+        """
+        cosine, sine = scale * math.cos(math.radians(turn)), scale * math.sin(math.radians(turn))
+        return cls(np.array([[cosine, -sine, shift[0]], [sine, cosine, shift[1]], [0.0, 0.0, 1.0]]))
+
+    @classmethod
+    def of(cls, matrix: "Motion | ArrayLike") -> "Motion":
+        """Take a motion, or make one of a `(3, 3)` or `(2, 3)` matrix, as OpenCV gives."""
+        if isinstance(matrix, Motion):
+            return matrix
+        values = np.asarray(matrix, dtype=np.float64)
+        return cls(np.vstack([values, (0.0, 0.0, 1.0)]) if values.shape == (2, 3) else values)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether every point stays where it is, up to rounding."""
+        return bool(np.allclose(self.matrix, np.eye(3), atol=1e-9))
+
+    def then(self, later: "Motion") -> "Motion":
+        """Compose two motions: this one first, and a later one after it."""
+        return Motion(later.matrix @ self.matrix)
+
+    def inverse(self) -> "Motion":
+        """Invert the motion: the map from the second frame to the first."""
+        return Motion(np.linalg.inv(self.matrix))
+
+    def points(self, points: Tensor) -> Tensor:
+        """Map points.
+
+        Args:
+            points: `(..., 2)`, `(x, y)` in pixels of the first frame.
+
+        Returns:
+            `(..., 2)` in pixels of the second frame.
+        """
+        matrix = torch.from_numpy(self.matrix)
+        mapped = points.double() @ matrix[:, :2].T + matrix[:, 2]
+        return (mapped[..., :2] / mapped[..., 2:]).to(points)
+
+    def scale_at(self, points: Tensor) -> Tensor:
+        """Compute the local scale: pixels of the second frame for one of the first, as the root of the areas' ratio.
+
+        Args:
+            points: `(..., 2)`, `(x, y)` in pixels of the first frame.
+
+        Returns:
+            `(...)`, positive.
+        """
+        # The determinant of the map's derivative at a point is det(M) / w³.
+        weight = points.double() @ torch.from_numpy(self.matrix[2, :2].copy()) + 1.0
+        return (abs(float(np.linalg.det(self.matrix))) / weight.abs() ** 3).sqrt().to(points)
+
+    def boxes(self, boxes: Tensor) -> Tensor:
+        """Map boxes: their centres move, and their sides are scaled; they stay upright.
+
+        Args:
+            boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frame.
+
+        Returns:
+            `(..., 4)` in pixels of the second frame.
+        """
+        low, high = boxes[..., :2], boxes[..., 2:]
+        centre = (low + high) / 2
+        half = (high - low) / 2 * self.scale_at(centre)[..., None]
+        there = self.points(centre)
+        return torch.cat([there - half, there + half], -1)

@@ -1,0 +1,95 @@
+"""Looks that a moving camera carries along: where what they showed lies in the present frame.
+
+    frame t0:  window ▢ with boxes ──── motion since t0 ────►  frame t:  window ▢ and boxes, moved and scaled,
+                                                                         the same scores, a map of hints resampled
+
+A look is carried from the frame in which it was taken, by the motion since then, so that nothing is resampled twice.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.motion import Motion
+from semfov.zoom.glances import Glance, Window
+from semfov.zoom.hints import Gist
+from semfov.zoom.lattice import Lattice
+
+
+def carried(glance: Glance, motion: Motion, lattice: Lattice) -> Glance:
+    """Carry a look to another frame.
+
+    Args:
+        glance: the look, as it was taken.
+        motion: maps pixels of the frame in which it was taken to those of the other frame.
+        lattice: lattice of the frames.
+
+    Returns:
+        The look in pixels of the other frame; its window and its boxes may lie beyond the frame. Its window is none of
+        the lattice's any more.
+    """
+    window = _carried_window(glance.window, motion, lattice)
+    detections = glance.detections
+    boxes = Detections(motion.boxes(detections.boxes), detections.scores, detections.mask)
+    gist = None if glance.gist is None else _carried_gist(glance.gist, motion, lattice)
+    return replace(glance, window=window, detections=boxes, gist=gist)
+
+
+def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Which boxes `(..., 4)` have their centre inside a frame of `(width, height)`; → `(...)` boolean."""
+    centre = (boxes[..., :2] + boxes[..., 2:]) / 2
+    return ((centre >= 0) & (centre < boxes.new_tensor(size))).all(-1)
+
+
+def share_shown(window: Window, lattice: Lattice) -> float:
+    """Share of the frame that a window shows."""
+    (x1, y1, x2, y2), (width, height) = window.region(lattice), lattice.size
+    across = max(min(x2, width) - max(x1, 0.0), 0.0)
+    down = max(min(y2, height) - max(y1, 0.0), 0.0)
+    return across * down / (width * height)
+
+
+def _carried_window(window: Window, motion: Motion, lattice: Lattice) -> Window:
+    """The window in another frame: an upright box about its moved centre."""
+    region = torch.tensor(window.region(lattice), dtype=torch.float64)
+    centre = (region[:2] + region[2:]) / 2
+    scale = float(motion.scale_at(centre))
+    x1, y1, x2, y2 = motion.boxes(region).tolist()
+    wide, high = lattice.pitch
+    cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
+    fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, window.fixation[2] / scale
+    return Window(fixation, window.level, cells, (x1, y1, x2, y2))
+
+
+def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
+    """The hints of a look in the cells of another frame, each from the nearest cell of the look; None for no cell.
+
+    Hints of a look at the whole frame fill the lattice: what enters at a border is expected to be like that border.
+    """
+    rows, columns = gist.scores.shape[:2]
+    first = np.array(gist.first)
+    pitch = np.array(lattice.pitch)
+    if gist.level == 0:
+        low, high = first, np.array([columns, rows])
+    else:
+        corner = motion.points(torch.from_numpy(first * pitch)[None])[0].numpy()
+        moved = np.rint(corner / pitch).astype(int)
+        low = moved.clip(0)
+        high = np.minimum(moved + gist.scale * np.array([columns, rows]), (lattice.columns, lattice.rows))
+        high = (high - low) // gist.scale
+        if high.min() <= 0:
+            return None
+    cells = np.stack(np.meshgrid(*(np.arange(count) for count in high)), -1)
+    centres = (low + (cells + 0.5) * gist.scale) * pitch
+    there = motion.inverse().points(torch.from_numpy(centres)).numpy()
+    place = np.floor((there / pitch - first) / gist.scale).astype(np.intp)
+    nearest = place.clip(0, (columns - 1, rows - 1))
+    column, row = nearest[..., 0], nearest[..., 1]
+    scores, size, found = gist.scores[row, column], gist.size[row, column], gist.found[row, column]
+    if gist.level > 0:
+        shown = torch.from_numpy((place == nearest).all(-1))
+        scores, size, found = scores * shown[..., None], size * shown, found & shown[..., None]
+    return Gist(gist.level, (int(low[0]), int(low[1])), gist.scale, scores, size, found)
