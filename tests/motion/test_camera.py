@@ -1,0 +1,151 @@
+"""The motion of a camera over a scene that is known: estimated within a pixel, or not at all."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semfov.motion import CameraMotion, CameraStep, Motion
+
+WIDTH, HEIGHT = 640, 360
+CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
+
+
+def scene(seed=0, side=1600):
+    """Random patches of many sizes, as a ground seen from above has."""
+    random, picture = np.random.default_rng(seed), np.full((side, side, 3), 120, np.uint8)
+    for size in (200, 80, 40, 20, 10):
+        for _ in range(3 * (side // size) ** 2 // 4):
+            x, y = random.integers(0, side, 2)
+            colour = random.integers(0, 255, 3).tolist()
+            cv2.rectangle(
+                picture, (int(x), int(y)), (int(x + random.integers(4, size)), int(y + size // 2)), colour, -1
+            )
+    return cv2.GaussianBlur(picture, (5, 5), 1)
+
+
+def view(picture, x, y, turn=0.0, scale=1.0):
+    """A frame about a place of the scene, and the map from the scene to the frame."""
+    matrix = cv2.getRotationMatrix2D((x, y), turn, scale)
+    matrix[:, 2] += CENTRE - (x, y)
+    frame = cv2.warpAffine(picture, matrix, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
+    return frame, Motion.of(matrix)
+
+
+def error(motion, before, after):
+    """Distance in pixels between where a motion takes points of a frame and where they are."""
+    import torch
+
+    places = torch.tensor([[100.0, 60.0], [500.0, 80.0], [320.0, 180.0], [120.0, 300.0], [560.0, 310.0]])
+    truth = before.inverse().then(after)
+    return float((motion.points(places) - truth.points(places)).norm(dim=-1).max())
+
+
+FLIGHTS = {
+    "shift": lambda k: (600 + 9 * k, 700 + 5 * k),
+    "fast": lambda k: (400 + 40 * k, 800),
+    "turn": lambda k: (800, 800, 1.5 * k),
+    "zoom": lambda k: (800, 800, 0.0, 1.02**k),
+    "shake": lambda k: (800 + 6 * (-1) ** k, 800 + 4 * (-1) ** (k // 2)),
+}
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_motions_add_up_to_where_the_camera_is(flight):
+    """Twenty frames: each step is right, and so is their sum."""
+    picture, camera = scene(), CameraMotion()
+    total = Motion.still()
+    frame, first = view(picture, *FLIGHTS[flight](0))
+    assert camera.step(frame) == CameraStep(None)
+    for number in range(1, 20):
+        frame, now = view(picture, *FLIGHTS[flight](number))
+        step = camera.step(frame)
+        assert step.motion is not None
+        total = total.then(step.motion)
+        assert error(total, first, now) < 1.0
+
+
+def test_a_camera_that_stands_still_has_not_moved_at_all():
+    """Noise of the sensor is no motion."""
+    picture, camera, random = scene(), CameraMotion(), np.random.default_rng(1)
+    frame, _ = view(picture, 700, 700)
+    camera.step(frame)
+    for _ in range(5):
+        noisy = np.clip(frame + random.normal(0, 3, frame.shape), 0, 255).astype(np.uint8)
+        assert camera.step(noisy).is_still
+
+
+def test_a_slow_drift_is_not_lost_to_rounding():
+    picture, camera = scene(), CameraMotion()
+    frame, first = view(picture, 700, 700)
+    camera.step(frame)
+    total = Motion.still()
+    for number in range(1, 31):
+        frame, now = view(picture, 700 + 0.1 * number, 700)
+        step = camera.step(frame)
+        assert step.motion is not None
+        total = total.then(step.motion)
+    assert error(total, first, now) < 0.6
+
+
+DISTURBED = {
+    "another scene": lambda frame: view(scene(9), 800, 800)[0],
+    "a mirrored frame": lambda frame: frame[:, ::-1].copy(),
+    "darkness": lambda frame: np.zeros_like(frame),
+    "noise": lambda frame: np.random.default_rng(0).integers(0, 255, frame.shape, np.uint8),
+    "a grey wall": lambda frame: np.full_like(frame, 128),
+    "an upside-down frame": lambda frame: frame[::-1, ::-1].copy(),
+    "a leap": lambda frame: cv2.resize(frame[120:240, 213:427], (WIDTH, HEIGHT)),
+}
+
+
+@pytest.mark.parametrize("disturbance", DISTURBED)
+def test_frames_that_do_not_fit_together_have_no_motion(disturbance):
+    frame, _ = view(scene(), 700, 700)
+    camera = CameraMotion()
+    camera.step(frame)
+    assert camera.step(DISTURBED[disturbance](frame)).motion is None
+
+
+def test_frames_after_a_disturbance_are_found_again():
+    """The motion is that since the last frame before it."""
+    picture, camera = scene(), CameraMotion(patience=4)
+    frame, before = view(picture, 700, 700)
+    camera.step(frame)
+    dark = np.zeros_like(frame)
+    for _ in range(2):
+        step = camera.step(dark)
+        assert step.motion is None
+        assert step.waits
+    frame, after = view(picture, 712, 705)
+    step = camera.step(frame)
+    assert step.motion is None
+    assert not step.waits
+    assert error(step.recovered, before, after) < 1.0
+    frame, later = view(picture, 720, 708)
+    step = camera.step(frame)
+    assert error(step.motion, after, later) < 1.0
+
+
+def test_a_disturbance_that_lasts_ends_the_wait():
+    picture, camera = scene(), CameraMotion(patience=3)
+    frame, _ = view(picture, 700, 700)
+    other = scene(9)
+    camera.step(frame)
+    steps = [camera.step(view(other, 600 + 5 * number, 600)[0]) for number in range(4)]
+    assert [step.waits for step in steps] == [True, True, False, False]
+    assert [step.recovered for step in steps] == [None] * 4
+    assert [step.motion is None for step in steps] == [
+        True,
+        False,
+        False,
+        False,
+    ]  # the new scene has motions of its own
+
+
+def test_steps_of_two_frames_are_composed():
+    first, second = Motion.similarity(shift=(3, 0)), Motion.similarity(shift=(0, 4))
+    both = CameraStep(first).then(CameraStep(second))
+    assert both.motion.matrix[:2, 2].tolist() == [3, 4]
+    assert CameraStep(None, waits=True).then(CameraStep(second, recovered=first)) == CameraStep(None, recovered=first)
+    found = CameraStep(None, recovered=first).then(CameraStep(second))
+    assert found.recovered.matrix[:2, 2].tolist() == [3, 4]

@@ -1,0 +1,70 @@
+"""Motions between frames: a group of projective maps, whose scale is that of small distances."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import InputError
+from semfov.motion import Motion
+
+numbers = st.floats(-200, 200)
+motions = st.builds(
+    lambda x, y, turn, scale, tilt: Motion(
+        Motion.similarity(shift=(x, y), turn=turn, scale=scale).matrix
+        + np.array([[0, 0, 0], [0, 0, 0], [tilt, -tilt, 0]])
+    ),
+    numbers,
+    numbers,
+    st.floats(-180, 180),
+    st.floats(0.2, 5),
+    st.floats(-1e-4, 1e-4),
+)
+points = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=5).map(
+    lambda x: torch.tensor(x, dtype=torch.float64)
+)
+
+
+@given(motions, points)
+def test_points_are_mapped_as_by_opencv(motion, places):
+    expected = cv2.perspectiveTransform(places.numpy()[None], motion.matrix)[0]
+    np.testing.assert_allclose(motion.points(places).numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+@given(motions, motions, points)
+def test_motions_compose_and_invert(first, second, places):
+    both = first.then(second)
+    torch.testing.assert_close(both.points(places), second.points(first.points(places)), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(first.inverse().points(first.points(places)), places, rtol=1e-6, atol=1e-6)
+    assert first.then(first.inverse()).is_still
+
+
+@given(motions, points)
+def test_scale_is_that_of_a_small_triangle(motion, places):
+    step = 1e-3
+    right, below = places + torch.tensor([step, 0.0]), places + torch.tensor([0.0, step])
+    u, v = (motion.points(each) - motion.points(places) for each in (right, below))
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs() / step**2
+    torch.testing.assert_close(motion.scale_at(places), area.sqrt(), rtol=1e-4, atol=1e-6)
+
+
+def test_boxes_move_with_their_centres_and_keep_their_precision():
+    motion = Motion.similarity(shift=(5, -3), scale=2)
+    boxes = torch.tensor([[[0.0, 0.0, 10.0, 4.0]]])
+    assert motion.boxes(boxes).tolist() == [[[5.0, -3.0, 25.0, 5.0]]]
+    turned = Motion.similarity(turn=90).boxes(torch.tensor([[8.0, -1.0, 12.0, 1.0]]))
+    torch.testing.assert_close(turned, torch.tensor([[-2.0, 9.0, 2.0, 11.0]]))
+    assert motion.boxes(boxes).dtype == torch.float32
+
+
+def test_matrices_of_opencv_are_taken_and_others_refused():
+    similarity = cv2.getRotationMatrix2D((10.0, 20.0), 30, 1.5)
+    place = torch.tensor([[10.0, 20.0]])
+    torch.testing.assert_close(Motion.of(similarity).points(place), place)
+    motion = Motion.still()
+    assert Motion.of(motion) is motion
+    for matrix in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4), np.diag([1.0, 1.0, 0.0])):
+        with pytest.raises(InputError, match="motion: expected a 3 × 3 matrix"):
+            Motion.of(matrix)
