@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from semfov.motion import CameraMotion, CameraStep, Motion
 
@@ -33,8 +34,6 @@ def view(picture, x, y, turn=0.0, scale=1.0):
 
 def error(motion, before, after):
     """Distance in pixels between where a motion takes points of a frame and where they are."""
-    import torch
-
     places = torch.tensor([[100.0, 60.0], [500.0, 80.0], [320.0, 180.0], [120.0, 300.0], [560.0, 310.0]])
     truth = before.inverse().then(after)
     return float((motion.points(places) - truth.points(places)).norm(dim=-1).max())
@@ -139,7 +138,7 @@ def test_a_disturbance_that_lasts_ends_the_wait():
         False,
         False,
         False,
-    ]  # the new scene has motions of its own
+    ]
 
 
 def test_steps_of_two_frames_are_composed():

@@ -11,20 +11,16 @@ from semfov import InputError
 from semfov.motion import Motion
 
 numbers = st.floats(-200, 200)
-motions = st.builds(
-    lambda x, y, turn, scale, tilt: Motion(
-        Motion.similarity(shift=(x, y), turn=turn, scale=scale).matrix
-        + np.array([[0, 0, 0], [0, 0, 0], [tilt, -tilt, 0]])
-    ),
-    numbers,
-    numbers,
-    st.floats(-180, 180),
-    st.floats(0.2, 5),
-    st.floats(-1e-4, 1e-4),
-)
-points = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=5).map(
-    lambda x: torch.tensor(x, dtype=torch.float64)
-)
+
+
+def projective(shift, turn, scale, tilt):
+    matrix = Motion.similarity(shift=shift, turn=turn, scale=scale).matrix
+    return Motion(matrix + np.array([[0, 0, 0], [0, 0, 0], [tilt, -tilt, 0]]))
+
+
+pairs = st.tuples(numbers, numbers)
+motions = st.builds(projective, pairs, st.floats(-180, 180), st.floats(0.2, 5), st.floats(-1e-4, 1e-4))
+points = st.lists(pairs, min_size=1, max_size=5).map(lambda places: torch.tensor(places, dtype=torch.float64))
 
 
 @given(motions, points)

@@ -120,8 +120,7 @@ def test_objects_stay_at_their_places_while_the_camera_moves(speed):
     """After thirty frames, one look each, nearly all squares are known, and few boxes are elsewhere."""
     agent = ZoomAgent(WindowEye(Patches())).eval()
     episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.01, follows=True)
-    for frame, boxes in flight(30, speed):
-        moment = episode.step(frame)
+    *_, (moment, boxes) = ((episode.step(frame), boxes) for frame, boxes in flight(30, speed))
     overlap = box_iou(boxes, moment.objects.boxes) >= 0.5
     assert overlap.any(1).float().mean() >= 0.85
     inside = ((moment.objects.boxes[:, :2] > 40) & (moment.objects.boxes[:, 2:] < torch.tensor([980.0, 720.0]))).all(-1)
