@@ -2,6 +2,8 @@
 
 from typing import Any, get_args
 
+from numpy.typing import ArrayLike
+
 from semfov.agents.episode import Episode, without_none
 from semfov.agents.fovea import FoveaAgent, FoveaEpisode
 from semfov.agents.picture import OpenedPicture
@@ -9,6 +11,7 @@ from semfov.agents.windows import ZoomAgent
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.tone import White, check_white
 from semfov.errors import check, lookup
+from semfov.motion import Motion
 from semfov.paths import Moment
 
 __all__ = ["LivePerception"]
@@ -22,6 +25,10 @@ class LivePerception:
 
     With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
     detector's input where the agent has no evidence for photographs, or where a first cell is given.
+
+    Looks at windows follow a camera that moves: what they showed is carried along. Where a frame fits none before it,
+    after a cut or in the dark, the moment is `lost`, and only what that frame shows is listed, until the scene is found
+    again. The scene is taken to be flat or far away. A fovea does not follow the camera.
 
     Args:
         fovea: the part of an agent that looks by a fovea.
@@ -87,13 +94,16 @@ class LivePerception:
         }
         self._check_start()
 
-    def step(self, frame: ImageLike, passed: float = 1.0) -> Moment:
+    def step(self, frame: ImageLike, passed: float = 1.0, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame.
 
         Args:
             frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
             passed: number of frames since the last look, this one included, by which evidence fades; above 1 where
                 frames were lost, such as the seconds between two time stamps times the frames per second.
+            pose: where the camera is, if that is known from a gimbal or from odometry: the map from pixels of the first
+                frame to pixels of this one, a `semfov.motion.Motion` or its `(3, 3)` or `(2, 3)` matrix; for all frames
+                or none. None estimates the motion from the frames (`semfov.motion.CameraMotion`).
 
         Returns:
             What is known at this frame: a `FoveaMoment` or a `WindowMoment`.
@@ -111,7 +121,7 @@ class LivePerception:
         if self.how == "auto":
             self.how = picture.kind("auto", self._canvas, photographs=self._photographs)
             self._check_start()
-        return self._episodes[self.how].step(frame, passed)
+        return self._episodes[self.how].step(frame, passed, pose)
 
     @property
     def criterion(self) -> str | None:

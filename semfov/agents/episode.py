@@ -7,12 +7,14 @@ from time import perf_counter
 from typing import Any, Generic, Literal, TypeVar
 
 import torch
+from numpy.typing import ArrayLike
 from torch import nn
 
 from semfov.data.inputs import ImageLike
 from semfov.decision import Decision
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole
+from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
@@ -77,6 +79,7 @@ class Episode(ABC, Generic[_Record]):
         self.limits = EpisodeLimits() if limits is None else limits
         self.forgetting = None if rate is None else Forgetting(rate)
         self.passed = 1.0
+        self.pose: Motion | ArrayLike | None = None
         self.passes = 0
         self.ending: Ending | None = None
         self.criterion: str | None = None
@@ -100,10 +103,10 @@ class Episode(ABC, Generic[_Record]):
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
     @torch.inference_mode()
-    def step(self, frame: ImageLike, passed: float = 1.0) -> Moment:
+    def step(self, frame: ImageLike, passed: float = 1.0, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame of a stream (`look`), and tell what is known then."""
         check_number(passed, "passed", 0, 1e9)
-        self.passed = passed
+        self.passed, self.pose = passed, pose
         self.look(frame)
         return self.moment()
 

@@ -236,6 +236,7 @@ class FoveaEpisode(Episode[Scanpath]):
 
     def _look_at(self, frame: ImageLike) -> RecordedLook | None:
         """Spend a frame of a stream on a look."""
+        check(self.pose is None, "pose", "None for a fovea, or how='windows', whose looks follow the camera", self.pose)
         self._pixels = as_pixels(frame, argument="frame", color=self.color)
         if isinstance(frame, Tensor):  # of all others this is a copy
             self._pixels = self._pixels.clone()

@@ -1,5 +1,6 @@
 """Looks at windows of a picture larger than the detector's input, or of the frames of a stream."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -19,8 +20,8 @@ from semfov.data.windowed import LargePicture
 from semfov.decision import Decision, check_thresholds
 from semfov.detection import LEAST, Detections
 from semfov.detection.load import load_detector, loader_options
-from semfov.errors import check, check_number, check_options, check_whole
-from semfov.motion import CameraMotion
+from semfov.errors import InputError, check, check_number, check_options, check_whole
+from semfov.motion import CameraMotion, CameraStep, KnownPoses
 from semfov.paths import Ending, RecordedLook, WindowMoment, ZoomPath
 from semfov.paths.stimulus import reduced_copy
 from semfov.zoom.belief import ZoomBelief
@@ -277,7 +278,9 @@ class WindowEpisode(Episode[ZoomPath]):
         self._last: WindowStep[Any] | None = None
         self._newest: KeptLook | None = None
         self._closer_looks: list[KeptLook] = []
-        self._camera = CameraMotion() if follows else None
+        self._camera = _followed_camera() if follows else None
+        self._poses: KnownPoses | None = None
+        self._lost = False
         self._frame = 0.0
         self._concluded: Decision | None = None
         self._began = perf_counter()
@@ -359,15 +362,12 @@ class WindowEpisode(Episode[ZoomPath]):
     def _follow(self, view: WindowView) -> None:
         """Take the next frame of a stream, and carry what is known along with the camera."""
         assert isinstance(self._glances, LiveGlances)
-        if self._camera is None:
-            self._glances.show(view, self._frame)
-            return
-        width, height = view.picture.size
-        camera = self._camera.step(view.picture.pixels((0, 0, width, height)))
-        if self._newest is None:
+        camera = self._camera_step(view)
+        if camera is None or self._newest is None:
             self._glances.show(view, self._frame)
             return
         self._glances.show(view, self._frame, camera)
+        self._lost = camera.motion is None and camera.recovered is None
         if camera.is_still:
             return
         if camera.motion is None:
@@ -377,6 +377,20 @@ class WindowEpisode(Episode[ZoomPath]):
                 look.carry(camera.motion, self._glances.lattice)
         if self._decisions is not None:
             self._decisions.follow(camera.motion)
+
+    def _camera_step(self, view: WindowView) -> CameraStep | None:
+        """How the camera moved since the last frame, by its pose or by the frames; None if it is not followed."""
+        first = self._newest is None
+        check(
+            first or (self.pose is None) == (self._poses is None), "pose", "a pose of each frame, or of none", self.pose
+        )
+        if self.pose is not None:
+            self._poses = self._poses or KnownPoses()
+            return self._poses.step(self.pose)
+        if self._camera is None:
+            return None
+        width, height = view.picture.size
+        return self._camera.step(view.picture.pixels((0, 0, width, height)))
 
     def _turn(self) -> bool:
         """Make the next look of the search or the exploration; returns whether one was left."""
@@ -470,6 +484,7 @@ class WindowEpisode(Episode[ZoomPath]):
             **self._recorded(),
             photograph=reduced_copy(self._glances.view.picture),
             number=self.passes - 1,
+            lost=self._lost,
             next_window=self._last.choices[0][0]
             if candidate is None
             else closer_window(self._glances.lattice, candidate.box, self._closer),
@@ -496,7 +511,7 @@ class WindowEpisode(Episode[ZoomPath]):
             objects, unseen = probable_objects(
                 current, lattice, sought, self.certainty, remaining=remaining, promised=sum(further), latest=fading
             )
-        if self._camera is not None:
+        if self._camera is not None or self._poses is not None:
             objects = objects[inside_frame(objects.boxes, lattice.size)]
         return {
             "lattice": lattice,
@@ -519,6 +534,15 @@ class WindowEpisode(Episode[ZoomPath]):
     def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
         return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None
+
+
+def _followed_camera() -> CameraMotion | None:
+    """What follows a camera that moves; without OpenCV a warning, and the camera is taken to stand still."""
+    try:
+        return CameraMotion()
+    except InputError as error:
+        warnings.warn(f"the camera is taken to stand still, unless poses are given: {error}", stacklevel=2)
+        return None
 
 
 def _without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:

@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import needing
 from semfov.motion.motion import Motion
@@ -59,6 +59,33 @@ class CameraStep(NamedTuple):
         if recovered is None and self.recovered is not None and later.motion is not None:
             recovered = self.recovered.then(later.motion)
         return CameraStep(motion, recovered, later.waits)
+
+
+class KnownPoses:
+    """How the camera moved by poses that are known: of a gimbal, a head, or a robot's odometry.
+
+    >>> camera = KnownPoses()
+    >>> camera.step([[1, 0, 0], [0, 1, 0]]).motion is None
+    True
+    >>> camera.step([[1, 0, 8], [0, 1, -2]]).motion.matrix[:2, 2].tolist()
+    [8.0, -2.0]
+    """
+
+    def __init__(self) -> None:
+        self._last: Motion | None = None
+
+    def step(self, pose: Motion | ArrayLike) -> CameraStep:
+        """Take the pose of the next frame.
+
+        Args:
+            pose: maps pixels of a frame that is the same for all poses, such as the first one, to pixels of this frame;
+                a `Motion`, or its `(3, 3)` or `(2, 3)` matrix.
+
+        Returns:
+            The motion since the last frame; none for the first frame.
+        """
+        last, self._last = self._last, Motion.of(pose)
+        return CameraStep(None if last is None else last.inverse().then(self._last))
 
 
 class _Sight:

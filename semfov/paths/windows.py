@@ -12,7 +12,7 @@ from torch import Tensor
 from semfov.data.classes import plural
 from semfov.detection import Detections, Objects
 from semfov.errors import check
-from semfov.io.schema import Array, Field, Json, Maybe, Number, Object
+from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
@@ -313,12 +313,13 @@ class WindowMoment(ZoomPath, Moment):
     """The looks that count at one frame whose windows are looked at, and what they show.
 
     It is the record of these looks, the last of which is at this frame. Its objects are merged from them. Those of
-    earlier frames are where they were then.
+    earlier frames are where the camera shows their places now.
 
     Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
 
     Attributes:
         next_window: the window to look at in the next frame.
+        lost: whether the frame fits none before it, after a cut or in the dark; then nothing of earlier frames counts.
 
     Example::
 
@@ -327,8 +328,9 @@ class WindowMoment(ZoomPath, Moment):
     """
 
     next_window: Window
+    lost: bool = False
 
-    _format = Format("window moment", _TENSORS, {**_VALUES, "number": WHOLE, "next_window": _WINDOW})
+    _format = Format("window moment", _TENSORS, {**_VALUES, "number": WHOLE, "next_window": _WINDOW, "lost": Flag()})
 
     @property
     def next_point(self) -> tuple[float, float]:
@@ -347,7 +349,8 @@ class WindowMoment(ZoomPath, Moment):
 
     def describe(self) -> str:
         """Describe objects or decision at the frame in a few words."""
-        return self._decided() or self.objects_in_words()
+        known = self._decided() or self.objects_in_words()
+        return f"{known}; the camera lost the scene" if self.lost else known
 
     def _lines(self) -> list[str]:
         return [f"frame {self.number}", *super()._lines()]
@@ -355,13 +358,13 @@ class WindowMoment(ZoomPath, Moment):
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
         window = {name: getattr(self.next_window, name) for name in _WINDOW_VALUES}
-        return tensors, {**record, "number": self.number, "next_window": window}
+        return tensors, {**record, "number": self.number, "next_window": window, "lost": self.lost}
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         made = super()._fields(tensors, record, shared)
         window = _window_from(record["next_window"], made["lattice"])
-        return {**made, "number": record["number"], "next_window": window}
+        return {**made, "number": record["number"], "next_window": window, "lost": record.get("lost", False)}
 
 
 def _ends_in_words(low: int, high: int) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import Detections, Detector, WindowEye, ZoomAgent
+from semfov import Detections, Detector, InputError, WindowEye, ZoomAgent
 from semfov.agents.episode import EpisodeLimits
 from semfov.detection.scores import Candidates
 from semfov.motion import Motion
@@ -139,3 +139,27 @@ def test_a_cut_ends_what_was_known():
     for number in range(3):
         moment = episode.step(np.roll(empty, 4 * number, 1))
     assert len(moment.objects) == 0
+
+
+@pytest.mark.slow
+def test_known_poses_take_the_place_of_the_estimate():
+    """A camera that turns about itself over a ground without any texture, where nothing can be followed."""
+    agent = ZoomAgent(WindowEye(Patches())).eval()
+    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.01, follows=True)
+    for number in range(12):
+        frame = np.full((768, 1024, 3), 90, np.uint8)
+        x, y = 300 + 10 * number, 500 - 7 * number
+        cv2.rectangle(frame, (x, y), (x + 39, y + 39), (255, 0, 0), -1)
+        moment = episode.step(frame, pose=[[1, 0, 10 * number], [0, 1, -7 * number]])
+    assert not moment.lost
+    assert len(moment.objects) == 1
+    assert float(box_iou(moment.objects.boxes, torch.tensor([[x, y, x + 40.0, y + 40.0]]))) > 0.7
+
+
+def test_poses_are_given_for_all_frames_or_none():
+    agent = ZoomAgent(WindowEye(Patches())).eval()
+    frame = np.full((768, 1024, 3), 90, np.uint8)
+    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.01, follows=True)
+    episode.step(frame, pose=np.eye(3))
+    with pytest.raises(InputError, match="pose: expected a pose of each frame, or of none"):
+        episode.step(frame)
