@@ -4,7 +4,7 @@ import logging
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.deep import deep_values, is_deep
 from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.data.windowed import LargePicture
+from semfov.data.windowed import BY_WINDOWS, LargePicture
 from semfov.errors import DataError, SemfovError, check_data, check_pixels
 from semfov.io.files import check_regular
 
@@ -79,14 +80,64 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     torch.Size([3, 2, 4])
     """
     check_white(white)
+    if oriented and _is_raster(path):
+        from semfov.data.large import open_large  # which reads photographs by `read_photograph`
+
+        picture = open_large(path, white=white)
+        _check_pixels(picture.size, f"image {Path(path)}")
+        return picture.read((0, 0, *picture.size)).float().div_(255)
+    return read_photograph(path, oriented=oriented, white=white)
+
+
+def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
+    """Read an image file by Pillow alone (`read_image`)."""
     with opening(Path(path), "decoded"), open_pillow(path) as image:
         check_proportion(image.size, Path(path).stat().st_size, path)
         _check_pixels(image.size, f"image {Path(path)}")
-        wide = image.mode in _SIXTEEN_BITS and white is None
-        array = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
-    if wide:
-        warn_of_range(float(array.min()) * 65535, float(array.max()) * 65535, path)
+        deep = is_deep(image)
+        wide = deep or image.mode in _SIXTEEN_BITS
+        if not deep:
+            array = shown = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
+    if deep:
+        array, shown = _deep_pixels(path, upright=oriented, white=white)
+    if wide and white is None:
+        warn_of_range(float(shown.min()) * 65535, float(shown.max()) * 65535, path)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
+
+
+def _is_raster(path: str | PathLike[str]) -> bool:
+    """Whether a file is of a kind of which Pillow keeps only the precision of grey values right, and is none of these.
+
+    Masks, channels that are pages, and colours of 16 bits are read as they are by windows.
+    """
+    if Path(path).suffix.lower() not in BY_WINDOWS:
+        return False
+    with suppress(Exception), quiet_decoders, open_pillow(path) as image:  # others say why a file cannot be read
+        grey = image.mode in (*_SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
+        return image.format in ("TIFF", "JPEG2000") and not grey
+    return False
+
+
+def _deep_pixels(
+    path: str | PathLike[str], *, upright: bool, white: White | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels `(H, W, 3)` in [0, 1] of a file with more than 8 bits a channel, over white, and its colours alone."""
+
+    def turned(image: Any) -> Any:
+        stored = _orientation(image)
+        image.load()
+        return _turned(image, stored, _orientation(image), upright=upright)
+
+    with opening(Path(path), "decoded"), open_pillow(path) as image, open_pillow(path) as again:
+        values, most = deep_values((image, again), turned)
+    count = values.shape[-1]
+    colours = values[..., : count - (count in (2, 4))]
+    shown = between(colours, (0.0, float(most)) if white is None else black_and_white(white, colours))
+    pixels = shown if shown.shape[-1] == 3 else np.repeat(shown, 3, -1)
+    if count in (2, 4):
+        share = between(values[..., -1:], (0.0, float(most)))
+        pixels = pixels * share + (1 - share)
+    return pixels, shown
 
 
 def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
@@ -281,7 +332,7 @@ class PhotographPicture(LargePicture):
         x1, y1, x2, y2 = box
         if self._array is None:
             with opening(self.path, "decoded"), open_pillow(self.path) as image:
-                if image.mode in _PLAIN and self._white is None:
+                if image.mode in _PLAIN and self._white is None and not is_deep(image):
                     stored = _orientation(image)
                     image.load()
                     whole = _turned(image, stored, _orientation(image), upright=True)
@@ -291,8 +342,8 @@ class PhotographPicture(LargePicture):
                         rows = whole.crop((0, top, width, min(top + _ROWS, height)))
                         array[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
                     self._array = array  # only now that it is whole
-                else:
-                    self._array = to_bytes(read_image(self.path, white=self._white))
+        if self._array is None:
+            self._array = to_bytes(read_photograph(self.path, white=self._white))  # which may warn
         return self._array[y1:y2, x1:x2]
 
 

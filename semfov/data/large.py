@@ -1,7 +1,6 @@
 """Large pictures that are read window by window: arrays, memory maps, TIFFs, rasters, and files decoded when needed."""
 
 import lzma
-import math
 import re
 import warnings
 import weakref
@@ -41,9 +40,12 @@ _Box = tuple[int, int, int, int]
 _WHITE_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 2, 3, 6  # photometric interpretations
 _PREMULTIPLIED, _UNASSOCIATED = 1, 2  # kinds of a further channel
 _JPEG = 7
-_COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES, _METADATA, _NODATA = 259, 262, 274, 277, 42112, 42113  # tags
+_COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES, _EXTRA, _METADATA, _NODATA = 259, 262, 274, 277, 338, 42112, 42113
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 _ALWAYS = (1, 8, 32946)  # compressions whose decoders are always there
+_MASK = 4  # bit of the kind of a page
+_MOST_LAYERS = 64  # pages that are channels of one picture
+_ROWS = 64  # of a picture that is stored in one strip, which are read at once
 _PLANES = 2  # planar configuration of channels that are stored one after the other
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
 _INFLATERS: dict[int, Callable[[], Any]] = {
@@ -73,7 +75,8 @@ class _TiffPicture(LargePicture):
             first = (number for number in range(min(len(pages), 64)) if not pages[number].is_reduced)
             self.page: Any = pages[next(first, 0) if pages[0].is_reduced else 0]
             page: Any = self.page
-            count = int(page.samplesperpixel)
+            self._layers = _layers_of(self.file, page)
+            count = len(self._layers) if len(self._layers) > 1 else int(page.samplesperpixel)
             self.size = int(page.imagewidth), int(page.imagelength)
             self._check_kind(known=white is not None)
         extra = [int(each) for each in page.extrasamples]
@@ -85,15 +88,12 @@ class _TiffPicture(LargePicture):
             self._alpha = 0  # GDAL names that band otherwise
         colour = tuple(named[name] for name in ("Red", "Green", "Blue") if name in named)
         usual = colour if len(colour) == 3 else None
-        if usual is None and colours == 3 and page.photometric == _RGB:
+        if usual is None and colours == 3 and (page.photometric == _RGB or len(self._layers) > 1):
             usual = 1, 2, 3
         self._channels = [band - 1 for band in _chosen_bands(count, bands, usual, self.path, alpha=bool(self._alpha))]
         if self._alpha:
             self._channels.append(colours + extra.index(self._alpha))
-        nodata = page.tags.get(_NODATA)
-        self._nodata: float | None = None
-        with suppress(ValueError):  # some programs write words
-            self._nodata = None if nodata is None else float(str(nodata.value).strip("\0 "))
+        self._nodata = self._value_of_nothing()
         if page.compression not in _ALWAYS:
             with opening(self.path, "decoded"):
                 self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
@@ -124,15 +124,31 @@ class _TiffPicture(LargePicture):
             return self._bytes(self._values(box))
 
     @cached_property
-    def _tile_size(self) -> tuple[int, int]:
-        """Width and height of a tile, or of a strip."""
+    def _rows_are_plain(self) -> bool:
+        """Whether the whole picture is one strip that is not packed, of which rows can be read."""
         page = self.page
-        return (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
+        whole = not page.is_tiled and page.rowsperstrip >= self.size[1] and all(page.databytecounts)
+        return bool(whole and page.compression == 1 and page.predictor == 1 and page.fillorder == 1)
+
+    @cached_property
+    def _kept(self) -> dict[tuple[int, int], NDArray[Any]]:
+        """Strips that are the whole picture, decoded."""
+        return {}
+
+    @cached_property
+    def _tile_size(self) -> tuple[int, int]:
+        """Width and height of a tile, of a strip, or of what is read at once of a strip that is the whole picture."""
+        page = self.page
+        if page.is_tiled:
+            return page.tilewidth, page.tilelength
+        return self.size[0], min(_ROWS, self.size[1]) if self._rows_are_plain else page.rowsperstrip
 
     @cached_property
     def _held(self) -> NDArray[np.bool_]:
         """Which tiles are stored in the file, `(rows, columns)`."""
         across, down = (-(-length // side) for length, side in zip(self.size, self._tile_size, strict=True))
+        if self._rows_are_plain or len(self._layers) > 1:
+            return np.ones((down, across), np.bool_)
         counts = np.asarray(self.page.databytecounts, np.int64)
         planes = max(len(counts) // (across * down), 1)
         return counts[: planes * across * down].reshape(planes, down, across).any(0)
@@ -148,14 +164,17 @@ class _TiffPicture(LargePicture):
         page, channels = self.page, self._channels
         wide, high = self._tile_size
         across, down = -(-self.size[0] // wide), -(-self.size[1] // high)
-        planes = page.planarconfig == _PLANES and page.samplesperpixel > 1
+        layered = len(self._layers) > 1
+        planes = layered or (page.planarconfig == _PLANES and page.samplesperpixel > 1)
         size = wide * high * (1 if planes else page.samplesperpixel) * page.dtype.itemsize
-        window = np.zeros((y2 - y1, x2 - x1, len(channels)), page.dtype)
+        # What is not stored is without data, or 0, as GDAL reads it.
+        window = np.full((y2 - y1, x2 - x1, len(channels)), self._nodata or 0, page.dtype)
         for place, channel in enumerate(channels) if planes else [(slice(None), 0)]:
             for row in range(y1 // high, -(-y2 // high)):
                 for column in range(x1 // wide, -(-x2 // wide)):
-                    number = (channel * down if planes else 0) * across + row * across + column
-                    tile = self._tile(number, size)
+                    plane = channel * down if planes and not layered else 0
+                    number = (plane + row) * across + column
+                    tile = self._tile(self._layers[channel if layered else 0], number, size)
                     if tile is None:
                         continue
                     top, left = row * high, column * wide
@@ -172,20 +191,42 @@ class _TiffPicture(LargePicture):
                     window[at, along, place] = part
         return window
 
-    def _tile(self, number: int, size: int) -> NDArray[Any] | None:
-        """A tile; None for one that is not stored in the file."""
+    def _tile(self, layer: Any, number: int, size: int) -> NDArray[Any] | None:
+        """A tile of a page; None for one that is not stored in the file."""
         page = self.page
-        offset, count = page.dataoffsets[number], page.databytecounts[number]
+        if self._rows_are_plain:
+            return self._rows(layer, number)
+        if (layer.index, number) in self._kept:
+            return self._kept[layer.index, number]
+        offset, count = layer.dataoffsets[number], layer.databytecounts[number]
         if not count:
             return None
         check_tile(size, count, f"image {self.path}")
-        with self._lock:
-            self.file.filehandle.seek(offset)
-            data = self.file.filehandle.read(count)
+        data = self._stored(offset, count)
         make, most = _INFLATERS.get(int(page.compression)), 2 * size + 2**16
         fits = make is None or len(data) <= _INFLATED or len(make().decompress(data, most)) < most
         check_data(fits, f"image {self.path}", f"tiles of {size:,} bytes", "one that inflates to more; replace it")
-        return page.decode(data, number, jpegtables=page.jpegtables)[0][0]
+        tile: NDArray[Any] = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
+        if not page.is_tiled and page.rowsperstrip >= self.size[1]:
+            self._kept[layer.index, number] = tile  # the whole picture, which each window would decode again
+        return tile
+
+    def _stored(self, offset: int, count: int) -> bytes:
+        with self._lock:
+            self.file.filehandle.seek(offset)
+            return bytes(self.file.filehandle.read(count))
+
+    def _rows(self, layer: Any, number: int) -> NDArray[Any]:
+        """Rows of a picture that is stored in one strip as it is, `(h, w, samples)`; `number` counts such parts."""
+        page, (wide, high) = self.page, self._tile_size
+        down = -(-self.size[1] // high)
+        plane, part = divmod(number, down)
+        rows = min(high, self.size[1] - part * high)
+        samples = 1 if page.planarconfig == _PLANES else page.samplesperpixel
+        kind = page.dtype.newbyteorder(self.file.byteorder)
+        line = wide * samples * kind.itemsize
+        data = self._stored(layer.dataoffsets[plane] + part * high * line, rows * line)
+        return np.frombuffer(data, kind).reshape(rows, wide, samples)
 
     def _bytes(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         count = len(self._channels) - bool(self._alpha)
@@ -199,21 +240,43 @@ class _TiffPicture(LargePicture):
             tile = np.minimum(colour + (255 - share), 255).astype(np.uint8)
         return np.repeat(tile, 3, -1) if count == 1 else tile
 
+    def _value_of_nothing(self) -> float | None:
+        """The value of pixels without data; None where the file names none that its type has."""
+        tag, kind = self.page.tags.get(_NODATA), self.page.dtype
+        try:
+            value = float(str("" if tag is None else tag.value).strip("\0 "))
+        except ValueError:  # some programs write words
+            return None
+        limits = np.iinfo(kind) if kind.kind in "ui" else None
+        return value if limits is None or limits.min <= value <= limits.max else None
+
     def _colour_of_nothing(self) -> tuple[int, int, int] | None:
         """The colour in which pixels without data are shown; None where the file does not tell them."""
         if self._alpha:
             return 255, 255, 255
-        kind = self.page.dtype.kind
-        limits = np.iinfo(self.page.dtype) if kind in "ui" else None
-        value = self._nodata
-        if value is None or (limits and not (limits.min <= value <= limits.max and math.isfinite(value))):
+        if self._nodata is None:
             return None
-        red, green, blue = self._bytes(np.full((1, 1, len(self._channels)), value, self.page.dtype))[0, 0].tolist()
+        values = np.full((1, 1, len(self._channels)), self._nodata, self.page.dtype)
+        red, green, blue = self._bytes(values)[0, 0].tolist()
         return red, green, blue
 
 
-def _is_converted(path: str | PathLike[str]) -> bool:
-    """Whether a TIFF is turned, or of other colours than grey and RGB: Pillow converts these, or nobody reads them."""
+def _layers_of(file: Any, page: Any) -> list[Any]:
+    """The pages of a TIFF that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
+    for series in file.series[:1]:
+        pages = list(series.pages)
+        channels = series.axes == "CYX" and 2 <= len(pages) <= _MOST_LAYERS and page.samplesperpixel == 1
+        if channels and all(each is not None and each.shape == page.shape for each in pages):
+            return pages
+    return [page]
+
+
+def _is_mask(page: Any) -> bool:
+    return bool(getattr(page, "subfiletype", 0) & _MASK)  # frames of a series have none
+
+
+def _tags_of(path: str | PathLike[str]) -> Any:
+    """The tags of the first page of a TIFF, by their numbers; none where it has none that can be read."""
     tags: Any = {}
     check_regular(path, f"image {Path(path)}")
     with quiet_decoders:
@@ -227,6 +290,12 @@ def _is_converted(path: str | PathLike[str]) -> bool:
                 with tifffile.TiffFile(path) as file:
                     first: Any = file.pages[0]
                     tags = {tag.code: tag.value for tag in first.tags.values()}
+    return tags
+
+
+def _is_converted(path: str | PathLike[str]) -> bool:
+    """Whether a TIFF is turned, or of other colours than grey and RGB: Pillow converts these, or nobody reads them."""
+    tags = _tags_of(path)
     kind, packed = tags.get(_PHOTOMETRIC, 1), tags.get(_COMPRESSION, 1)
     turned, bands = tags.get(_ORIENTATION, 1), tags.get(_SAMPLES, 1)
     fits = turned == 1 or kind > 1 or bands <= 2  # of others Pillow reads none, or the first as grey
@@ -264,14 +333,22 @@ class _RasterPicture(LargePicture):
         self._has_overviews = bool(self._file.overviews(self._bands[0]))
         flags = {each.name for each in self._file.mask_flag_enums[self._bands[0] - 1]}
         self._masked = "per_dataset" in flags
+        # What GDAL leaves to those who show a picture: TIFFs with other numbers for white, and colours times alpha.
+        tags = _tags_of(path) if self.path.suffix.lower() in (".tif", ".tiff") else {}
+        self._inverted = tags.get(_PHOTOMETRIC) == _WHITE_IS_ZERO
+        self._premultiplied = _PREMULTIPLIED in np.atleast_1d(tags.get(_EXTRA, ()))
         nodata = self._file.nodatavals[self._bands[0] - 1]
         wide = "uint16" in kinds
         self._tone = _tone_of(self, white, lambda box: self._values(box, 1), nodata=nodata, wide=wide)
         if self._masked:
             self.nothing = 255, 255, 255
         elif nodata is not None:
-            grey = int(bytes_between(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]), self._tone)[0])
+            grey = int(self._shown(np.full((1,), nodata, self._file.dtypes[self._bands[0] - 1]))[0])
             self.nothing = grey, grey, grey
+
+    def _shown(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        pixels = bytes_between(values, self._tone)
+        return 255 - pixels if self._inverted else pixels
 
     def holds(self, box: _Box) -> bool:
         if isinstance(self._file, Mosaic):
@@ -295,10 +372,11 @@ class _RasterPicture(LargePicture):
         return torch.from_numpy(self.pixels(outwards, reduction)).permute(2, 0, 1)
 
     def pixels(self, box: _Box, reduction: int = 1) -> NDArray[np.uint8]:
-        pixels = bytes_between(self._values(box, reduction), self._tone)
+        pixels = self._shown(self._values(box, reduction))
         if self._masked:
             share = self._values(box, reduction, mask=True).astype(np.uint16)
-            pixels = ((pixels * share + 127) // 255 + (255 - share)).clip(max=255).astype(np.uint8)
+            colour = pixels if self._premultiplied else (pixels * share + 127) // 255
+            pixels = (colour + (255 - share)).clip(max=255).astype(np.uint8)
         return np.repeat(pixels, 3, -1) if len(self._bands) == 1 else pixels
 
     def _values(self, box: _Box, reduction: int, *, mask: bool = False) -> NDArray[Any]:
@@ -391,9 +469,9 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) ->
     try:
         tiff = _TiffPicture(path, white=white, bands=bands)
         with opening(tiff.path, "opened"):
-            # `tifffile` does not tell reduced copies apart from other pages.
+            # `tifffile` tells neither reduced copies nor masks apart from other pages.
             pages: Any = tiff.file.pages[1:]
-            if not tiff.page.subifds and not any(page.is_reduced for page in pages):
+            if not tiff.page.subifds and not any(page.is_reduced or _is_mask(page) for page in pages):
                 return tiff
     except DataError as error:
         with suppress(DataError):

@@ -21,7 +21,7 @@ from semfov.detection.exchange import category_ids, coco_results, named_detectio
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text, digits, pixels
-from semfov.paths.georeference import georeference
+from semfov.paths.georeference import georeference, polygon_on_earth
 from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
 from semfov.words import not_there
@@ -316,8 +316,9 @@ class Conversion(Outcome):
     ) -> dict[str, Any]:
         """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
 
-        For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84). Other pictures have no place on
-        earth: their coordinates are pixels with y down, as the member `coordinates` of the collection says.
+        For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84), and a box over the antimeridian
+        has two polygons, one on each side. Other pictures have no place on earth: their coordinates are pixels with y
+        down, as the member `coordinates` of the collection says.
 
         Args:
             path: the file to write; None writes none.
@@ -343,8 +344,12 @@ class Conversion(Outcome):
             for row in rows
         ]
         if place is not None and rows:
-            flat = place(np.array(corners).reshape(-1, 2))
-            corners = [[(x, y) for x, y in ring] for ring in flat.round(8).reshape(-1, 4, 2).tolist()]
+            rings = place(np.array(corners).reshape(-1, 2)).reshape(-1, 4, 2)
+            shapes = [polygon_on_earth(ring) for ring in rings]
+        else:
+            shapes = [
+                {"type": "Polygon", "coordinates": [[list(point) for point in (*ring, ring[0])]]} for ring in corners
+            ]
         names = "object", "class", "score", "confirmed", "look"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",
@@ -355,9 +360,9 @@ class Conversion(Outcome):
                 {
                     "type": "Feature",
                     "properties": {name: row[name] for name in names},
-                    "geometry": {"type": "Polygon", "coordinates": [[list(point) for point in (*ring, ring[0])]]},
+                    "geometry": shape,
                 }
-                for row, ring in zip(rows, corners, strict=True)
+                for row, shape in zip(rows, shapes, strict=True)
             ],
         }
         _written(json.dumps(collection, allow_nan=False), path)

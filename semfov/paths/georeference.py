@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,42 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
         return np.stack(transform(system, "EPSG:4326", x, y)[:2], -1)
 
     return place
+
+
+def polygon_on_earth(ring: NDArray[np.float64]) -> dict[str, Any]:
+    """The GeoJSON geometry of a ring of longitudes and latitudes `(N, 2)`, cut at the antimeridian (RFC 7946, 3.1.9).
+
+    >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
+    [-160.0, 1.0]
+    """
+    # A step from one corner to the next is the shorter way round the globe.
+    steps = np.diff(ring[:, 0])
+    east = ring[0, 0] + np.concatenate([[0.0], np.cumsum((steps + 180) % 360 - 180)])
+    corners = np.stack([east - 360 * np.floor((east.min() + 180) / 360), ring[:, 1]], -1)
+    area = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
+    corners = corners if area >= 0 else corners[::-1]  # outer rings are counterclockwise
+    if corners[:, 0].max() <= 180:
+        return {"type": "Polygon", "coordinates": [_closed(corners)]}
+    parts = _cut(corners, 1.0), _cut(corners, -1.0) - [360.0, 0.0]
+    return {"type": "MultiPolygon", "coordinates": [[_closed(part)] for part in parts]}
+
+
+def _closed(corners: NDArray[np.float64]) -> list[list[float]]:
+    """A ring of GeoJSON, whose last corner is the first one."""
+    return [*corners.tolist(), corners[0].tolist()]
+
+
+def _cut(corners: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+    """The part of a ring that lies west (1) or east (-1) of the antimeridian."""
+    kept: list[NDArray[np.float64]] = []
+    for here, following in zip(corners, np.roll(corners, -1, 0), strict=True):
+        before, after = side * (180.0 - here[0]), side * (180.0 - following[0])
+        if before >= 0:
+            kept.append(here)
+        if before * after < 0:
+            share = before / (before - after)
+            kept.append(np.array([180.0, here[1] + (following[1] - here[1]) * share]))
+    return np.array(kept)
 
 
 def _is_referenced(source: str) -> bool:
