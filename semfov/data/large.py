@@ -43,7 +43,7 @@ _JPEG = 7
 _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _SAMPLES, _EXTRA, _METADATA, _NODATA = 259, 262, 274, 277, 338, 42112, 42113
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 _ALWAYS = (1, 8, 32946)  # compressions whose decoders are always there
-_MASK = 4  # bit of the kind of a page
+_REDUCED, _MASK = 1, 4  # bits of the kind of a page
 _MOST_LAYERS = 64  # pages that are channels of one picture
 _ROWS = 64  # of a picture that is stored in one strip, which are read at once
 _PLANES = 2  # planar configuration of channels that are stored one after the other
@@ -271,8 +271,9 @@ def _layers_of(file: Any, page: Any) -> list[Any]:
     return [page]
 
 
-def _is_mask(page: Any) -> bool:
-    return bool(getattr(page, "subfiletype", 0) & _MASK)  # frames of a series have none
+def _is_other(page: Any) -> bool:
+    """Whether a page is a reduced copy or a mask of another one."""
+    return bool(getattr(page, "subfiletype", 0) & (_REDUCED | _MASK))  # pages that are like the first have none
 
 
 def _tags_of(path: str | PathLike[str]) -> Any:
@@ -471,7 +472,7 @@ def _tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) ->
         with opening(tiff.path, "opened"):
             # `tifffile` tells neither reduced copies nor masks apart from other pages.
             pages: Any = tiff.file.pages[1:]
-            if not tiff.page.subifds and not any(page.is_reduced or _is_mask(page) for page in pages):
+            if not tiff.page.subifds and not any(map(_is_other, pages)):
                 return tiff
     except DataError as error:
         with suppress(DataError):

@@ -175,7 +175,7 @@ def test_a_decompression_bomb_is_refused(tmp_path, side):
     idat = b"IDAT" + zlib.compress(b"\0" * 100)
     data += struct.pack(">I", len(idat) - 4) + idat + struct.pack(">I", zlib.crc32(idat))
     (tmp_path / "bomb.png").write_bytes(data)
-    unusable(rf"bomb\.png: .*({MAX_PIXELS:,}|{2 * MAX_PIXELS:,}) pixels", read_image, tmp_path / "bomb.png")
+    unusable(rf"bomb\.png: .*(in proportion to the file|{2 * MAX_PIXELS:,} pixels)", read_image, tmp_path / "bomb.png")
 
 
 def samples():
