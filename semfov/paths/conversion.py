@@ -21,7 +21,7 @@ from semfov.detection.exchange import category_ids, coco_results, named_detectio
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text, digits, pixels
-from semfov.paths.georeference import georeference, polygon_on_earth
+from semfov.paths.georeference import box_on_earth, georeference
 from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
 from semfov.words import not_there
@@ -343,13 +343,12 @@ class Conversion(Outcome):
             [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
             for row in rows
         ]
-        if place is not None and rows:
-            rings = place(np.array(corners).reshape(-1, 2)).reshape(-1, 4, 2)
-            shapes = [polygon_on_earth(ring) for ring in rings]
-        else:
+        if place is None:
             shapes = [
-                {"type": "Polygon", "coordinates": [[list(point) for point in (*ring, ring[0])]]} for ring in corners
+                {"type": "Polygon", "coordinates": [[[*point] for point in (*ring, ring[0])]]} for ring in corners
             ]
+        else:
+            shapes = [box_on_earth(np.array(ring), place) for ring in corners]
         names = "object", "class", "score", "confirmed", "look"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",

@@ -55,8 +55,22 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     return place
 
 
-def polygon_on_earth(ring: NDArray[np.float64]) -> dict[str, Any]:
+_STEPS = 4  # along a side of a box, each shorter than half the way round the globe
+
+
+def box_on_earth(
+    corners: NDArray[np.float64], place: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> dict[str, Any]:
+    """The GeoJSON geometry of a box with corners `(4, 2)` in pixels, which `place` puts on earth."""
+    share = np.arange(_STEPS)[:, None] / _STEPS
+    sides = corners[:, None] + (np.roll(corners, -1, 0) - corners)[:, None] * share
+    return polygon_on_earth(place(sides.reshape(-1, 2)), _STEPS)
+
+
+def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any]:
     """The GeoJSON geometry of a ring of longitudes and latitudes `(N, 2)`, cut at the antimeridian (RFC 7946, 3.1.9).
+
+    Its corners are some of the places, `every` one from the first on.
 
     >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
     [-160.0, 1.0]
@@ -64,7 +78,7 @@ def polygon_on_earth(ring: NDArray[np.float64]) -> dict[str, Any]:
     # A step from one corner to the next is the shorter way round the globe.
     steps = np.diff(ring[:, 0])
     east = ring[0, 0] + np.concatenate([[0.0], np.cumsum((steps + 180) % 360 - 180)])
-    corners = np.stack([east - 360 * np.floor((east.min() + 180) / 360), ring[:, 1]], -1)
+    corners = np.stack([east - 360 * np.floor((east.min() + 180) / 360), ring[:, 1]], -1)[::every]
     area = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
     corners = corners if area >= 0 else corners[::-1]  # outer rings are counterclockwise
     if corners[:, 0].max() <= 180:
@@ -75,7 +89,8 @@ def polygon_on_earth(ring: NDArray[np.float64]) -> dict[str, Any]:
 
 def _closed(corners: NDArray[np.float64]) -> list[list[float]]:
     """A ring of GeoJSON, whose last corner is the first one."""
-    return [*corners.tolist(), corners[0].tolist()]
+    rounded = corners.round(8).tolist()  # a millimetre
+    return [*rounded, rounded[0]]
 
 
 def _cut(corners: NDArray[np.float64], side: float) -> NDArray[np.float64]:
