@@ -110,12 +110,13 @@ def _is_raster(path: str | PathLike[str]) -> bool:
 
     Masks, channels that are pages, and colours of 16 bits are read as they are by windows.
     """
-    if Path(path).suffix.lower() not in BY_WINDOWS:
+    kind = Path(path).suffix.lower()
+    if kind not in BY_WINDOWS:
         return False
-    with suppress(Exception), quiet_decoders, open_pillow(path) as image:  # others say why a file cannot be read
+    with suppress(Exception), quiet_decoders, open_pillow(path) as image:
         grey = image.mode in (*_SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
         return image.format in ("TIFF", "JPEG2000") and not grey
-    return False
+    return kind in (".tif", ".tiff")  # of a compression that Pillow has not, or of 12 bits
 
 
 def _deep_pixels(

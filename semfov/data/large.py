@@ -151,7 +151,7 @@ class _TiffPicture(LargePicture):
             return np.ones((down, across), np.bool_)
         counts = np.asarray(self.page.databytecounts, np.int64)
         planes = max(len(counts) // (across * down), 1)
-        return counts[: planes * across * down].reshape(planes, down, across).any(0)
+        return np.logical_or.reduce(counts[: planes * across * down].reshape(planes, down, across) > 0)
 
     def holds(self, box: _Box) -> bool:
         x1, y1, x2, y2 = box

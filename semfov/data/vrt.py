@@ -25,7 +25,8 @@ _Rect = tuple[float, float, float, float]  # x, y, width, height
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG"}
 _MOST_BYTES = 2**26  # of the text of a mosaic
-_MOST_LAYERS = 64  # sources that lie one over another
+_MOST_SOURCES = 2**15  # of all bands, each of which takes a fraction of a millisecond
+_MOST_LAYERS = 16  # sources that lie one over another
 _ROUNDING = 1e-6  # of a pixel
 _OPEN = 64  # files of a mosaic that are open at once
 _TYPES = {
@@ -108,6 +109,8 @@ class Mosaic:
         self._file = lru_cache(_OPEN)(_open_source)
         root = _root(path)
         parts = _kept(root, _DATASET, path)
+        count = sum(part.tag in _SOURCES for part in root.iter())
+        check_data(count <= _MOST_SOURCES, path, f"at most {_MOST_SOURCES:,} sources", f"{count:,}; join files first")
         self.width, self.height = (int(_number(root, name, path)) for name in ("rasterXSize", "rasterYSize"))
         check_data(min(self.width, self.height) > 0, path, "a width and a height", f"{self.width} × {self.height}")
         self._files: dict[str, Path] = {}
@@ -180,7 +183,7 @@ class Mosaic:
             down = _Side.of(source, 1, box[1], scales[1], shape[0])
             if across.covered and down.covered:
                 values, there = self._values(source, across, down, resampling if max(scales) < 1 else None)
-                part = np.ix_(down.covered, across.covered)
+                part = slice(down.covered.start, down.covered.stop), slice(across.covered.start, across.covered.stop)
                 values = _as_kind(values, band.kind)
                 canvas[part] = values if there is None else np.where(there, values, canvas[part])
         return canvas
@@ -214,6 +217,8 @@ class Mosaic:
         if (source.ratio, source.offset) != (1.0, 0.0):
             values = values * source.ratio + source.offset
         edges = _edges(down), _edges(across)
+        if edges == ((0, 0), (0, 0)):
+            return values, there
         return np.pad(values, edges, "edge"), None if there is None else np.pad(there, edges, "edge")
 
     def _band(self, part: XML.Element) -> _Band:

@@ -168,3 +168,27 @@ def test_what_a_tiff_does_not_store_is_without_data(tmp_path, nodata):
     assert picture.pixels((0, 0, 32, 32))[..., 0].flatten().tolist().count(nodata or 0) == 3 * 256
     assert picture.holds((0, 0, 16, 32))
     assert not picture.holds((16, 0, 32, 32))
+
+
+@pytest.mark.parametrize("kind", ["webp", "lerc", "12 bits", "zstd"])
+def test_compressions_that_gdal_has(tmp_path, kind):
+    """Read by windows as by the fovea, though Pillow and `tifffile` have no decoder of some of them."""
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    values, options = pixels(HIGH, WIDE), {"compress": kind}
+    if kind == "webp":
+        options["webp_lossless"] = "yes"
+    elif kind == "12 bits":
+        values, options = values.astype(np.uint16) * 16, {"nbits": 12, "compress": "deflate"}
+    path = tmp_path / "a.tif"
+    try:
+        with rasterio.open(
+            path, "w", driver="GTiff", width=WIDE, height=HIGH, count=3, dtype=values.dtype, photometric="rgb",
+            transform=rasterio.transform.Affine.scale(2.0), **options,
+        ) as file:  # fmt: skip
+            file.write(np.moveaxis(values, -1, 0))
+    except rasterio.errors.RasterioError:
+        pytest.skip(f"GDAL has no {kind}")
+    white = 4080 if kind == "12 bits" else None
+    assert np.array_equal(open_large(path, white=white).pixels((0, 0, WIDE, HIGH)), pixels(HIGH, WIDE))
+    fovea = read_image(path, white=white).permute(1, 2, 0).numpy() * 255
+    assert np.array_equal(fovea.round(), pixels(HIGH, WIDE))

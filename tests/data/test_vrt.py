@@ -196,8 +196,9 @@ def test_a_place_between_pixels_takes_the_nearest(folder):
         (mosaic(0, 200, one("a.tif")), "a width and a height"),
         (mosaic(300, 200, one("a.tif", given=' resampling="gauss"')), "a resampling of"),
         (mosaic(300, 200, one("a.tif", kind=COMPLEX, more="<Exponent>2</Exponent>")), "the kind 'Exponent'"),
-        (mosaic(300, 200, lambda band: source("a.tif", band) * 70), "cover it at most 64 times"),
+        (mosaic(300, 200, lambda band: source("a.tif", band) * 70), "cover it at most 16 times"),
         (mosaic(300, 200, one("a.tif"), bands=0), "at least one band"),
+        (mosaic(300, 200, lambda band: source("a.tif", band) * 11_000), "at most 32,768 sources, got 33,000"),
     ],
 )
 def test_what_a_mosaic_may_not_say(folder, text, said):
