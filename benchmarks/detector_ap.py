@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from semfov.data.annotations import read_annotations
-from semfov.data.images import read_image
+from semfov.data.reading import read_image
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress

@@ -13,7 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.fuzz.runner import Case, Draw, changed
-from semfov.data.images import MAX_PIXELS, read_image
+from semfov.data.images import MAX_PIXELS
+from semfov.data.reading import read_image
 
 # Pillow mode -> formats that keep it.
 KINDS = {

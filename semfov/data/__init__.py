@@ -2,8 +2,8 @@
 
 from semfov.data.classes import canonical_name, class_index
 from semfov.data.coco import CocoScenes
-from semfov.data.images import read_image
 from semfov.data.inputs import as_image
+from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes, box_coverage, legal_targets
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.word_vectors import WordVectors, spread

@@ -11,7 +11,7 @@ import torch
 
 from semfov.data.annotations import Annotations, Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name, class_indices
-from semfov.data.images import read_image
+from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check, check_data
 from semfov.io.files import check_regular, inside, json_sha256, sha256

@@ -4,7 +4,7 @@ import logging
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.deep import deep_values, is_deep
-from semfov.data.tone import White, between, black_and_white, check_white
-from semfov.data.windowed import BY_WINDOWS, LargePicture
+from semfov.data.tone import White, between, black_and_white
+from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, SemfovError, check_data, check_pixels
 from semfov.io.files import check_regular
 
@@ -47,55 +47,19 @@ _MOVES = (
 )
 _INVERSE = {6: 8, 8: 6}
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
-_SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
+SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 
 _PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
 _ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
-
-
-def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
-    """Read an image file as RGB.
-
-    The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
-    channels, CMYK and YCbCr are converted to RGB, and transparent pixels are blended with white. Grey images of 16 bits
-    keep their precision. The first frame of an animation is read. Colour profiles are not applied.
-
-    Args:
-        path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, HEIF, TIFF, GIF, BMP or PPM, whatever its name.
-        oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
-        white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
-            `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.
-
-    Returns:
-        `(3, H, W)`, float32 in [0, 1].
-
-    Raises:
-        DataError: the file is missing, unreadable, truncated or not an image, or has more than `MAX_PIXELS` pixels.
-
-    >>> import tempfile
-    >>> from PIL import Image
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     Image.new("L", (4, 2), 255).save(folder + "/white.png")
-    ...     read_image(folder + "/white.png").shape
-    torch.Size([3, 2, 4])
-    """
-    check_white(white)
-    if oriented and _is_raster(path):
-        from semfov.data.large import open_large  # which reads photographs by `read_photograph`
-
-        picture = open_large(path, white=white)
-        _check_pixels(picture.size, f"image {Path(path)}")
-        return picture.read((0, 0, *picture.size)).float().div_(255)
-    return read_photograph(path, oriented=oriented, white=white)
 
 
 def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
     """Read an image file by Pillow alone (`read_image`)."""
     with opening(Path(path), "decoded"), open_pillow(path) as image:
         check_proportion(image.size, Path(path).stat().st_size, path)
-        _check_pixels(image.size, f"image {Path(path)}")
+        check_area(image.size, f"image {Path(path)}")
         deep = is_deep(image)
-        wide = deep or image.mode in _SIXTEEN_BITS
+        wide = deep or image.mode in SIXTEEN_BITS
         if not deep:
             array = shown = _pixels(image, f"image {Path(path)}", upright=oriented, white=white)
     if deep:
@@ -103,20 +67,6 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
     if wide and white is None:
         warn_of_range(float(shown.min()) * 65535, float(shown.max()) * 65535, path)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
-
-
-def _is_raster(path: str | PathLike[str]) -> bool:
-    """Whether a file is of a kind of which Pillow keeps only the precision of grey values right, and is none of these.
-
-    Masks, channels that are pages, and colours of 16 bits are read as they are by windows.
-    """
-    kind = Path(path).suffix.lower()
-    if kind not in BY_WINDOWS:
-        return False
-    with suppress(Exception), quiet_decoders, open_pillow(path) as image:
-        grey = image.mode in (*_SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
-        return image.format in ("TIFF", "JPEG2000") and not grey
-    return kind in (".tif", ".tiff")  # of a compression that Pillow has not, or of 12 bits
 
 
 def _deep_pixels(
@@ -254,12 +204,12 @@ def check_tile(size: int, stored: int, name: str) -> None:
 def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     """A Pillow image of any mode as `read_image` would read its file, `(3, H, W)`; `name` is for messages."""
     with opening(name, "decoded"):
-        _check_pixels(image.size, name)
+        check_area(image.size, name)
         array = _pixels(image, name, upright=True, white=white)
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
 
 
-def _check_pixels(size: tuple[int, int], name: str) -> None:
+def check_area(size: tuple[int, int], name: str) -> None:
     fits, got = 0 < math.prod(size) <= MAX_PIXELS, f"{size[0]} × {size[1]}; {_SMALLER}"
     check_data(fits, name, f"1 to {MAX_PIXELS:,} pixels", got)
 
@@ -285,10 +235,10 @@ def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDA
     """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
     stored = _orientation(image)
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
-    inverted = image.mode in _SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
+    inverted = image.mode in SIXTEEN_BITS and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC_TAG) == 0
     image.load()
     image = _turned(image, stored, _orientation(image), upright=upright)
-    wide = image.mode in _SIXTEEN_BITS or image.mode == "F"
+    wide = image.mode in SIXTEEN_BITS or image.mode == "F"
     pixels = np.asarray(image if wide else _over_white(image).convert("RGB"))
     if white is not None:
         pixels = between(pixels, black_and_white(white, pixels))

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.images import from_pillow, read_image
+from semfov.data.images import from_pillow
+from semfov.data.reading import read_image
 from semfov.data.tone import White, between, black_and_white, check_white
 from semfov.errors import InputError, check, check_pixels, lookup, values_known
 

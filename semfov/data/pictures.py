@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from semfov.data.images import read_image
+from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.errors import check_data
 from semfov.io.files import inside, json_sha256, sha256

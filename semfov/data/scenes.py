@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.classes import class_indices
-from semfov.data.images import read_image
+from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, ComposedScenes, Scene
 from semfov.errors import check, check_data
 from semfov.io.files import json_sha256, sha256

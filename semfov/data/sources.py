@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.data.images import read_image
 from semfov.data.inputs import STREAMS
+from semfov.data.reading import read_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.errors import DataError, InputError, SemfovError, check, check_data, needing, printable

@@ -11,7 +11,7 @@ from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.eye import Eye, View
 
-LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
+LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.reading", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
 
 

@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from semfov import InputError, read_image
 from semfov.data import images
-from semfov.data.large import _ArrayPicture, _RasterPicture, _TiffPicture, open_large
+from semfov.data.large import _ArrayPicture, open_large
+from semfov.data.rasters import _RasterPicture, _TiffPicture
 from semfov.data.windowed import LargePicture, resized
 from tests.refusals import refused, unusable
 

@@ -13,7 +13,8 @@ from PIL import Image
 
 from semfov import DataError, as_image, read_image
 from semfov.agents.picture import OpenedPicture
-from semfov.data.large import _RasterPicture, open_large, picture_size
+from semfov.data.large import open_large, picture_size
+from semfov.data.rasters import _RasterPicture
 from tests.data.test_large import pixels
 from tests.refusals import refused, unusable
 
@@ -75,7 +76,7 @@ def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
         size = {3: 2, 4: 4, 16: 8}[int(dtype)]
         content[at : at + size] = value.to_bytes(size, "little") if size > 2 or value < 2**16 else b"\xff\xff"
     path.write_bytes(bytes(content) + bomb)
-    monkeypatch.setattr("semfov.data.large._INFLATED", 100)
+    monkeypatch.setattr("semfov.data.rasters._INFLATED", 100)
     tracemalloc.start()
     unusable(r"expected tiles of 12,288 bytes, got one that", open_large(path).read, (0, 0, 1, 1))
     assert tracemalloc.get_traced_memory()[1] < 20e6

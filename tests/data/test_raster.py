@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 
 from semfov import SemfovError, read_image
-from semfov.data.large import _ArrayPicture, _RasterPicture, _TiffPicture, open_large, picture_size
+from semfov.data.large import _ArrayPicture, open_large, picture_size
+from semfov.data.rasters import _RasterPicture, _TiffPicture
 from semfov.errors import DataError
 from semfov.paths.georeference import georeference
 from tests.data.test_large import pixels

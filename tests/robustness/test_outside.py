@@ -14,7 +14,8 @@ import tifffile
 from PIL import Image
 
 from semfov import SemfovError, read_image
-from semfov.data.large import _RasterPicture, open_large, picture_size
+from semfov.data.large import open_large, picture_size
+from semfov.data.rasters import _RasterPicture
 from semfov.paths.georeference import georeference
 from tests.refusals import unusable
 

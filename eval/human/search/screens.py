@@ -12,7 +12,7 @@ from torch import Tensor
 
 from semfov.data.classes import class_index
 from semfov.data.fixations import Fixations, Letterbox, coco_name
-from semfov.data.images import read_image
+from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.detection.placement import resize
 from semfov.errors import InputError

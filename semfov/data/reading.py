@@ -1,0 +1,60 @@
+"""Reading of image files as a whole, by the reader that knows most of their kind."""
+
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+
+from torch import Tensor
+
+from semfov.data.images import SIXTEEN_BITS, check_area, open_pillow, quiet_decoders, read_photograph
+from semfov.data.rasters import open_by_windows
+from semfov.data.tone import White, check_white
+from semfov.data.windowed import BY_WINDOWS
+
+
+def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
+    """Read an image file as RGB.
+
+    The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
+    channels, CMYK and YCbCr are converted to RGB, and transparent pixels are blended with white. Grey images of 16 bits
+    keep their precision. The first frame of an animation is read. Colour profiles are not applied.
+
+    Args:
+        path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, HEIF, TIFF, GIF, BMP or PPM, whatever its name.
+        oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
+        white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
+            `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.
+
+    Returns:
+        `(3, H, W)`, float32 in [0, 1].
+
+    Raises:
+        DataError: the file is missing, unreadable, truncated or not an image, or has more than `MAX_PIXELS` pixels.
+
+    >>> import tempfile
+    >>> from PIL import Image
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     Image.new("L", (4, 2), 255).save(folder + "/white.png")
+    ...     read_image(folder + "/white.png").shape
+    torch.Size([3, 2, 4])
+    """
+    check_white(white)
+    if oriented and _is_raster(path):
+        picture = open_by_windows(path, white=white)
+        check_area(picture.size, f"image {Path(path)}")
+        return picture.read((0, 0, *picture.size)).float().div_(255)
+    return read_photograph(path, oriented=oriented, white=white)
+
+
+def _is_raster(path: str | PathLike[str]) -> bool:
+    """Whether a file is of a kind of which Pillow keeps only the precision of grey values right, and is none of these.
+
+    Masks, channels that are pages, and colours of 16 bits are read as they are by windows.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in BY_WINDOWS:
+        return False
+    with suppress(Exception), quiet_decoders, open_pillow(path) as image:
+        grey = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
+        return image.format in ("TIFF", "JPEG2000") and not grey
+    return kind in (".tif", ".tiff")  # of a compression that Pillow has not, or of 12 bits
