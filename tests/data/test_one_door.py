@@ -11,7 +11,7 @@ PACKAGE = Path(semfov.__file__).parent
 READERS = {  # where others' readers are called
     "PIL.Image.open": {"data/images.py"},
     "rasterio.open": {"data/gdal.py"},
-    "tifffile.TiffFile": {"data/large.py", "data/tiff.py", "data/proportion.py"},
+    "tifffile.TiffFile": {"data/rasters.py", "data/tiff.py", "data/proportion.py"},
     "cv2.VideoCapture": {"data/sources.py"},
 }
 OTHERS = {  # by which nothing is read here
