@@ -230,7 +230,7 @@ def _width(kind: int) -> int:
     """Bytes of an element; of a text, those of an empty one, and of a kind that is not known, the most of a number."""
     import onnx
 
-    otherwise = {onnx.TensorProto.UNDEFINED: 16, onnx.TensorProto.STRING: 32}
+    otherwise: dict[int, int] = {onnx.TensorProto.UNDEFINED: 16, onnx.TensorProto.STRING: 32}
     return otherwise.get(kind) or onnx.helper.tensor_dtype_to_np_dtype(kind).itemsize
 
 

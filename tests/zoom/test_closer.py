@@ -505,7 +505,8 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
         assert len({glance.window for glance in each.glances}) == each.passes < 1 + len(each.closer)
         assert {look.number for look in each.closer} == set(range(1, each.passes))
         rows = [row["closer"] for row in each.rows()]
-        assert rows == [None, *(max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes))]
+        best = [max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes)]
+        assert rows == [None, *(pytest.approx(place, abs=5e-5) for place in best)]  # tables have four digits
 
 
 SHARES = torch.tensor([0.7, 0.4, 0.2])
