@@ -10,6 +10,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from semfov.data import example
 from semfov.detection.placement import resize
 
 GAZE, SIGMA = (290.0, 280.0), 100.0
@@ -44,10 +45,8 @@ def processor() -> str:
 
 
 def photograph(width: int = 640, height: int = 480) -> Tensor:
-    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
-    from skimage import data
-
-    return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (width, height)).clamp(0, 1)
+    """A photograph that comes with the package, `(1, 3, height, width)`."""
+    return resize(example("beach")[None], (width, height)).clamp(0, 1)
 
 
 def use_threads(count: int) -> None:

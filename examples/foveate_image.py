@@ -11,9 +11,9 @@ import semfov
 
 
 def main() -> None:
-    """Foveate a photograph, or an embedded scene if none is given."""
+    """Foveate a photograph, or one that comes with semfov if none is given."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("photo", nargs="?", help="image file (default: an embedded scene)")
+    parser.add_argument("photo", nargs="?", help="image file (default: one that comes with semfov)")
     parser.add_argument(
         "--gaze", nargs=2, type=float, metavar=("X", "Y"), help="fixation in pixels (default: the centre)"
     )
@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--out", default="foveated.png", help="file to write (default: foveated.png)")
     arguments = parser.parse_args()
 
-    image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(["cup"])[0].image
+    image = semfov.read_image(arguments.photo) if arguments.photo else semfov.example("beach")
     height, width = image.shape[-2:]
     gaze = image.new_tensor(arguments.gaze or ((width - 1) / 2, (height - 1) / 2))
 

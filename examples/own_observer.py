@@ -66,25 +66,25 @@ class BestScore(semfov.observers.Observer):
 
 
 def main() -> None:
-    """Search an embedded scene for a cup."""
+    """Search an embedded photograph for a dog."""
     detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
-    scene = semfov.EmbeddedScenes(detector.classes)[1]
-    image, grid, cup = scene.image[None], semfov.Grid(10, 10, scene.size), detector.classes.index("cup") + 1
-    goal = grid.footprint(scene.boxes[scene.labels == cup]).any(0)
+    scene = semfov.EmbeddedScenes(detector.classes)[0]
+    image, grid, dog = scene.image[None], semfov.Grid(10, 10, scene.size), detector.classes.index("dog") + 1
+    goal = grid.footprint(scene.boxes[scene.labels == dog]).any(0)
 
     steps = semfov.rollout(
         LiveLooks(eye, eye.open(image), grid),
         BestScore(len(detector.classes) + 1),
-        semfov.acquisition.TargetPosterior(cup),
+        semfov.acquisition.TargetPosterior(dog),
         torch.tensor([0]),  # first cell of each episode; here there is one episode
         Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), image)),
         most=20,
         ends=lambda step: goal[step.cell],
     )
     for step in steps:
-        (x, y), best = step.fixation[0].tolist(), float(step.belief.probability(cup).max())
-        print(f"fixation {step.shift} at ({x:.0f}, {y:.0f}), best score of a cup so far {best:.2f}")
+        (x, y), best = step.fixation[0].tolist(), float(step.belief.probability(dog).max())
+        print(f"fixation {step.shift} at ({x:.0f}, {y:.0f}), best score of a dog so far {best:.2f}")
     print("found" if goal[step.cell] else "not found")
 
 

@@ -85,7 +85,7 @@ def main() -> None:
     """Search a panorama, or one made of embedded scenes if none is given, with a simulated camera."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("panorama", nargs="?", help="image file (default: embedded scenes on a sphere)")
-    parser.add_argument("target", nargs="?", default="motorcycle", help="class to search for")
+    parser.add_argument("target", nargs="?", default="horse", help="class to search for")
     parser.add_argument("--delay", type=float, default=0.3, help="age of frames in seconds (default: 0.3)")
     parser.add_argument("--noise", type=float, default=0.5, help="error of directions in degrees (default: 0.5)")
     parser.add_argument("--blind", action="store_true", help="the camera does not report its direction")

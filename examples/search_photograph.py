@@ -10,10 +10,10 @@ from semfov import viz
 
 
 def main() -> None:
-    """Search a photograph, or an embedded scene if none is given."""
+    """Search a photograph, or one that comes with semfov if none is given."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("photo", nargs="?", help="image file (default: an embedded scene)")
-    parser.add_argument("target", nargs="?", default="cup", help="class to search for (default: cup)")
+    parser.add_argument("photo", nargs="?", help="image file (default: one that comes with semfov)")
+    parser.add_argument("target", nargs="?", default="boat", help="class to search for (default: boat)")
     parser.add_argument("--out", default="scanpath.png", help="figure to write (default: scanpath.png)")
     arguments = parser.parse_args()
 
@@ -22,7 +22,7 @@ def main() -> None:
     # combines your own parts.
     agent = semfov.ActivePerception.recommended()
 
-    image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image
+    image = semfov.read_image(arguments.photo) if arguments.photo else semfov.example("beach")
     scanpath = agent.search(image, arguments.target, start=0)
 
     for number, (x, y) in enumerate(scanpath.as_fixations("photograph").points.tolist()):

@@ -24,6 +24,7 @@ from .belief import observers as observers
 from .cli.search import run as run
 from .data import EmbeddedScenes as EmbeddedScenes
 from .data import as_image as as_image
+from .data import example as example
 from .data import read_image as read_image
 from .data.coco import CocoScenes as CocoScenes
 from .detection import Detections as Detections

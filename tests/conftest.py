@@ -10,17 +10,15 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, nullcontext
-from functools import partial, wraps
+from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from semfov.data.scenes import EmbeddedScenes
 from tests.pretended import a_gpu
 
 pytest.register_assert_rewrite("tests.base_tester")
@@ -99,23 +97,6 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """The CPU and a GPU, which is pretended on a machine without one (`tests.pretended`)."""
     with a_gpu() if request.param == "cuda" else nullcontext():
         yield torch.device(request.param)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def kept_scenes() -> Iterator[None]:
-    """Compose each embedded scene only once."""
-    compose, kept = EmbeddedScenes._pixels, {}
-
-    @wraps(compose)
-    def once(scenes: EmbeddedScenes, index: int) -> Any:
-        key = scenes._generator(index).bit_generator.state["state"]["state"]
-        if key not in kept:
-            kept[key] = compose(scenes, index)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EmbeddedScenes, "_pixels", once)
-        yield
 
 
 @pytest.fixture

@@ -21,9 +21,9 @@ def _save(image, path, size=None):
 
 def fill(folder: Path) -> dict[str, object]:
     """Write photographs, large pictures, a video and fixations, and return what code takes as given."""
-    scenes = semfov.EmbeddedScenes(["cup"], count=16)
-    _save(scenes[0].image, folder / "kitchen.jpg")
-    _save(scenes[2].image, folder / "poster.jpg")
+    scenes = semfov.EmbeddedScenes(["boat"], count=16)
+    _save(scenes[0].image, folder / "kitchen.jpg", (640, 480))
+    _save(scenes[2].image, folder / "poster.jpg", (640, 480))
     _save(Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image, folder / "harbour.jpg")
     (folder / "drone.jpg").symlink_to("harbour.jpg")
     _save(Panoramas(scenes, width=1024, count=1)[0].image, folder / "panorama.jpg")

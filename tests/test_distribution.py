@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "semfov"
-DATA = {".safetensors", ".onnx", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
+DATA = {".safetensors", ".onnx", ".jpg", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
 
 CODE = """
 import sys
@@ -83,6 +83,8 @@ def tracked(folder):
 def test_wheel_and_sdist_contain_what_they_must(built):
     every = names_in(built, "*.whl")
     assert any(name.endswith("licenses/LICENSE") for name in every)
+    assert any(name.endswith("licenses/semfov/detection/models/LICENSE.txt") for name in every)
+    assert {"semfov/detection/models/yolox_nano_416.onnx", "semfov/data/photographs/beach.jpg"} <= every
     names = {name for name in every if ".dist-info/" not in name}
     assert names == tracked(PACKAGE)
     assert sum(name.endswith(".safetensors") for name in names) > 15
@@ -90,6 +92,49 @@ def test_wheel_and_sdist_contain_what_they_must(built):
     assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "Makefile"} <= names
     assert {"tests/conftest.py", "eval/search/__init__.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names
     assert not [name for name in names if name.startswith((".venv/", "build/", "runs/", ".git/"))]
+
+
+ALONE = """
+import socket
+import sys
+from types import ModuleType
+
+def refuse(*_, **__):
+    raise AssertionError("a socket was opened")
+
+socket.socket.connect = socket.create_connection = socket.getaddrinfo = refuse
+
+import semfov
+from semfov.cli.app import _Calls
+from semfov.cli.main import main
+
+assert semfov.__file__.startswith(sys.argv[1]), semfov.__file__
+for words in (["search", "--target", "boat"], ["find", "--target", "person", "--passes", "4"], ["gaze"],
+              ["search", "example:market", "--target", "truck", "--out", "seen"]):
+    assert main(words) == 0, words
+sys.modules["gradio"] = ModuleType("gradio")  # the page's calls need it only for their errors
+calls = _Calls(semfov.ActivePerception.recommended())
+for _ in calls.examples:
+    picture, name = calls.take()
+    picture.save("example.png")
+    words, page = calls.look("example.png", name, "search", 2)
+    print(name, words)
+"""
+
+
+def test_the_wheel_alone_looks_at_its_photographs_without_a_network_and_with_an_empty_cache(built, tmp_path):
+    """Its files are unpacked into a folder that comes first; whatever opens a connection ends the process."""
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "unpacked")
+    where = {"PYTHONPATH": str(tmp_path / "unpacked"), "SEMFOV_CACHE": str(tmp_path / "cache"), "MPLBACKEND": "agg"}
+    printed = run(sys.executable, "-c", ALONE, tmp_path / "unpacked", cwd=tmp_path, **where)
+    assert "looking at example:beach, which comes with semfov" in printed
+    assert "found boat" in printed
+    assert "looking at example:sheet" in printed
+    assert "found truck" in printed
+    assert (tmp_path / "seen").is_dir()
+    assert not (tmp_path / "cache").exists()
 
 
 def test_the_wheel_works_in_a_separate_environment(built, tmp_path):

@@ -52,7 +52,7 @@ def test_help_version_and_unknown_commands_import_no_tensors(words):
 
 
 HEAVY = [
-    *["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "cv2", "torch._dynamo"],
+    *["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "cv2", "torch._dynamo"],
     *["gymnasium", "transformers"],
 ]
 

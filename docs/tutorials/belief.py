@@ -17,16 +17,16 @@ detector = semfov.load_detector("yolox-nano")
 model = semfov.FovealObservationModel.from_pretrained("yolox-nano")
 eye = semfov.Eye(named_sensor("gradual"), detector).eval()
 
-scene = semfov.EmbeddedScenes(detector.classes)[1]  # made of photographs that come with installed packages
+scene = semfov.EmbeddedScenes(detector.classes)[4]  # a photograph that comes with semfov: a man, horses and a dog
 view = eye.open(scene.image[None])
 grid = semfov.Grid(10, 10, scene.size)
-fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5  # one on each of its five objects
+fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5  # one on each of its four objects
 
 # %% [markdown]
 # ## The views
 
-# %% alt="Five foveated views of the same collage of photographs, each sharp around its fixation"
-figure, axes = plt.subplots(1, 5, figsize=(12, 2.1), layout="compressed")
+# %% alt="Four foveated views of the same photograph of a farm, each sharp around its fixation"
+figure, axes = plt.subplots(1, 4, figsize=(12, 2.6), layout="compressed")
 for axis, picture, (x, y) in zip(axes, eye.foveated(view, fixations), fixations.tolist()):
     axis.imshow(picture.permute(1, 2, 0).clamp(0, 1).numpy())
     axis.set(title=f"from ({x:.0f}, {y:.0f})", xticks=[], yticks=[])
@@ -55,15 +55,15 @@ for fixation in fixations:
 # A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so the probability rises slowly. What matters
 # is which class has the largest probability.
 
-# %% alt="The collage in grey with the probability of a person in each cell, after each of five looks"
+# %% alt="The photograph in grey with the probability of a person in each cell, after each of four looks"
 person = detector.classes.index("person") + 1  # 0 is background
 maps = torch.stack([belief[:, person] / belief.sum(-1) for belief in beliefs]).reshape(-1, 10, 10)
-figure, axes = plt.subplots(1, 5, figsize=(12, 2.3), layout="compressed")
+figure, axes = plt.subplots(1, 4, figsize=(12, 2.8), layout="compressed")
 for number, (axis, probability) in enumerate(zip(axes, maps), start=1):
-    axis.imshow(scene.image.mean(0).numpy(), cmap="gray", extent=(0, 640, 480, 0))
+    axis.imshow(scene.image.mean(0).numpy(), cmap="gray", extent=(0, *scene.size, 0))
     strength = (0.9 * (probability / maps.max()).sqrt()).numpy()
     drawn = axis.imshow(
-        probability.numpy(), cmap="plasma", alpha=strength, vmin=0, vmax=float(maps.max()), extent=(0, 640, 480, 0)
+        probability.numpy(), cmap="plasma", alpha=strength, vmin=0, vmax=float(maps.max()), extent=(0, *scene.size, 0)
     )
     axis.plot(*fixations[:number].T.numpy(), ".", color="white", markeredgecolor="black", markersize=10)
     axis.set(title=f"person, look {number}", xticks=[], yticks=[])

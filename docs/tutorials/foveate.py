@@ -7,20 +7,19 @@
 # %%
 import matplotlib.pyplot as plt
 import torch
-from skimage import data
 
 import semfov
 
-image = semfov.as_image(data.astronaut())  # a photograph of scikit-image; (3, 512, 512), RGB in [0, 1]
-gaze = [(224, 110), (400, 300)]  # the face, and the model of the shuttle
+image = semfov.example("lifeboat")  # a photograph that comes with semfov; (3, 332, 480), RGB in [0, 1]
+gaze = [(200, 95), (430, 215)]  # the man who stands, and the wheel
 views = semfov.foveate(image, gaze, sigma=50, growth=1)
 print(views.shape)
 
 
-# %% alt="Three times the same portrait of an astronaut: sharp all over, sharp on the face alone, sharp beside the face"
+# %% alt="Three times the same photograph of a lifeboat and its crew: sharp all over, sharp on the man who stands, sharp on a wheel"
 def show(pictures, titles, points=()):
     """Pictures side by side, with a cross at each point that is given."""
-    figure, axes = plt.subplots(1, len(pictures), figsize=(3.3 * len(pictures), 3.6), layout="compressed")
+    figure, axes = plt.subplots(1, len(pictures), figsize=(4 * len(pictures), 3.2), layout="compressed")
     for axis, picture, title in zip(axes, pictures, titles):
         axis.imshow(picture.permute(1, 2, 0).clamp(0, 1).numpy())
         axis.set(title=title, xticks=[], yticks=[])
@@ -28,7 +27,7 @@ def show(pictures, titles, points=()):
         axis.plot(x, y, "+", color="white", markersize=12)
 
 
-show([image, *views], ["photograph", "looking at the face", "looking at the shuttle"], gaze)
+show([image, *views], ["photograph", "looking at the man who stands", "looking at the wheel"], gaze)
 
 # %% [markdown]
 # ## How acuity falls off
@@ -37,7 +36,7 @@ show([image, *views], ["photograph", "looking at the face", "looking at the shut
 # to coarse. With `growth=1`, as published, all bands share one window: a sharp disc on a blurred picture. With
 # `growth=2` acuity falls off gradually.
 
-# %% alt="The astronaut with a fovea of 50 pixels: with growth 1 a sharp disc on a blurred picture, with growth 2 a gradual fall-off"
+# %% alt="The lifeboat with a fovea of 50 pixels: with growth 1 a sharp disc on a blurred picture, with growth 2 a gradual fall-off"
 kinds = {"growth 1, σ = 50": (50, 1.0), "growth 2, σ = 50": (50, 2.0), "growth 2, σ = 20": (20, 2.0)}
 pictures = [semfov.foveate(image, gaze[0], sigma=sigma, growth=growth) for sigma, growth in kinds.values()]
 show(pictures, list(kinds))
@@ -51,7 +50,7 @@ show(pictures, list(kinds))
 # %%
 sensor = semfov.Foveation(50.0, growth=1.0)
 bands = sensor.pyramid(image[None])  # once for the photograph
-fixations = torch.rand(1, 8, 2) * 512
+fixations = torch.rand(1, 8, 2) * torch.tensor([480, 332])
 print(sensor(bands, fixations).shape)  # eight looks
 
 # %% [markdown]
@@ -61,10 +60,10 @@ print(sensor(bands, fixations).shape)  # eight looks
 # that we have the view from an unknown fixation. We start at the centre and move the gaze until our view is the same.
 
 # %%
-unknown = torch.tensor([300.0, 150.0])
+unknown = torch.tensor([300.0, 120.0])
 seen = sensor(bands, unknown)
 
-guess = torch.tensor([256.0, 256.0], requires_grad=True)
+guess = torch.tensor([240.0, 166.0], requires_grad=True)
 optimizer = torch.optim.Adam([guess], lr=10.0)
 path, errors = [], []
 for _ in range(60):
@@ -76,7 +75,7 @@ for _ in range(60):
     optimizer.step()
 print(f"guess ({guess[0]:.1f}, {guess[1]:.1f}), truth ({unknown[0]:.1f}, {unknown[1]:.1f})")
 
-# %% alt="The path of the guess over the foveated astronaut, from the centre to the true fixation, and the error falling with the steps"
+# %% alt="The path of the guess over the foveated lifeboat, from the centre to the true fixation, and the error falling with the steps"
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.8), layout="compressed")
 left.imshow(seen[0].permute(1, 2, 0).clamp(0, 1).numpy())
 left.plot(*torch.stack(path).T.numpy(), ".-", color="white", markersize=4, linewidth=1)

@@ -35,7 +35,7 @@ print(policies.policy_names("exploration"))
 # An agent is an eye with a strategy for search and one for exploration. We take the eye and the learned map of the
 # recommended agent for the published fovea, and combine them with the new policy.
 
-# %% alt="The scanpath over a collage of photographs by the new policy, with the foveated views and the classes of the map"
+# %% alt="The scanpath over a photograph of a market by the new policy, with the foveated views and the classes of the map"
 recommended = semfov.ActivePerception.recommended(sigma=100, growth=1)
 search = recommended.searching.observer, recommended.searching.policy
 mapper, closer = recommended.exploring.observer, recommended.exploring.policy
@@ -77,6 +77,6 @@ axis.grid(alpha=0.3)
 _ = axis.legend()
 
 # %% [markdown]
-# These scenes are toy examples with five objects each, as large as the fovea. For meaningful figures, name the
+# These are four photographs. For meaningful figures, name the
 # registered policy in the settings of `eval.explore` and measure it on photographs. [Write your own
 # policy](../guides/write_your_own_policy.md) shows how to do this, for a search policy.

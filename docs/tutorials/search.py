@@ -9,17 +9,16 @@ import semfov
 from semfov import viz
 
 agent = semfov.ActivePerception.recommended()
-scene = semfov.EmbeddedScenes(agent.classes[1:])[6]
-# The image can also be a path, a Pillow image, a NumPy array or a tensor.
-scanpath = agent.search(scene.image, "cat", start=99)
+photograph = semfov.example("beach")  # also a path, a Pillow image, a NumPy array or a tensor
+scanpath = agent.search(photograph, "boat", start=99)
 print(scanpath)
 
-# %% alt="The scanpath over a collage of photographs to the cat, with the foveated view and the belief at each fixation"
+# %% alt="The scanpath over a photograph of a beach to a boat, with the foveated view and the belief at each fixation"
 viz.plot_episode(scanpath)
 
 # %% [markdown]
 # The upper row shows the foveated views, sharp around the fixation, with their detections. The lower row shows the
-# probability that a cell holds the cat. The search does not scan the picture in order; it looks where a cat is most
+# probability that a cell holds a boat. The search does not scan the picture in order; it looks where a boat is most
 # probable.
 #
 # ## The decision
@@ -42,10 +41,10 @@ scanpath.to_frame()[["look", "column", "row", "probability", "presence", "seen",
 #
 # ## An absent target
 #
-# There is no cup in the scene. The agent gives up when no remaining cell is worth a look.
+# There is no cup on the beach. The agent gives up when no remaining cell is worth a look.
 
 # %% alt="The scanpath of a search for a cup, which is not there, and the decision"
-absent = agent.search(scene.image, "cup", start=0)
+absent = agent.search(photograph, "cup", start=0)
 print(absent)
 viz.plot_scanpath(absent)
 

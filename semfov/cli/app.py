@@ -21,7 +21,8 @@ from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
-from semfov.data import EmbeddedScenes, class_index, read_image
+from semfov.data import Scene, class_index, read_image
+from semfov.data.examples import EXAMPLES, example_scene
 from semfov.data.images import PhotographPicture
 from semfov.errors import DataError, InputError, SemfovError, check, check_data
 from semfov.paths import Record, Scanpath
@@ -35,7 +36,6 @@ from semfov.viz.style import GAZE, TARGET
 
 _TASKS = ("search", "find all", "explore", "gaze")
 _EVERY = "all classes"
-_EXAMPLES = 16  # embedded scenes
 _VIEWERS = 15  # whose scanpaths the page of a prediction has
 _HEIGHT = 820  # pixels of the screen for the page of a record
 _MOST_BYTES = 2**26  # of a file that is uploaded
@@ -64,7 +64,7 @@ def serve(options: AppOptions) -> int:
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
-        page = _make_page(agent, options.seed)
+        page = _make_page(agent)
         address = _launched(page, options.host, options.port)
         print(f"{agent.eye.detector.settings()['name']}: open {address} in a browser; Ctrl-C ends it", flush=True)
         try:
@@ -148,19 +148,19 @@ def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: S
 class _Calls:
     """What the page calls; refusals are shown on it."""
 
-    def __init__(self, agent: ActivePerception, seed: int) -> None:
+    def __init__(self, agent: ActivePerception) -> None:
         self.agent, self.classes = agent, list(agent.classes[1:])
-        self.scenes: EmbeddedScenes | None = None
+        self.examples: list[Scene] = []
         with suppress(InputError):  # the detector knows none of their classes
-            self.scenes = EmbeddedScenes(self.classes, count=_EXAMPLES, seed=seed)
-        self._numbers = cycle(range(_EXAMPLES))
+            scenes = [example_scene(name, self.classes) for name in EXAMPLES]
+            self.examples = [scene for scene in scenes if len(scene.labels)]
+        self._turns = cycle(self.examples)
         self._stops: dict[str, threading.Event] = {}
 
     def take(self) -> tuple[Image.Image, str]:
-        """The next embedded scene, and a class that it holds."""
-        assert self.scenes is not None
-        index = next(self._numbers)
-        return pillow(self.scenes[index].image), self.scenes.classes[self.scenes.targets(index)[0] - 1]
+        """The next example, and the class of most of its objects."""
+        scene = next(self._turns)
+        return pillow(scene.image), self.classes[int(scene.labels.mode().values) - 1]
 
     def look(self, path: str | None, target: str, task: str, passes: float, visitor: str = "") -> tuple[str, str]:
         """Words about a record of a picture, and its page in a frame; `stop` of the same visitor ends the search."""
@@ -249,11 +249,11 @@ def _told() -> Iterator[None]:
         raise gradio.Error(str(error), print_exception=False) from None
 
 
-def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
+def _make_page(agent: ActivePerception) -> Any:
     """The page, a `gradio.Blocks`; pictures that it is given are removed within minutes."""
     import gradio
 
-    calls = _Calls(agent, seed)
+    calls = _Calls(agent)
 
     def look(path: Any, target: str, task: str, passes: float, request: gradio.Request) -> tuple[str, str]:
         return calls.look(path, target, task, passes, request.session_hash)
@@ -278,7 +278,7 @@ def _make_page(agent: ActivePerception, seed: int = 0) -> Any:
                 )
                 # Gradio would open the file with any of Pillow's decoders, of which some start programs.
                 picture.preprocess = lambda payload: payload and payload.path
-                example = gradio.Button("Take an example", visible=calls.scenes is not None)
+                example = gradio.Button("Take an example", visible=bool(calls.examples))
                 target = gradio.Dropdown([_EVERY, *calls.classes], value=_EVERY, label="Class", filterable=True)
                 task = gradio.Radio(list(_TASKS), value=_TASKS[0], label="What to do")
                 passes = gradio.Slider(1, 64, value=16, step=1, label="Passes of the detector at most")

@@ -13,9 +13,9 @@ from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import GazeOptions
 from semfov.cli.results import held_outputs, tell_written, unfinished
-from semfov.cli.sources import PictureSource, picture_sources
+from semfov.cli.sources import example_source, picture_sources
+from semfov.data.examples import EXAMPLES
 from semfov.data.fixations import Fixations, write_table
-from semfov.data.sources import embedded_picture
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -58,9 +58,8 @@ class _GazeJob:
         remember(options, options.detector)
         self.model = FixationDensity.for_detector(self.detector) if own is None else own
         if not self.sources:
-            print("no picture was given: looking at an embedded scene")
-            scene = embedded_picture(self.detector.classes, None, options.seed)
-            self.sources = [PictureSource("embedded scene", scene=scene)]
+            self.sources = [example_source(EXAMPLES[0])]
+            print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
         self.kind, self.several = kind, several
         self.table = None if out is None or kind in _DENSITIES else out if kind else out / "scanpaths.csv"
         self.outcomes: dict[int, _Outcome] = {}

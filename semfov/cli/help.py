@@ -25,7 +25,8 @@ Commands:
 
 `semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
 `semfov completion bash >> ~/.bashrc` lets the shell complete commands and options (also zsh and fish).
-Without a picture, search, find, explore and gaze take an embedded scene, so `semfov search --target cup` tries it out.
+Without a picture, search, find, explore and gaze take one that comes with semfov: try `semfov search --target boat`.
+Others are example:market, example:lifeboat, example:aeroplane, example:farm and example:sheet.
 """
 
 _AGENT = """\
@@ -138,7 +139,7 @@ semfov gaze: where people look in a picture that they view freely
 
 usage: semfov gaze [PICTURE ...] [options]
 
-  PICTURE              photographs, or folders of them (none: an embedded scene)
+  PICTURE              photographs, or folders of them (none: one that comes with semfov)
   --detector NAME      the detector whose features are read: yolox-nano (default), yolov3-tiny, nanodet-plus-m-1.5x
   --weights FILE       its weights, where they are not downloaded
   --model FILE         a model for your own detector or of your own fixations, from semfov fit

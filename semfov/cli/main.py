@@ -18,7 +18,7 @@ from semfov.cli.help import HELP
 from semfov.version import __version__
 from semfov.words import OTHER_WORDS
 
-_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: an embedded scene)")
+_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: one that comes with semfov)")
 _DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
 
 _SUBCOMMANDS: dict[str, tuple[tuple[str, str], str, str]] = {

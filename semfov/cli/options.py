@@ -66,7 +66,7 @@ class AgentOptions(DetectorOptions):
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
-        seed: seed of the random start, of ties and of the embedded scene.
+        seed: seed of the random start and of ties.
         quiet: print errors and warnings alone.
     """
 
@@ -84,7 +84,7 @@ class PictureOptions(AgentOptions):
     """Looks at pictures, and what is written of them.
 
     Args:
-        pictures: photographs, large pictures, folders of them, or patterns of names (none: an embedded scene).
+        pictures: photographs, large pictures, folders of them, or patterns of names (none: one that comes with semfov).
         recursive: also take the photographs of the folders in a folder.
         how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
             in front of the viewer), or `auto` for what suits the picture.
@@ -235,7 +235,7 @@ class GazeOptions(DetectorOptions):
     """Predict where people look.
 
     Args:
-        pictures: photographs, folders of them, or patterns of names (none: an embedded scene).
+        pictures: photographs, folders of them, or patterns of names (none: one that comes with semfov).
         recursive: also take the photographs of the folders in a folder.
         detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
         model: file of a model for your own detector, from `semfov fit` (none: the one that is shipped).
@@ -271,10 +271,9 @@ class AppOptions(AgentOptions):
         host: address that the page is served on. Another one than that of this machine lets others use it: anybody who
             reaches it, as it asks for no password.
         port: its port (none: the first free one from 7860 on).
-        seed: seed of the examples.
     """
 
-    unused = ("start",)
+    unused = ("seed", "start")
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(1, 65_535)] | None = None

@@ -33,11 +33,11 @@ from semfov.cli.options import (
 )
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, ResultsFile, held_outputs, kind_of, tell_written, unfinished
-from semfov.cli.sources import PictureSource, picture_sources
+from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data import WordVectors, class_index, spread
+from semfov.data.examples import example_with
 from semfov.data.large import picture_size
-from semfov.data.sources import embedded_picture
 from semfov.errors import InputError, SemfovError, check, check_options, lookup
 from semfov.head.scenes import World
 from semfov.io.files import check_writable, plain_name, sha256, write_bytes
@@ -85,8 +85,8 @@ class _PictureJob(ABC):
         if self.truth is not None:
             self.truth.categories(self.targets or self.agent.classes[1:])
         if not self.sources:
-            scene = embedded_picture(self.agent.classes[1:], self.target, options.seed)
-            self.sources = [PictureSource("embedded scene", scene=scene)]
+            name = "sheet" if self.every else example_with(self.target, self.agent.classes[1:])
+            self.sources = [example_source(name, self.agent.classes[1:], self.target)]
 
     def aim(self, classes: Sequence[str] | None) -> None:
         """Take the target from the options; before the names of the classes are known it is not checked."""
@@ -259,7 +259,7 @@ def _look_and_write(job: _PictureJob, stream: TextIO) -> list[dict[str, Any]]:
     """Look at all pictures; no other command writes the same files meanwhile."""
     sources, several = job.sources, job.several
     if not job.options.pictures:
-        print("no picture was given: looking at an embedded scene")
+        print(f"no picture was given: looking at {sources[0].name}, which comes with semfov")
     outputs = _PictureFiles(job, stream)
     complete, endings, faults = False, Counter[str](), list[SemfovError]()
     before: dict[int, PictureOutcome] = {}
@@ -359,7 +359,7 @@ class _SearchJob(_PictureJob):
         aim = weights if kind == "fovea" and len(weights) > 1 else next(iter(weights))
         start = self.start
         if start is None and kind == "fovea" and source.scene is not None and source.scene.boxes is not None:
-            # A random first cell off the target of an embedded scene.
+            # A random first cell off the target.
             height, width = source.scene.image.shape[-2:]
             grid = Grid(agent.columns, agent.rows, (width, height))
             free = (~grid.footprint(source.scene.boxes).any(0)).nonzero()[:, 0]

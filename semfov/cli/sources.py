@@ -1,8 +1,8 @@
-"""Pictures that a command names: files, those of folders, or an embedded scene."""
+"""Pictures that a command names: files, those of folders, or examples that come with the package."""
 
 import os
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from glob import glob
 from pathlib import Path
 from types import MappingProxyType
@@ -10,13 +10,17 @@ from typing import Any, NamedTuple
 
 from semfov.agents.picture import How, PictureLike
 from semfov.cli.options import GazeOptions, PictureOptions, white_of
+from semfov.data.examples import example_scene
 from semfov.data.large import open_large, picture_size
+from semfov.data.scenes import CLASSES
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
 from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.head import Flat, Panorama
 from semfov.io.files import disk_is_full
 
 _DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in the code a picture has failed
+
+_EXAMPLE = "example:"  # before the name of a picture that comes with the package
 
 
 class PictureSource(NamedTuple):
@@ -25,7 +29,7 @@ class PictureSource(NamedTuple):
     name: str
     file: Path | None = None
     scene: Picture | None = None
-    place: Path = Path("embedded-scene")
+    place: Path = Path("example")
     shown: Mapping[str, Any] = MappingProxyType({})
 
     def opened(self, how: How) -> PictureLike:
@@ -62,6 +66,13 @@ class PictureSource(NamedTuple):
         return DataError(f"{self.name}: cannot be looked at ({type(error).__name__}: {reason})")
 
 
+def example_source(name: str, classes: Sequence[str] = CLASSES, target: str | None = None) -> PictureSource:
+    """A picture that comes with the package, with the boxes of a target."""
+    scene = example_scene(name, classes)
+    boxes = None if target is None else scene.boxes[scene.labels == [*classes].index(target) + 1]
+    return PictureSource(f"{_EXAMPLE}{name}", scene=Picture(name, scene.image, boxes), place=Path(name))
+
+
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
     """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
     sources: dict[str, PictureSource] = {}
@@ -73,6 +84,9 @@ def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource
     # What a shell makes of `flight/*` is what is in a folder.
     kept = {*photographs([Path(name) for name in names], "pictures")} if len(names) > 1 else set()
     for name in [name for name in names if Path(name) in kept] or names:
+        if name.startswith(_EXAMPLE):
+            sources.setdefault(name, example_source(name.removeprefix(_EXAMPLE)))
+            continue
         path = Path(name)
         check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
         there = path.exists() or bool(path.suffix) or len(path.parts) > 1

@@ -2,6 +2,7 @@
 
 from semfov.data.classes import canonical_name, class_index
 from semfov.data.coco import CocoScenes
+from semfov.data.examples import example
 from semfov.data.inputs import as_image
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes, box_coverage, legal_targets
@@ -19,6 +20,7 @@ __all__ = [
     "box_coverage",
     "canonical_name",
     "class_index",
+    "example",
     "legal_targets",
     "read_image",
     "spread",

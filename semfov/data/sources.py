@@ -16,9 +16,8 @@ from torch import Tensor
 
 from semfov.data.inputs import STREAMS
 from semfov.data.reading import read_image
-from semfov.data.scenes import EmbeddedScenes
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
-from semfov.errors import DataError, InputError, SemfovError, check, check_data, needing, printable
+from semfov.errors import DataError, SemfovError, check, check_data, needing, printable
 from semfov.io.files import MADE_HERE, reading
 
 PHOTOGRAPHS = (
@@ -102,22 +101,6 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
         video = "; `semfov live` takes videos" if any(path.suffix.lower() in VIDEOS for path in others) else ""
         warnings.warn(f"{where}: {kept} left out, {'' if count == 1 else 'such as '}{such}{video}", stacklevel=3)
     return [path for path in paths if path not in others]
-
-
-def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
-    """Compose the first embedded scene that holds a target."""
-    embedded = EmbeddedScenes(classes, count=scenes, seed=seed)
-    for index in range(len(embedded)):
-        names = [embedded.classes[label - 1] for label in embedded.targets(index)]
-        if target is None or target in names:
-            scene = embedded[index]
-            chosen = scene.labels == (0 if target is None else embedded.classes.index(target) + 1)
-            return Picture(scene.name, scene.image, None if target is None else scene.boxes[chosen])
-    held = sorted({embedded.classes[label - 1] for index in range(len(embedded)) for label in embedded.targets(index)})
-    raise InputError(
-        f"target: expected a class in the embedded scenes ({', '.join(held)}), got {target!r}; "
-        f"give a photograph to search for it"
-    )
 
 
 class Stream(NamedTuple):

@@ -42,7 +42,7 @@ _GOES_ON = "; give the same command again to continue"
 """What is said about an interrupted command that keeps what it has finished."""
 
 _PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
-             "skimage": "scikit-image", "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
+             "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
 """Names under which packages are installed, where they are not those of their modules."""
 _HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)
 _ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", _HANGUP: "terminated"}

@@ -76,7 +76,7 @@ def calls(agent, monkeypatch):
     gradio = ModuleType("gradio")
     monkeypatch.setattr(gradio, "Error", Told, raising=False)
     monkeypatch.setitem(sys.modules, "gradio", gradio)
-    return _Calls(agent, seed=0)
+    return _Calls(agent)
 
 
 def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, calls, photo):

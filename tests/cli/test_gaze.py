@@ -207,4 +207,4 @@ def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
 def test_without_a_picture_it_takes_an_embedded_scene(run):
     code, out, _ = run("--people", 2)
     assert code == 0
-    assert "embedded scene" in out
+    assert "looking at example:beach, which comes with semfov" in out

@@ -7,12 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov import ActivePerception, Detections, Grid
+from semfov import Detections, Grid
 from semfov.belief import DirichletBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.cli import live
 from semfov.cli.main import main
-from semfov.data.sources import Picture, Stream, embedded_picture
+from semfov.data.examples import example_scene
+from semfov.data.sources import Picture, Stream
 from semfov.decision import CloseUp, Decision
 from semfov.paths import FoveaMoment
 from semfov.viz.live import draw_moment, video, video_suffix
@@ -43,29 +44,29 @@ def read(path):
 @pytest.mark.slow
 def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_path, capsys):
     """The target is found, is followed to the edge, and is absent once it has left the view."""
-    scene = embedded_picture(ActivePerception.recommended().classes[1:], "motorcycle", 0)
-    places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
-    path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
-    assert main(["live", str(path), "--target", "Motorbikes", "--how", "fovea", "--out", str(tmp_path / "out")]) == 0
+    scene = example_scene("farm", ["horse"])
+    places = [40] * 8 + [40 + 20 * shift for shift in range(1, 11)] + [240] * 12
+    path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 240] for x in places])
+    assert main(["live", str(path), "--target", "Horses", "--how", "fovea", "--out", str(tmp_path / "out")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "most likely at" in line]
     assert len(lines) == len(places)
-    assert "motorcycle: found" in lines[7]
-    assert "motorcycle: absent" in lines[-1]
+    assert "horse: found" in lines[7]
+    assert "horse: absent" in lines[-1]
     assert any("closely" in line for line in lines)
-    left, top, right, bottom = scene.boxes[0].tolist()
+    (left, top), (right, bottom) = scene.boxes[:, :2].amin(0).tolist(), scene.boxes[:, 2:].amax(0).tolist()
     for x, line in zip(places[:14], lines, strict=False):
         column, row = map(int, re.search(r"most likely at cell \((\d), (\d)\)", line).groups())
         # The most likely cell overlaps the annotated box, which moves with the view.
-        assert left - x < 32 * (column + 1)
-        assert right - x > 32 * column
-        assert top < 48 * (row + 1)
-        assert bottom > 48 * row
+        assert left - x < 24 * (column + 1)
+        assert right - x > 24 * column
+        assert top < 38.1 * (row + 1)
+        assert bottom > 38.1 * row
     chances = [float(re.search(r"p ([\d.]+)( \(there [\d.]+\))?, most", line)[1]) for line in lines]
     assert min(chances[1:14]) > 0.9
     assert chances[-1] < 0.3
     shown = read(tmp_path / "out" / f"live{video_suffix()}")
     assert len(shown) == len(places)
-    assert shown[0].shape == (480, 320, 3)
+    assert shown[0].shape == (381, 240, 3)
 
 
 @pytest.fixture

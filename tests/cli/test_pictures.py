@@ -664,9 +664,9 @@ def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monke
 @pytest.mark.parametrize(
     "options",
     [
-        "search --target Cups",
-        "find --target cup",
-        "search --target cup --agent published --sensor published-narrow --shifts 1 --draw scanpath",
+        "search --target Boats",
+        "find --target dog",
+        "search --target boat --agent published --sensor published-narrow --shifts 1 --draw scanpath",
     ],
 )
 def test_the_agents_of_the_package_look_at_an_embedded_scene(options, tmp_path, capsys):
@@ -676,6 +676,6 @@ def test_the_agents_of_the_package_look_at_an_embedded_scene(options, tmp_path, 
     with torch.random.fork_rng():
         assert main([*options.split(), *out]) == 0
     printed = capsys.readouterr().out
-    assert "an embedded scene" in printed
+    assert "which comes with semfov" in printed
     assert (tmp_path / "out/scanpath.png").is_file()
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -48,7 +48,7 @@ def test_a_target_that_covers_exactly_the_limit_is_legal_and_a_size_is_width_and
 
 
 def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
-    scenes = EmbeddedScenes(("person", "cat", "dog"), count=9, seed=3)
+    scenes = EmbeddedScenes(("person", "boat", "dog"), count=9, seed=3)
     most = crowded(scenes, 0.4)
     counts = {name: len(scenes.annotation(index).boxes) for index, name in enumerate(scenes.ids)}
     assert len(most) == len(most.ids) == 4  # 3.6 rounded up
@@ -59,7 +59,7 @@ def test_no_scene_that_is_left_out_holds_more_objects_than_one_that_is_kept():
 
 
 def test_a_scene_is_that_of_the_set():
-    scenes = EmbeddedScenes(("person", "cat", "dog"), count=6, seed=3)
+    scenes = EmbeddedScenes(("person", "boat", "dog"), count=6, seed=3)
     most = crowded(scenes, 0.5)
     for index, name in enumerate(most.ids):
         place = scenes.ids.index(name)
@@ -78,7 +78,7 @@ def test_coverages_and_shares_out_of_range_are_refused():
         refused("share: expected above 0", crowded, EmbeddedScenes(("person",), count=2), share)
 
 
-SCENES = EmbeddedScenes(("person", "cat", "cup"), count=5, seed=3)
+SCENES = EmbeddedScenes(("person", "truck", "boat"), count=5, seed=3)
 
 
 def make(**changes):
@@ -101,13 +101,14 @@ def test_no_photograph_is_repeated_if_there_are_enough():
 
 
 def test_boxes_move_with_the_pixels_of_their_tile():
-    mosaics = make(tile=(640, 500))
+    whole = EmbeddedScenes(("person", "truck", "boat"), count=1)  # a photograph that fits the tiles as it is
+    mosaics = Mosaics(whole, 2, 2, tile=(640, 520), count=1)
     scene = mosaics[0]
-    assert scene.size == (1280, 1000)
+    assert scene.size == (1280, 1040)
     start = 0
     for tile in mosaics.tiles(0):
         x1, y1, x2, y2 = tile.box
-        part = SCENES[tile.scene]
+        part = whole[tile.scene]
         assert (x2 - x1, y2 - y1) == part.size
         assert torch.equal(scene.image[:, y1:y2, x1:x2], part.image)
         stop = start + len(part.boxes)
@@ -124,9 +125,12 @@ def test_boxes_are_scaled_with_their_photographs():
     assert (annotation.boxes >= 0).all()
     assert (annotation.boxes <= limit).all()
     tile = mosaics.tiles(0)[0]
-    count = len(SCENES.annotation(tile.scene).boxes)
-    corner = torch.tensor([*tile.box[:2], *tile.box[:2]])
-    torch.testing.assert_close(annotation.boxes[:count], SCENES.annotation(tile.scene).boxes / 2 + corner)
+    own = SCENES.annotation(tile.scene)
+    x1, y1, x2, y2 = tile.box
+    scale = torch.tensor([(x2 - x1) / own.size[0], (y2 - y1) / own.size[1]] * 2)
+    assert float(scale.min()) == pytest.approx(float(scale.max()), rel=0.01)
+    expected = own.boxes * scale + torch.tensor([x1, y1] * 2)
+    torch.testing.assert_close(annotation.boxes[: len(own.boxes)], expected, atol=1e-3, rtol=0)
 
 
 class OneEach:

@@ -1,25 +1,22 @@
-import hashlib
+"""The embedded photographs, the scenes that are made of them, and the sheet of all."""
+
+import json
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
-from semfov.data import EmbeddedScenes
-from semfov.data import scenes as module
-from semfov.data.scenes import _DISTRACTORS, _PHOTOGRAPHED_OBJECTS, _TEXTURES
-from tests.refusals import refused, unusable
+from semfov.data import CocoScenes, EmbeddedScenes, example
+from semfov.data.examples import EXAMPLES, example_scene, example_with
+from semfov.data.scene import Annotation
+from semfov.data.scenes import CLASSES, FOLDER, PHOTOGRAPHS, _Part, _Photograph
+from tests.refusals import refused
 
-CLASSES = ("person", "motorbike", "cat", "cup")
-COUNT = 40
-
-
-@pytest.fixture(scope="module", autouse=True)
-def composed():
-    """Compose scenes anew each time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EmbeddedScenes, "_pixels", EmbeddedScenes._pixels.__wrapped__)
-        yield
+COUNT = 20
+RECORD = json.loads((FOLDER / "photographs.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -27,133 +24,149 @@ def scenes():
     return EmbeddedScenes(CLASSES, count=COUNT)
 
 
-def test_shapes(scenes):
-    assert len(scenes) == COUNT
-    assert scenes.ids == list(range(COUNT))
-    scene = scenes[3]
-    assert scene.image.shape == (3, 480, 640)
-    assert scene.image.dtype == torch.float32
-    assert scene.image.min() >= 0
-    assert scene.image.max() <= 1
-    assert scene.size == (640, 480)
-    assert scene.name == "search array 3, seed 0"
-    assert [s.id for s in EmbeddedScenes(CLASSES, count=2)] == [0, 1]
+def test_every_photograph_has_a_source_and_no_known_copyright_restrictions():
+    (licence,) = RECORD["licenses"]
+    assert licence["name"] == "No known copyright restrictions"
+    assert sorted(path.name for path in FOLDER.glob("*.jpg")) == sorted(each["file_name"] for each in RECORD["images"])
+    told = (FOLDER / "README.md").read_text(encoding="utf-8")
+    for each in RECORD["images"]:
+        assert each["license"] == licence["id"]
+        assert "staticflickr.com" in each["flickr_url"]
+        assert each["flickr_url"] in told
+    assert "CC BY 4.0" in told
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) <= 600_000
 
 
-def test_patches_do_not_overlap_and_lie_inside_the_scene(scenes):
-    for index in range(COUNT):
-        taken = np.zeros((480, 640), dtype=int)
-        items = scenes.items(index)
-        assert len(items) == 10
-        for item in items:
-            x1, y1, x2, y2 = item.patch
-            assert 0 <= x1 < x2 <= 640
-            assert 0 <= y1 < y2 <= 480
-            taken[y1:y2, x1:x2] += 1
-        assert taken.max() == 1
+def test_the_first_scenes_are_the_photographs_as_a_data_set_in_cocos_format_reads_them(scenes):
+    coco = CocoScenes(FOLDER, FOLDER / "photographs.json", CLASSES, min_instances=1, max_target_area=None)
+    files = {scene.name: (scene, coco.annotation(index)) for index, scene in enumerate(map(coco.__getitem__, range(5)))}
+    for index, photograph in enumerate(PHOTOGRAPHS):
+        scene, annotation = scenes[index], scenes.annotation(index)
+        other, told = files[f"{photograph.name}.jpg"]
+        assert scene.name == photograph.name
+        assert torch.equal(scene.image, other.image)
+        assert annotation.size == told.size == scene.size
+        assert torch.equal(scene.boxes, annotation.boxes)
+        order, others = (np.lexsort(boxes.numpy().round(1).T) for boxes in (annotation.boxes, told.boxes))
+        torch.testing.assert_close(annotation.boxes[order], told.boxes[others], atol=0.011, rtol=0)
+        assert torch.equal(annotation.labels[order], told.labels[others])
+        assert torch.equal(annotation.crowd[order], told.crowd[others])
 
 
-def test_boxes_lie_in_their_patches_labels_name_their_objects_and_all_are_legal_targets(scenes):
-    for index in range(COUNT):
-        annotation = scenes.annotation(index)
-        objects = [item for item in scenes.items(index) if item.photograph.label]
-        assert len(objects) == len(annotation.boxes) == 5
-        for item, box, label in zip(objects, annotation.boxes.tolist(), annotation.labels.tolist(), strict=True):
-            assert CLASSES[label - 1].replace("motorbike", "motorcycle") == item.photograph.label
-            x1, y1, x2, y2 = item.patch
-            assert x1 <= box[0] < box[2] <= x2
-            assert y1 <= box[1] < box[3] <= y2
-            assert (box[2] - box[0]) * (box[3] - box[1]) >= 0.4 * (x2 - x1) * (y2 - y1)
+def test_boxes_lie_in_their_scene_and_there_is_something_to_search_for(scenes):
     for index in range(COUNT):
         annotation = scenes.annotation(index)
-        assert scenes.targets(index) == sorted(set(annotation.labels.tolist()))
-        for label in scenes.targets(index):
-            x1, y1, x2, y2 = annotation.boxes[annotation.labels == label].unbind(-1)
-            assert ((x2 - x1) * (y2 - y1)).sum() <= 0.2 * 640 * 480
+        width, height = annotation.size
+        x1, y1, x2, y2 = annotation.boxes.unbind(-1)
+        assert bool(((x1 >= 0) & (x1 < x2) & (x2 <= width)).all())
+        assert bool(((y1 >= 0) & (y1 < y2) & (y2 <= height)).all())
+        assert scenes.targets(index)
+        whole = PHOTOGRAPHS[index % len(PHOTOGRAPHS)].objects.size
+        assert all(0.59 <= part / side <= 1 for part, side in zip(annotation.size, whole, strict=True))
 
 
-def test_mirrored_boxes_follow_the_pixels():
-    """Checked on a photograph that is white only inside the box of its object."""
-    photograph = module._Photograph("test", "skimage", "test.png", (10, 20, 110, 80), "cat", (30, 25, 60, 75))
-    pixels = np.zeros((100, 120), np.uint8)
-    pixels[25:75, 30:60] = 255
-    patch = Image.fromarray(pixels).crop(photograph.crop).resize((50, 30), Image.Resampling.BOX)
-    for mirrored in (False, True):
-        shown = np.asarray(patch)[:, ::-1] if mirrored else np.asarray(patch)
-        rows, columns = np.nonzero(shown > 127)
-        box = module._Item(photograph, (200, 100, 250, 130), mirrored).box()
-        seen = (columns.min() + 200, rows.min() + 100, columns.max() + 201, rows.max() + 101)
-        assert np.abs(np.subtract(box, seen)).max() <= 0.5
+@given(st.data(), st.booleans())
+def test_boxes_of_a_part_follow_the_pixels(data, mirrored):
+    """A picture that is white only in its boxes is white in the part only in the boxes of the part."""
+    boxes = torch.tensor([[3.0, 4.0, 9.0, 12.0], [20.0, 2.0, 31.0, 8.0]])
+    pixels = np.zeros((30, 40), np.uint8)
+    for x1, y1, x2, y2 in boxes.int().tolist():
+        pixels[y1:y2, x1:x2] = 255
+    left, top = data.draw(st.integers(0, 12)), data.draw(st.integers(0, 8))
+    right, bottom = data.draw(st.integers(left + 15, 40)), data.draw(st.integers(top + 10, 30))
+    objects = Annotation(boxes, torch.tensor([1, 2]), torch.tensor([False, False]), (40, 30))
+    part = _Part(_Photograph("white", objects), (left, top, right, bottom), mirrored).objects()
+    shown = Image.fromarray(pixels).crop((left, top, right, bottom))
+    shown = np.asarray(shown)[:, ::-1] if mirrored else np.asarray(shown)
+    drawn = np.zeros_like(shown)
+    for x1, y1, x2, y2 in part.boxes.int().tolist():
+        drawn[y1:y2, x1:x2] = 255
+    seen = [
+        pixels[max(top, y1) : min(bottom, y2), max(left, x1) : min(right, x2)].size / ((x2 - x1) * (y2 - y1))
+        for x1, y1, x2, y2 in boxes.int().tolist()
+    ]
+    assert part.labels.tolist() == [label for label, share in zip((1, 2), seen, strict=True) if share >= 0.5]
+    assert bool((drawn <= shown).all())
+    if all(share >= 0.5 or share == 0 for share in seen):
+        assert np.array_equal(drawn, shown)
 
 
-def test_patches_show_their_photographs(scenes):
-    scene, items = scenes[0], scenes.items(0)
-    for item in items:
-        x1, y1, x2, y2 = item.patch
-        path = module._path(item.photograph.package, item.photograph.file)
-        source = Image.open(path).convert("RGB").crop(item.photograph.crop)
-        expected = np.asarray(source.resize((x2 - x1, y2 - y1), Image.Resampling.BICUBIC)).astype(float)
-        expected = expected[:, ::-1] if item.mirrored else expected
-        shown = scene.image[:, y1:y2, x1:x2].permute(1, 2, 0).numpy() * 255
-        assert abs(shown - expected).mean() < 6
-
-
-def test_boxes_lie_in_their_crops():
-    for photograph in _PHOTOGRAPHED_OBJECTS + _DISTRACTORS:
-        left, top, right, bottom = photograph.crop
-        with Image.open(module._path(photograph.package, photograph.file)) as image:
-            assert 0 <= left < right <= image.width
-            assert 0 <= top < bottom <= image.height
-        if photograph.label:
-            x1, y1, x2, y2 = photograph.box
-            assert left <= x1 < x2 <= right
-            assert top <= y1 < y2 <= bottom
-
-
-def test_photographs_are_files_of_the_installed_packages():
-    from importlib.metadata import files
-
-    carried = {str(f) for name in ("scikit-image", "matplotlib") for f in files(name)}
-    for photograph in _PHOTOGRAPHED_OBJECTS + _DISTRACTORS:
-        assert f"{photograph.package}/{module._FOLDERS[photograph.package]}/{photograph.file}" in carried
-    assert all(f"skimage/data/{texture}" in carried for texture in _TEXTURES)
+def test_images_are_the_pixels_of_their_parts(scenes):
+    for index in (5, 9, 12):
+        part = scenes.part(index)
+        shown = Image.open(part.photograph.path).convert("RGB").crop(part.box)
+        shown = np.asarray(shown)[:, ::-1] if part.mirrored else np.asarray(shown)
+        image = scenes[index].image
+        assert np.array_equal((image * 255).round().byte().permute(1, 2, 0).numpy(), shown)
+        image.zero_()  # it is a copy
+        assert scenes[index].image.any()
 
 
 @pytest.mark.slow
-def test_a_seed_gives_bit_identical_scenes_in_another_process(fresh, scenes):
+def test_a_seed_gives_the_same_scenes_in_another_process(fresh, scenes):
     program = (
         "from semfov.data import EmbeddedScenes\n"
         f"s = EmbeddedScenes({CLASSES!r}, count={COUNT})\n"
-        "print(s.fingerprint, s.digest(5), s.digest(1))"
+        "print(s.fingerprint, s.digest(5), s.digest(1), s.part(7).box)"
     )
-    assert fresh(program).split() == [scenes.fingerprint, scenes.digest(5), scenes.digest(1)]
-    assert torch.equal(scenes[5].image, scenes[5].image)
+    assert fresh(program) == f"{scenes.fingerprint} {scenes.digest(5)} {scenes.digest(1)} {scenes.part(7).box}\n"
 
 
-def test_digests_are_of_the_pixels_whatever_the_number_of_scenes(scenes):
-    pixels = (scenes[2].image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
-    assert scenes.digest(2) == hashlib.sha256(pixels.tobytes()).hexdigest()
+def test_digests_are_of_the_parts_whatever_the_number_of_scenes(scenes):
     few = EmbeddedScenes(CLASSES, count=2)
-    assert few.digest(1) == scenes.digest(1)
+    assert [few.digest(0), few.digest(1)] == [scenes.digest(0), scenes.digest(1)]
     assert few.fingerprint != scenes.fingerprint
     other = EmbeddedScenes(CLASSES, count=2, seed=1)
-    assert len({few.digest(0), few.digest(1), other.digest(0), other.digest(1)}) == 4
+    assert len({each.digest(index) for each in (few, other) for index in range(2)}) == 4
+    assert len({scenes.digest(index) for index in range(COUNT)}) == COUNT
 
 
 def test_objects_of_classes_unknown_to_the_detector_have_no_box():
-    scenes = EmbeddedScenes(("dog", "cat"), count=6)
-    for index in range(6):
-        assert set(scenes.annotation(index).labels.tolist()) <= {2}
-    assert any(scenes.targets(index) == [2] for index in range(6))
-    refused("classes: expected at least one of cat, cup, motorcycle, person", EmbeddedScenes, ("zebra",))
+    scenes = EmbeddedScenes(("zebra", "aeroplane", "dog"), count=5)
+    assert [scenes.annotation(index).labels.tolist() for index in range(5)] == [[3], [], [], [2], [3]]
+    refused("classes: expected at least one of airplane, boat, car, dog", EmbeddedScenes, ("zebra",))
 
 
-def test_bad_arguments_and_missing_files(monkeypatch):
+def test_bad_arguments(scenes):
     refused("count", EmbeddedScenes, CLASSES, count=0)
     refused("seed", EmbeddedScenes, CLASSES, seed=-1)
+    refused("unknown example 'beech'; did you mean 'beach'", example, "beech")
     with pytest.raises(IndexError):
         EmbeddedScenes(CLASSES, count=2)[2]
-    monkeypatch.setitem(module._FOLDERS, "skimage", "elsewhere")
-    unusable(r"expected the photograph .* pip install", EmbeddedScenes, CLASSES)
-    monkeypatch.setattr(module, "find_spec", lambda _: None)
-    unusable(r"expected the package .*, got none, as it is not installed; pip install", EmbeddedScenes, CLASSES)
+
+
+def test_the_sheet_shows_every_photograph_with_its_objects():
+    sheet = example_scene("sheet", CLASSES)
+    assert torch.equal(sheet.image, example("sheet"))
+    width, height = sheet.size
+    assert min(width, height) > 2 * 416
+    assert len(sheet.boxes) == sum(int((~each.objects.crowd).sum()) for each in PHOTOGRAPHS)
+    # The patch in each box is that of the object's photograph.
+    left = {(label, *box) for box, label in zip(sheet.boxes.tolist(), sheet.labels.tolist(), strict=True)}
+    for photograph in PHOTOGRAPHS:
+        image = example(photograph.name)
+        objects, single = photograph.objects, ~photograph.objects.crowd
+        for box, label in zip(objects.boxes[single].tolist(), objects.labels[single].tolist(), strict=True):
+            x1, y1, x2, y2 = map(int, box)
+            there = [
+                each
+                for each in left
+                if each[0] == label
+                and np.allclose([each[3] - each[1], each[4] - each[2]], [box[2] - box[0], box[3] - box[1]], atol=1e-3)
+                and torch.equal(
+                    sheet.image[:, int(each[2]) : int(each[2]) + y2 - y1, int(each[1]) : int(each[1]) + x2 - x1],
+                    image[:, y1:y2, x1:x2],
+                )
+            ]
+            assert there
+            left.remove(there[0])
+    assert not left
+
+
+def test_an_example_is_chosen_by_its_class():
+    assert [example_with(name, ("person", "lorry", *CLASSES)) for name in (None, "dog", "horse", "aeroplane")] == [
+        "beach", "beach", "farm", "aeroplane",
+    ]  # fmt: skip
+    assert set(EXAMPLES) == {*(each.name for each in PHOTOGRAPHS), "sheet"}
+    said = r"come with semfov \(dog, person\), got 'cup'; give a photograph"
+    refused(said, example_with, "cup", ("person", "cup", "dog"))

@@ -14,8 +14,8 @@ from PIL import Image
 import semfov
 from semfov.data import sources
 from semfov.data.images import _FORMATS
-from semfov.data.sources import PHOTOGRAPHS, embedded_picture, open_stream, picture_files
-from semfov.errors import DataError, InputError
+from semfov.data.sources import PHOTOGRAPHS, open_stream, picture_files
+from semfov.errors import DataError
 from semfov.report.episode import jpeg
 from tests import small
 from tests.refusals import refused, unusable
@@ -208,11 +208,3 @@ def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
     assert gaps == {"reconnected": 1, "lost": 0}
     assert [picture.passed for picture in taken[:2]] == [1, 1]
     assert taken[2].passed > 1
-
-
-def test_an_embedded_scene_contains_the_target():
-    picture = embedded_picture(("person", "cup"), "cup", seed=2)
-    assert picture.image.shape == (3, 480, 640)
-    assert len(picture.boxes) == 1
-    with pytest.raises(InputError, match=r"the embedded scenes \(cup, person\), got 'car'"):
-        embedded_picture(("person", "cup", "car"), "car", seed=0)

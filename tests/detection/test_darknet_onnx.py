@@ -9,6 +9,7 @@ import torch
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp
 
+from semfov import example
 from semfov.detection.load import load_yolo
 from semfov.detection.yolo import _VERSION, _exported, _network_digest, _OnnxTwin, network_model
 from semfov.errors import InputError
@@ -55,9 +56,7 @@ def test_onnxruntime_equals_torch(make_small, looks, shape, runtime):
 
 @pytest.mark.weights
 def test_onnxruntime_equals_torch_with_published_weights(tiny_weights, looks):
-    from skimage import data
-
-    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
+    image = example("market")[None]
     detector = load_yolo("yolov3-tiny", weights=tiny_weights)
     network = load_yolo("yolov3-tiny", weights=tiny_weights, runtime="torch", dtype=torch.float64)
     canvas = detector.fit(image)[0]

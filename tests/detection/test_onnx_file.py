@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional as F
 from torchvision.ops import box_iou
 
-from semfov import InputError, load_detector
+from semfov import InputError, example, load_detector
 from semfov.detection import onnx as onnx_detector
 from semfov.detection import onnx_session
 from semfov.detection.darknet import Darknet
@@ -139,10 +139,8 @@ def test_nanodet_plus_is_recognised_by_content_and_takes_other_sizes(shared, tmp
     ("name", "file"), [("nanodet-plus-m-1.5x", "nanodet_plus_m_1.5x_416.onnx"), ("yolox-nano", "yolox_nano_416.onnx")]
 )
 def test_a_published_model_sees_the_same_objects_at_all_sizes(name, file, shared, tmp_path, monkeypatch):
-    from skimage.data import astronaut
-
     monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path))
-    image = torch.from_numpy(astronaut()).permute(2, 0, 1)[None] / 255
+    image = example("aeroplane")[None]
     boxes = []
     for size in (None, 160, 640):
         detector = load_detector(name, weights=shared / "weights" / file, input_size=size)

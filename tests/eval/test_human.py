@@ -23,7 +23,7 @@ def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("human")
     (folder / "images").mkdir()
     generator = np.random.default_rng(0)
-    scenes = EmbeddedScenes(("person", "cup"), count=4, seed=0)
+    scenes = EmbeddedScenes(("person", "boat"), count=4, seed=0)
     searched = {"a": [], "b": [], "model": []}
     for number in range(4):
         pixels = (scenes[number].image.permute(1, 2, 0) * 255).byte().numpy()

@@ -328,7 +328,7 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
 
 def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, monkeypatch):
     config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
-    scenes = EmbeddedScenes(("cat", "cup"), count=8)
+    scenes = EmbeddedScenes(("dog", "boat"), count=8)
     inputs = PartInputs(config, SimpleNamespace(scenes=scenes))
     inputs.results["evidence"] = PartResult(Part("evidence.safetensors", "0", False, "not better"), "")
     forbid(monkeypatch, "verification")
@@ -432,7 +432,7 @@ def test_unknown_settings_of_the_call_are_named():
 
 def test_the_requested_number_of_absent_classes_is_chosen(home):
     """Also for a photograph without a target."""
-    scenes = EmbeddedScenes(("person", "cat", "cup", "zebra"), count=4)
+    scenes = EmbeddedScenes(("person", "dog", "boat", "zebra"), count=4)
     for index in range(4):
         annotation = scenes.annotation(index)
         held = set(annotation.labels.tolist())

@@ -107,7 +107,7 @@ def tables_of_choices(report):
 
 def test_examples_do_not_depend_on_the_store(tmp_path):
     eye = WindowEye(Tiles(name="bright"))
-    mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
+    mosaics = Mosaics(EmbeddedScenes(("person", "dog", "boat"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
     glances = StoredGlances(eye, mosaics, 0, store)
     example = ZoomExample.of(mosaics, 0, glances)
@@ -319,7 +319,7 @@ def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, set
 
 
 def test_recall_is_that_of_the_objects_of_each_photograph():
-    eye, scenes = WindowEye(Tiles(name="bright")), EmbeddedScenes(("person", "cat", "cup"), count=5)
+    eye, scenes = WindowEye(Tiles(name="bright")), EmbeddedScenes(("person", "dog", "boat"), count=5)
     mosaics = Mosaics(scenes, 2, 2, tile=(96, 72), count=3)
     opened = [StoredGlances(eye, mosaics, index, None) for index in range(3)]
     shares = {}

@@ -358,7 +358,7 @@ def test_windows_beyond_a_picture_and_several_episodes_are_refused(views, models
     refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)
 
 
-CLASSES = ("person", "cat", "cup")
+CLASSES = ("person", "dog", "boat")
 
 
 @pytest.fixture(scope="module")

@@ -32,9 +32,9 @@ def test_fit_writes_a_model_and_a_report(fitted):
     counts = torch.tensor(model.metadata["counts"])
     assert counts.shape == (81, 8)
     assert counts.sum() == model.metadata["samples"] > 30
-    person, cup = model.classes.index("person") + 1, model.classes.index("cup") + 1
+    person, boat = model.classes.index("person") + 1, model.classes.index("boat") + 1
     assert counts[person].sum() > 0
-    assert counts[cup].sum() > 0
+    assert counts[boat].sum() > 0
     report = (fitted / "report.md").read_text()
     for word in ("raw scores", "Dirichlet, fixed_point", "uses level"):
         assert word in report

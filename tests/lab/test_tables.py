@@ -203,7 +203,7 @@ def test_calibrated_probabilities_have_the_error_of_chance():
 
 
 def test_frequencies_are_those_of_the_other_scenes():
-    scenes = EmbeddedScenes(["cup", "cat", "dog"], count=5)
+    scenes = EmbeddedScenes(["boat", "truck", "dog"], count=5)
     held = [set(scenes.annotation(index).labels.tolist()) for index in range(5)]
     for index, row in enumerate(class_frequencies(scenes)):
         others = [held[other] for other in range(5) if other != index]

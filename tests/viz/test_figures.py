@@ -23,6 +23,7 @@ from semfov.viz import (
     plot_reliability,
     plot_scanpath,
 )
+from tests.lightness import lab_of
 from tests.refusals import refused
 
 
@@ -232,8 +233,6 @@ def test_colours_differ_in_lightness_or_hue_for_dichromats():
     """The smallest distance in CIELAB, with simulated red and green dichromacy (Viénot et al. 1999)."""
     from itertools import combinations
 
-    from skimage.color import rgb2lab
-
     codes = [[int(code[n : n + 2], 16) / 255 for n in (1, 3, 5)] for code in COLOURS]
     linear = np.array(codes) ** 2.2
     to_lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
@@ -241,7 +240,7 @@ def test_colours_differ_in_lightness_or_hue_for_dichromats():
     deutan = np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]])
     for lack in (np.eye(3), protan, deutan):
         seen = np.clip(linear @ (np.linalg.inv(to_lms) @ lack @ to_lms).T, 0, 1) ** (1 / 2.2)
-        lab = rgb2lab(seen[None])[0]
+        lab = lab_of(seen)
         assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 15
 
 

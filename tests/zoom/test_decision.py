@@ -341,7 +341,7 @@ def test_the_spread_covers_four_of_five_pictures():
 
 def test_the_spread_is_fitted_on_the_numbers_of_records():
     eye = WindowEye(Tiles(name="bright"))
-    mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 4, 4, tile=(96, 72), count=1)
+    mosaics = Mosaics(EmbeddedScenes(("person", "dog", "boat"), count=3), 4, 4, tile=(96, 72), count=1)
     certainty = Certainty(2.0, (1.0, *[0.0] * (len(FACTS) - 1)), scale=0.5, strength=2.0)
     torch.manual_seed(0)
     evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()

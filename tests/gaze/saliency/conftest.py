@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from semfov import example
+
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request: pytest.FixtureRequest) -> torch.dtype:
@@ -18,7 +20,7 @@ def tolerance(dtype: torch.dtype) -> float:
 
 @pytest.fixture
 def photograph() -> np.ndarray:
-    """Part of a photograph, with an odd height and width, `(97, 131, 3)` in [0, 1]."""
-    from skimage import data
-
-    return data.astronaut()[40 : 40 + 2 * 97 : 2, 150 : 150 + 2 * 131 : 2] / 255
+    """A picture of odd height and width, `(97, 131, 3)` in [0, 1], in colours: each channel is another photograph."""
+    names = "beach", "market", "lifeboat"
+    parts = [example(name)[0, 80 : 80 + 2 * 97 : 2, 150 : 150 + 2 * 131 : 2] for name in names]
+    return torch.stack(parts, -1).double().numpy()

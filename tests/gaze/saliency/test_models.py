@@ -9,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from skimage import color
 
 from semfov.gaze.saliency import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
 from semfov.gaze.saliency.blur import enlarge, gaussian_blur
 from semfov.gaze.saliency.itti import _promote
 from semfov.gaze.saliency.opponent import double_opponency, lab_colours, opponent_colours
+from tests.lightness import lab_of
 from tests.refusals import refused
 
 
@@ -109,6 +109,10 @@ def test_double_opponency(dtype: torch.dtype) -> None:
             assert got.tolist() == pytest.approx([intensity, red - green, blue - yellow], abs=2e-6)
 
 
+def plain_lab(pixels: np.ndarray) -> np.ndarray:
+    return lab_of(pixels) / (100, 255, 255)
+
+
 def test_lab(dtype: torch.dtype) -> None:
     pixels = np.random.default_rng(0).random((20, 30, 3))
     # Black, white and dark greys, where another branch of the formula applies.
@@ -116,7 +120,7 @@ def test_lab(dtype: torch.dtype) -> None:
     channels = lab_colours(torch.from_numpy(pixels).permute(2, 0, 1)[None].to(dtype))
     assert channels.dtype == dtype
     result = channels[0].permute(1, 2, 0).numpy()
-    np.testing.assert_allclose(result, color.rgb2lab(pixels) / (100, 255, 255), atol=2e-6)
+    np.testing.assert_allclose(result, plain_lab(pixels), atol=2e-6)
     # The program of VOCUS2's authors uses OpenCV's 8-bit values, with an offset.
     coded = cv2.cvtColor((255 * pixels).round().astype(np.uint8), cv2.COLOR_RGB2Lab) / 255
     np.testing.assert_allclose(result + np.array([0, 128, 128]) / 255, coded, atol=0.01)
@@ -297,8 +301,8 @@ def test_vocus2_equals_the_steps_in_opencv(photograph, fusion, centre, surround,
     np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)
 
 
-def test_saliency_in_lab_equals_that_of_lab_channels_by_scikit_image(photograph: np.ndarray) -> None:
-    lab = color.rgb2lab(photograph) / (100, 255, 255)
+def test_saliency_in_lab_equals_that_of_lab_channels(photograph: np.ndarray) -> None:
+    lab = plain_lab(photograph)
     expected = opencv_vocus2(np.moveaxis(lab, -1, 0), 2.0, 6.0, 2, "mean")
     saliency = VOCUS2(color_space="lab")(torch.from_numpy(photograph).permute(2, 0, 1)[None])
     np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)

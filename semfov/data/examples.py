@@ -1,0 +1,88 @@
+"""Example pictures: the embedded photographs by their names, and a sheet of all of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from semfov.data.classes import canonical_name
+from semfov.data.scene import Scene
+from semfov.data.scenes import CLASSES, PHOTOGRAPHS, EmbeddedScenes
+from semfov.errors import InputError, lookup
+
+_MARGIN = 40  # pixels of paper around the photographs
+_PAPER = 0.95  # its lightness
+
+EXAMPLES = (*(photograph.name for photograph in PHOTOGRAPHS), "sheet")
+"""Names of the example pictures."""
+
+
+def example(name: str) -> Tensor:
+    """Read an example picture, which comes with the package.
+
+    They are photographs of Flickr Commons without known copyright restrictions, and a sheet of them, which is a large
+    picture.
+
+    Args:
+        name: `beach`, `market`, `lifeboat`, `aeroplane`, `farm` or `sheet`.
+
+    Returns:
+        The picture, `(3, H, W)`, RGB in [0, 1].
+
+    Raises:
+        InputError: there is no such example.
+
+    >>> example("market").shape, example("sheet").shape
+    (torch.Size([3, 407, 500]), torch.Size([3, 1026, 1760]))
+    """
+    return example_scene(name, CLASSES).image
+
+
+def example_scene(name: str, classes: Sequence[str]) -> Scene:
+    """Read an example picture, and the objects of the detector's classes in it."""
+    number = EXAMPLES.index(lookup(name, EXAMPLES, "example"))
+    if name == "sheet":
+        return sheet(classes)
+    return EmbeddedScenes(classes, count=len(PHOTOGRAPHS))[number]
+
+
+def sheet(classes: Sequence[str]) -> Scene:
+    """Compose a sheet of all photographs, in two rows on white paper, with the boxes of single objects."""
+    scenes = EmbeddedScenes(classes, count=len(PHOTOGRAPHS))
+    prints = [_single(scenes, index) for index in range(len(scenes))]
+    rows = [prints[0::2], prints[1::2]]
+    width = max(sum(each.size[0] + _MARGIN for each in row) for row in rows) + _MARGIN
+    heights = [max(each.size[1] for each in row) for row in rows]
+    paper = torch.full((3, sum(heights) + _MARGIN * 3, width), _PAPER)
+    boxes, top = list[Tensor](), _MARGIN
+    for row, height in zip(rows, heights, strict=True):
+        gap = (width - sum(each.size[0] for each in row)) // (len(row) + 1)
+        left = gap
+        for each in row:
+            right, bottom = left + each.size[0], top + each.size[1]
+            paper[:, top:bottom, left:right] = each.image
+            boxes.append(each.boxes + torch.tensor([left, top, left, top]))
+            left = right + gap
+        top += height + _MARGIN
+    labels = torch.cat([each.labels for row in rows for each in row])
+    return Scene("sheet", "sheet", paper, torch.cat(boxes), labels)
+
+
+def _single(scenes: EmbeddedScenes, index: int) -> Scene:
+    """A scene without the boxes of crowds."""
+    scene, single = scenes[index], ~scenes.annotation(index).crowd
+    return replace(scene, boxes=scene.boxes[single], labels=scene.labels[single])
+
+
+def example_with(target: str | None, classes: Sequence[str]) -> str:
+    """Name the first photograph that shows an object of a class of the detector, or the first one without a target."""
+    shown = [[CLASSES[label - 1] for label in photograph.objects.labels] for photograph in PHOTOGRAPHS]
+    for photograph, names in zip(PHOTOGRAPHS, shown, strict=True):
+        if target is None or canonical_name(target) in names:
+            return photograph.name
+    held = sorted({name for name in classes if any(canonical_name(name) in names for names in shown)})
+    raise InputError(
+        f"target: expected a class in the pictures that come with semfov ({', '.join(held)}), got {target!r}; give a "
+        f"photograph to search for it"
+    )
