@@ -1,18 +1,16 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self, get_args
 
-import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
 from semfov.agents.fovea import FoveaAgent, Start
 from semfov.agents.head import HeadAgent
-from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, check_order
+from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, check_order, counted_from
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
@@ -28,7 +26,7 @@ from semfov.data.windowed import ChosenBands
 from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, check, check_number, check_options, checked_keywords, devices_here, lookup
+from semfov.errors import InputError, check, check_options, checked_keywords, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -205,19 +203,8 @@ class ActivePerception(nn.Module):
         return cls(**make(*given, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more.
-
-        Raises:
-            InputError: PyTorch has no such device here, or a detector without parameters would keep its precision.
-        """
-        try:
-            converted = fn(torch.zeros(0))
-        except (RuntimeError, AssertionError) as error:
-            here, reason = ", ".join(devices_here()), " ".join(str(error).split())
-            raise InputError(f"device: expected one that PyTorch has here ({here}), got another: {reason}") from None
-        detector = self.eye.detector
-        converts = converted.dtype not in HALVES or any(True for _ in detector.parameters())
-        check(converts, "half", "a detector of PyTorch", f"{detector.settings()['name']}, which has no parameters")
+        """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
+        self.eye.detector.check_conversion(fn)
 
         def precise(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
@@ -354,8 +341,7 @@ class ActivePerception(nn.Module):
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
             closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 3 in a photograph,
                 all that there are passes for in a large picture, 2 for a fovea. 0, and no verification, make none.
-            prior: how often the target is there: the share of the pictures that you search, such as 0.15. None assumes
-                half of them. The probabilities of the decision, which thresholds are compared with, depend on it.
+            prior: share of your pictures that hold the target, such as 0.15; None assumes half. Probabilities follow it.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
             bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
@@ -386,8 +372,8 @@ class ActivePerception(nn.Module):
             settings |= {"give_up": give_up, "shifts": shifts, "prior": prior}
             most = MOST_CLOSER if closer is None else closer
             return self.fovea.search(image, target, bounds, closer=most, **settings)
-        check(len(targets) == 1, "target", "one class for a search by windows or a head; find_all takes several",
-              target)  # fmt: skip
+        several = "one class for a search by windows or a head; find_all takes several"
+        check(len(targets) == 1, "target", several, target)
         arguments = without_none(confirm=confirm, give_up=give_up, prior=prior, **limits)
         if kind == "head":
             only_for(kind, "fovea", "confirm", closer=closer)
@@ -450,11 +436,11 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            return _counting(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
+            return counted_from(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
         arguments = without_none(worth=worth, **limits)
         if kind == "head":
             arguments |= without_none(duration=duration)
-            return _counting(self.head.find_all(opened.world, targets or None, **arguments), least)
+            return counted_from(self.head.find_all(opened.world, targets or None, **arguments), least)
         aim = targets[0] if len(targets) == 1 else list(targets) or None
         return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
 
@@ -514,11 +500,11 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
             seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)
-            return _counting(self.fovea.explore(seen, bounds, **given), least)
+            return counted_from(self.fovea.explore(seen, bounds, **given), least)
         arguments = without_none(worth=worth, passes=passes, seconds=seconds, on_look=on_look)
         if kind == "head":
             arguments |= without_none(start=start, duration=duration)
-            return _counting(self.head.explore(opened.world, seed=seed, **arguments), least)
+            return counted_from(self.head.explore(opened.world, seed=seed, **arguments), least)
         only_for(kind, "fovea", "none", start=start)
         return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
 
@@ -612,9 +598,3 @@ class ActivePerception(nn.Module):
         only_for(kind, "fovea", "passes=", shifts=shifts)
         only_for(kind, "head", "seconds=", duration=duration)
         return opened, kind
-
-
-def _counting(record: Record, least: float | None) -> Record:
-    """The record, whose objects count from `least` on; None leaves it as it is."""
-    check_number(0.0 if least is None else least, "least", 0, 1)
-    return record if least is None else replace(record, least=least)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -16,9 +17,10 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
-from semfov.errors import InputError, SemfovError, check, lookup
+from semfov.errors import InputError, SemfovError, check, check_number, lookup
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import World
+from semfov.paths import Record
 from semfov.zoom.lattice import Lattice
 
 KindOfLook = Literal["fovea", "windows", "head"]
@@ -118,3 +120,9 @@ def _is_class(name: object, classes: Sequence[str]) -> bool:
     except InputError:
         return False
     return True
+
+
+def counted_from(record: Record, least: float | None) -> Record:
+    """Count the objects of a record from a probability or score on; None leaves the record as it is."""
+    check_number(0.0 if least is None else least, "least", 0, 1)
+    return record if least is None else replace(record, least=least)

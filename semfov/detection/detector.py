@@ -12,9 +12,9 @@ from semfov.detection.feature_maps import FeatureMaps, no_features
 from semfov.detection.objects import LEAST
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
-from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import InputError, check, check_pixels, check_whole
+from semfov.errors import InputError, check, check_pixels, check_whole, devices_here
 from semfov.io.state import StatedModule
 
 FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
@@ -251,6 +251,23 @@ class Detector(StatedModule, ABC):
         raise InputError(
             f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"
         )
+
+    def check_conversion(self, convert: Callable[[Tensor], Tensor]) -> None:
+        """Check what a module's tensors are to be moved or converted to, before any of them is.
+
+        Args:
+            convert: moves or converts a tensor, as `torch.nn.Module._apply` takes it.
+
+        Raises:
+            InputError: PyTorch has no such device here, or a detector without parameters would keep its precision.
+        """
+        try:
+            converted = convert(torch.zeros(0))
+        except (RuntimeError, AssertionError) as error:
+            here, reason = ", ".join(devices_here()), " ".join(str(error).split())
+            raise InputError(f"device: expected one that PyTorch has here ({here}), got another: {reason}") from None
+        converts = converted.dtype not in HALVES or any(True for _ in self.parameters())
+        check(converts, "half", "a detector of PyTorch", f"{self.name}, which has no parameters")
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.
