@@ -341,7 +341,7 @@ class ActivePerception(nn.Module):
             give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
             closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 3 in a photograph,
                 all that there are passes for in a large picture, 2 for a fovea. 0, and no verification, make none.
-            prior: share of your pictures that hold the target, such as 0.15; None assumes half. Probabilities follow it.
+            prior: share of your pictures that hold the target, such as 0.15, which probabilities follow; None is half.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
             bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
