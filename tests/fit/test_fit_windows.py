@@ -319,7 +319,7 @@ def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, set
 
 
 def test_recall_is_that_of_the_objects_of_each_photograph():
-    eye, scenes = WindowEye(Tiles(name="bright")), EmbeddedScenes(("person", "dog", "boat"), count=5)
+    eye, scenes = WindowEye(Tiles(name="bright", pure=True)), RedBoxes()
     mosaics = Mosaics(scenes, 2, 2, tile=(96, 72), count=3)
     opened = [StoredGlances(eye, mosaics, index, None) for index in range(3)]
     shares = {}
