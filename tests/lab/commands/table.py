@@ -165,6 +165,15 @@ COMMANDS = {
             (("--mosaics", "-1"), "mosaics: expected"),
         ),
     ),
+    "eval.stream": Command(
+        refused=(
+            (("--target", "cupp"), "did you mean 'cup'"),
+            (("--frames", "8"), "frames: expected 8 or more after frame 8"),
+            (("--film", "nowhere"), "film nowhere: expected pictures in img1"),
+            (("--width", "8"), "width: expected a whole number from 64"),
+        ),
+        workers=False,
+    ),
     "eval.human viewing": Command(refused=((("--fixations", "[nobody.csv]", "--pictures", "[.]"), "nobody.csv"),)),
     "eval.human search": Command(refused=((("--people", "nobody.json"), "nobody.json"),)),
     "train.fit_fom": Command(

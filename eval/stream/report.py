@@ -1,0 +1,120 @@
+"""Runs the study to its end, and writes its tables."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from eval.bootstrap import Bootstrap
+from eval.comparison.summary import announce, write_summary
+from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
+from eval.zoom.objects import average_precision
+from semfov.errors import check_data
+from semfov.runs.results import ResultRecord
+from semfov.runs.tables import plus_minus, table
+
+_By = dict[str, dict[int, list[ResultRecord]]]
+"""Records by way of looking and frame."""
+
+
+def stream(config: StreamConfig) -> None:
+    """Look at all streams, and write the tables and the records."""
+    outcomes = [*StreamRun(config).outcomes()]
+    records = [record for outcome in outcomes for record in outcome.records]
+    last = max((record["frame"] for record in records), default=0)
+    what = f"a frame after frame {config.after} whose number is a multiple of {config.every}"
+    check_data(last > config.after, "stream", what, "none; lower every and after")
+    text = stream_summary(outcomes, config)
+    announce(text, write_summary(config.out, "stream", text, records))
+
+
+def stream_summary(outcomes: Sequence[StreamOutcome], config: StreamConfig) -> str:
+    """The tables, as Markdown."""
+    courses = dict.fromkeys(outcome.course for outcome in outcomes)
+    lines: list[str] = []
+    for course in courses:
+        lines += course_tables(course, [outcome for outcome in outcomes if outcome.course == course], config)
+    return "\n".join([*lines, *drift_table(outcomes)])
+
+
+def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: StreamConfig) -> list[str]:
+    """Tables of one course: AP50, and precision and recall of what is listed, by frame."""
+    by = by_way([record for outcome in outcomes for record in outcome.records])
+    frames = sorted(next(iter(by.values())))
+    heads = [*map(str, frames), f"all after {config.after}"]
+    precisions = [["", *heads, "passes a frame", "ms a frame"]]
+    listed = [["", *heads]]
+    bootstrap = Bootstrap.of(precision_figures(by, config.after), range(len(outcomes)))
+    for number, (way, records) in enumerate(by.items()):
+        chosen = [*records.values(), [each for frame in frames if frame > config.after for each in records[frame]]]
+        cells = [f"{precision_of(group):.2f}" for group in chosen[:-1]]
+        cells.append(plus_minus(float(bootstrap.value[number]), float(bootstrap.error[number]), 3))
+        milliseconds = sum(outcome.costs[way].milliseconds for outcome in outcomes) / len(outcomes)
+        precisions.append([way, *cells, str(outcomes[0].costs[way].passes), f"{milliseconds:.0f}"])
+        listed.append([way, *map(listed_cell, chosen)])
+    objects = sum(record["objects"] for group in next(iter(by.values())).values() for record in group)
+    what = "The frames of a film" if course == FILM else f"Course “{course}”, {len(outcomes)} flights"
+    return [
+        f"{what}: AP50 of {config.target} at the judged frames, with {objects} annotated objects. ± is the standard "
+        "error by bootstrap over streams, and ms are of the processor.",
+        "",
+        *table(precisions),
+        "",
+        "Precision / recall of the objects that are listed, from 0.5 on.",
+        "",
+        *table(listed),
+        "",
+    ]
+
+
+def by_way(records: Sequence[ResultRecord]) -> _By:
+    """The records of each way of looking and frame, in their order."""
+    groups: _By = {}
+    for record in records:
+        groups.setdefault(record["way"], {}).setdefault(record["frame"], []).append(record)
+    return groups
+
+
+def precision_of(records: Sequence[ResultRecord]) -> float:
+    """AP50 of the objects of some frames together."""
+    scores, right = (torch.tensor([value for each in records for value in each[name]]) for name in ("scores", "right"))
+    return average_precision(scores, right.bool(), sum(record["objects"] for record in records))
+
+
+def precision_figures(by: _By, after: int) -> Callable[[Tensor], Tensor]:
+    """A function of the indices of streams: AP50 of each way at all judged frames after a number, `(ways,)`."""
+
+    def figures(streams: Tensor) -> Tensor:
+        chosen = streams.tolist()
+        groups = [[each[n] for n in chosen for frame, each in way.items() if frame > after] for way in by.values()]
+        return torch.tensor([precision_of(group) for group in groups], dtype=torch.float64)
+
+    return figures
+
+
+def listed_cell(records: Sequence[ResultRecord]) -> str:
+    """Precision and recall of the listed objects of some frames."""
+    right, listed, objects = (sum(each[name] for each in records) for name in ("listed right", "listed", "objects"))
+    return f"{right / listed:.2f} / {right / max(objects, 1):.2f}" if listed else f"- / {0:.2f}"
+
+
+def drift_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
+    """Table of the drift of the estimated motion, by course."""
+    groups: Mapping[str, list[StreamOutcome]] = {outcome.course: [] for outcome in outcomes}
+    for outcome in outcomes:
+        groups[outcome.course].append(outcome)
+    rows = [["", "frames", "lost", "mean drift in px", "largest", "ms a frame"]]
+    for course, group in groups.items():
+        drifts = [outcome.drift for outcome in group]
+        pixels = [value for drift in drifts for value in drift.pixels]
+        far = [f"{sum(pixels) / len(pixels):.1f}", f"{max(pixels):.1f}"] if pixels else ["-", "-"]
+        frames = sum(drift.frames for drift in drifts)
+        milliseconds = 1000 * sum(drift.seconds for drift in drifts) / frames
+        rows.append([course, str(frames), str(sum(drift.lost for drift in drifts)), *far, f"{milliseconds:.1f}"])
+    return [
+        "The motion by `semfov.motion.CameraMotion`: frames that it found to fit none before, and how far the centre "
+        "of a frame has drifted from its known place since the first frame.",
+        "",
+        *table(rows),
+        "",
+    ]
