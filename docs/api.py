@@ -25,6 +25,7 @@ MODULES = (
     "semfov.viz",
     "semfov.report",
     "semfov.zoom",
+    "semfov.motion",
     "semfov.head",
     "semfov.agents",
     "semfov.envs",
