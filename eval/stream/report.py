@@ -44,11 +44,12 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
     heads = [*map(str, frames), f"all after {config.after}"]
     precisions = [["", *heads, "passes a frame", "ms a frame"]]
     listed = [["", *heads]]
-    bootstrap = Bootstrap.of(precision_figures(by, config.after), range(len(outcomes)))
+    figures = Bootstrap.of(precision_figures(by, config.after), range(len(outcomes)))
+    errors = (figures.error if len(outcomes) > 1 else torch.full_like(figures.value, torch.nan)).tolist()
     for number, (way, records) in enumerate(by.items()):
         chosen = [*records.values(), [each for frame in frames if frame > config.after for each in records[frame]]]
         cells = [f"{precision_of(group):.2f}" for group in chosen[:-1]]
-        cells.append(plus_minus(float(bootstrap.value[number]), float(bootstrap.error[number]), 3))
+        cells.append(plus_minus(float(figures.value[number]), errors[number], 3))
         milliseconds = sum(outcome.costs[way].milliseconds for outcome in outcomes) / len(outcomes)
         precisions.append([way, *cells, str(outcomes[0].costs[way].passes), f"{milliseconds:.0f}"])
         listed.append([way, *map(listed_cell, chosen)])
@@ -56,7 +57,7 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
     what = "The frames of a film" if course == FILM else f"Course “{course}”, {len(outcomes)} flights"
     return [
         f"{what}: AP50 of {config.target} at the judged frames, with {objects} annotated objects. ± is the standard "
-        "error by bootstrap over streams, and ms are of the processor.",
+        "error by bootstrap over flights, and ms are of the processor.",
         "",
         *table(precisions),
         "",

@@ -1,6 +1,6 @@
 """Looks at streams in every way, and compares what is known at some of their frames with the annotated objects."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -146,7 +146,8 @@ class StreamRun:
     def _look(self, course: str, name: str, frames: Iterator[Frame]) -> StreamOutcome:
         """Look at the frames of a stream in every way; what remembers nothing looks at the judged ones alone."""
         ways, drift = self._ways(), Drift()
-        seconds, steps = Counter[str](), Counter[str]()
+        seconds: dict[str, float] = defaultdict(float)
+        steps = Counter[str]()
         passes: dict[str, int] = {}
         records: list[ResultRecord] = []
         for number, frame in enumerate(frames, 1):

@@ -88,7 +88,7 @@ class Motion:
 
     def inverse(self) -> "Motion":
         """Invert the motion: the map from the second frame to the first."""
-        return Motion(np.linalg.inv(self.matrix))
+        return Motion.of(np.linalg.inv(self.matrix))
 
     def points(self, points: Tensor) -> Tensor:
         """Map points.

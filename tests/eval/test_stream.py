@@ -181,6 +181,7 @@ def test_a_small_run_writes_its_tables(tmp_path, capsys):
     assert text in capsys.readouterr().out
     for row in ("whole frame ", "slices in turn, carried along", "plain rule", "live ", "live, all candidates"):
         assert f"| {row}" in text
+    assert "nan" not in text
     assert len((tmp_path / "records.jsonl").read_text().splitlines()) == 2 * 7
 
 
