@@ -564,13 +564,13 @@ class ActivePerception(nn.Module):
         Args:
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
             how: the kind of look, `fovea` or `windows`; `auto` looks at windows (`semfov.live.LivePerception`).
-            rate: rate at which evidence fades, per frame; 0 forgets nothing; None takes 0.1, and 0.03 for windows.
+            rate: rate at which evidence fades, per second; 0 forgets nothing; None takes 2.5, and 0.75 for windows.
             start: first cell of a fovea; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
             give_up: probability below which a look is not worth a frame; None takes that of the belief alone, as a
                 belief that fades can reach it, or with rate 0 that of `search`.
-            closer: largest number of closer looks, 0 to 100, in ln 2 / rate frames; None takes that of `search`.
+            closer: largest number of closer looks, 0 to 100, in ln 2 / rate seconds; None takes that of `search`.
             prior: how often the target is there, as a share of frames; None assumes half of them.
             color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.

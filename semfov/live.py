@@ -8,7 +8,7 @@ from semfov.agents.episode import Episode, without_none
 from semfov.agents.fovea import FoveaAgent, FoveaEpisode
 from semfov.agents.picture import OpenedPicture
 from semfov.agents.windows import ZoomAgent
-from semfov.data.inputs import Color, ImageLike, as_image
+from semfov.data.inputs import FRAME, Color, ImageLike, as_image
 from semfov.data.tone import White, check_white
 from semfov.errors import check, lookup
 from semfov.motion import Motion
@@ -16,8 +16,8 @@ from semfov.paths import Moment
 
 __all__ = ["LivePerception"]
 
-_FOVEA_RATE = 0.1  # default rate at which the belief of a fovea fades, per frame
-_WINDOW_RATE = 0.03  # default rate at which looks at windows are forgotten, per frame: a look counts for 23 frames
+_FOVEA_RATE = 2.5  # default rate at which the belief of a fovea fades, per second
+_WINDOW_RATE = 0.75  # default rate at which looks at windows are forgotten, per second: a look counts for 0.9 s
 
 
 class LivePerception:
@@ -36,7 +36,7 @@ class LivePerception:
         target: class 1..K to search for; None explores.
         targets: classes 1..K whose objects are all to be found, which windows do; empty for `target`.
         how: the kind of look, `fovea`, `windows` or `auto`.
-        rate: rate at which evidence fades, per frame; None takes 0.1 for a fovea and 0.03 for windows.
+        rate: rate at which evidence fades, per second; None takes 2.5 for a fovea and 0.75 for windows.
         start: first cell of a fovea; None draws one at random.
         seed: seed of the generator that draws the start and breaks ties.
         white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
@@ -94,13 +94,13 @@ class LivePerception:
         }
         self._check_start()
 
-    def step(self, frame: ImageLike, passed: float = 1.0, pose: Motion | ArrayLike | None = None) -> Moment:
+    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame.
 
         Args:
             frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
-            passed: number of frames since the last look, this one included, by which evidence fades; above 1 where
-                frames were lost, such as the seconds between two time stamps times the frames per second.
+            passed: seconds since the last frame, by which evidence fades, such as the difference of two time stamps;
+                what is not given is taken to be 1/25 s.
             pose: where the camera is, if that is known from a gimbal or from odometry: the map from pixels of the first
                 frame to pixels of this one, a `semfov.motion.Motion` or its `(3, 3)` or `(2, 3)` matrix; for all frames
                 or none. None estimates the motion from the frames (`semfov.motion.CameraMotion`).

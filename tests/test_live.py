@@ -12,8 +12,10 @@ from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEviden
 from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
+from semfov.data.sources import open_stream
 from semfov.episode import Forgetting
 from semfov.gaze.policies import Policy
+from tests.films import encode
 from tests.refusals import refused
 from tests.small import Coloured, tensors
 
@@ -111,22 +113,22 @@ def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration
 
 
 def test_dirichlet_parameters_return_to_the_prior_exponentially():
-    """n looks without detections multiply β − β₀ by e^(−rn)."""
+    """t seconds without detections multiply β − β₀ by e^(−rt)."""
     agent = agent_with(Semantic(3, prior=0.25))
-    live = agent.live("green", rate=0.2, start=0)
+    live = agent.live("green", rate=2, start=0)
     first = live.step(scene(4)).belief.beta
     assert first.max() > 0.6
     for _ in range(5):
-        last = live.step(torch.full((3, 120, 160), 0.4)).belief.beta
+        last = live.step(torch.full((3, 120, 160), 0.4), passed=0.1).belief.beta
     torch.testing.assert_close(last - 0.25, math.exp(-1) * (first - 0.25), atol=1e-6, rtol=1e-5)
-    later = live.step(torch.full((3, 120, 160), 0.4), passed=2.5).belief.beta
+    later = live.step(torch.full((3, 120, 160), 0.4), passed=0.25).belief.beta
     torch.testing.assert_close(later - 0.25, math.exp(-1.5) * (first - 0.25), atol=1e-6, rtol=1e-5)
     refused("passed: expected a number", live.step, torch.full((3, 120, 160), 0.4), passed=math.nan)
 
 
 def test_the_belief_follows_a_moving_target_and_old_evidence_fades():
     """A square moves from the left to the right, and the most probable cell moves with it."""
-    live = agent_with(Semantic(3)).live("green", rate=0.3, seed=1)
+    live = agent_with(Semantic(3)).live("green", rate=7.5, seed=1)
     frames, grid = [], Grid(8, 6, SIZE)
     for x in [8] * 12 + list(range(8, 129, 8)) + [128] * 12:
         moment = live.step(scene(x))
@@ -149,7 +151,7 @@ def test_the_belief_follows_a_moving_target_and_old_evidence_fades():
 
 def test_cells_can_be_fixated_again_after_the_half_life_of_evidence():
     live, picture = (
-        agent_with(Semantic(3)).live("green", rate=math.log(2) / 4.5, start=0),
+        agent_with(Semantic(3)).live("green", rate=math.log(2) / 0.18, start=0),
         torch.full((3, 120, 160), 0.4),
     )
     cells = []
@@ -194,7 +196,7 @@ class Deciding(Semantic):
 
 
 def test_each_frame_has_a_decision():
-    live = agent_with(Deciding(3)).live("green", rate=0.2, start=9)
+    live = agent_with(Deciding(3)).live("green", rate=5, start=9)
     outcomes = [live.step(scene(8)).decision for _ in range(8)]
     assert outcomes[-1].outcome == "found"
     x1, y1, x2, y2 = outcomes[-1].box.tolist()
@@ -204,7 +206,31 @@ def test_each_frame_has_a_decision():
     assert gone[-1].outcome != "found"
     assert gone[-1].probability < 0.5
     assert agent_with(Semantic(3)).live("green").step(scene(8)).decision is None
-    assert FoveaEpisode(agent_with(Deciding(3)).fovea, 2, rate=0.1, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+    assert FoveaEpisode(agent_with(Deciding(3)).fovea, 2, rate=2.5, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+
+
+@pytest.mark.parametrize("how", ["fovea", "windows"])
+def test_a_film_gives_the_same_beliefs_in_any_container(tmp_path, how):
+    """Frames at 30 a second, of which a third is left out: MP4 states a mean rate, Matroska rounds its time stamps."""
+    times = [0, 1, 2, 3, 6, 7, 10, 11, 12, 30, 31, 32]
+    pictures = [(scene(8 * number).permute(1, 2, 0) * 255).byte().numpy() for number in range(len(times))]
+    films = {}
+    for end in ("mp4", "mkv", "avi", "webm"):
+        stream = open_stream(encode(tmp_path / f"film.{end}", "libvpx-vp9", times, pictures))
+        live = agent_with(observers()["target"]).live("green", how=how, start=3 if how == "fovea" else None)
+        films[end] = [(picture, live.step(picture.image, picture.passed)) for picture in stream.frames]
+        assert not stream.gaps["lost"]
+    for film in films.values():
+        seconds = [picture.passed for picture, _ in film[1:]]
+        assert seconds == pytest.approx(np.diff(times) / 30, abs=1e-9)
+        for (picture, moment), (first, expected) in zip(film, films["mp4"], strict=True):
+            assert torch.equal(picture.image, first.image)
+            assert moment.next_point == expected.next_point
+            if how == "fovea":
+                torch.testing.assert_close(moment.probability, expected.probability, atol=1e-6, rtol=0)
+            else:
+                assert [look.window for look in moment.glances] == [look.window for look in expected.glances]
+                torch.testing.assert_close(moment.objects.scores, expected.objects.scores, atol=1e-6, rtol=0)
 
 
 def test_frames_may_have_any_type_but_must_have_the_same_size():

@@ -22,6 +22,7 @@ from semfov import FovealObservationModel
 from semfov.agents.head import _CONFIRM
 from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
+from semfov.data.inputs import FRAME
 from semfov.decision import MOST_CLOSER
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
@@ -179,8 +180,9 @@ KNOWN = {
     "docs/guides/live.md": {
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
-        f"{log(2) / _WINDOW_RATE:.0f} by default": "code",
-        f"rate, {_FOVEA_RATE}": "code",
+        f"{log(2) / _WINDOW_RATE:.2f} by default": "code",
+        f"rate, {_FOVEA_RATE}, is {_FOVEA_RATE * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
+        f"1/{1 / FRAME:.0f} s is taken": "code",
         "of 16 bits": "a type",
     },
     "docs/guides/records.md": {

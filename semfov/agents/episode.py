@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from semfov.data.inputs import ImageLike
+from semfov.data.inputs import FRAME, ImageLike
 from semfov.decision import Decision
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole
@@ -78,7 +78,7 @@ class Episode(ABC, Generic[_Record]):
         self.targets = targets if len(targets) > 1 else ()
         self.limits = EpisodeLimits() if limits is None else limits
         self.forgetting = None if rate is None else Forgetting(rate)
-        self.passed = 1.0
+        self.passed = FRAME
         self.pose: Motion | ArrayLike | None = None
         self.passes = 0
         self.ending: Ending | None = None
@@ -103,7 +103,7 @@ class Episode(ABC, Generic[_Record]):
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
     @torch.inference_mode()
-    def step(self, frame: ImageLike, passed: float = 1.0, pose: Motion | ArrayLike | None = None) -> Moment:
+    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame of a stream (`look`), and tell what is known then."""
         check_number(passed, "passed", 0, 1e9)
         self.passed, self.pose = passed, pose

@@ -123,7 +123,7 @@ class FoveaEpisode(Episode[Scanpath]):
     r"""Looks of a fovea, with one gaze shift or one closer look for each pass of the detector.
 
     With a model of verification the target is found by closer looks alone (`semfov.decision.Verifier`). In a stream the
-    gaze continues from its last position, and each frame multiplies the evidence of earlier frames by :math:`e^{-r}`,
+    gaze continues from its last position, and after t seconds :math:`e^{-rt}` of the evidence is left,
     with the rate r (`semfov.episode.Forgetting`). With rate 0, frames of a still picture give the looks and the
     decision of a search of the picture up to its end. `ends` tells the outcome of a step (`semfov.decision.OUTCOMES`),
     0 to go on; a search `to_goal` ends on given cells, without a decision.
@@ -187,7 +187,7 @@ class FoveaEpisode(Episode[Scanpath]):
         self._start = int(first)
         self._looks: LiveLooks | None = None
         self._verifier: Verifier[Step] | None = None
-        self._outcome, self._faded, self._frame = 0, 0.0, 0.0
+        self._outcome, self._faded, self._now = 0, 0.0, 0.0
         self._concluded: Decision | None = None
 
     def open(self, image: Tensor) -> Grid:
@@ -243,7 +243,7 @@ class FoveaEpisode(Episode[Scanpath]):
         image = as_image(self._pixels, like=self.eye.sensor.like, argument="frame")[None]
         self._check_size((image.shape[-1], image.shape[-2]))
         self._faded += self.passed
-        self._frame += self.passed
+        self._now += self.passed
         if self._verifier is not None:
             self._verifier.wait(self.passed)
         if self._candidate is not None:
@@ -254,7 +254,7 @@ class FoveaEpisode(Episode[Scanpath]):
             self.open(image)
         else:
             self._image, self._looks.view = image, self.eye.open(image)
-            self._looks.frames = self._faded
+            self._looks.passed = self._faded
         self._faded = 0.0
         watch.lap("open")
         return self._fixate(watch.seconds)
@@ -264,8 +264,8 @@ class FoveaEpisode(Episode[Scanpath]):
         if step is None:
             return None
         self._last = step, self.passes
-        self._recent.append((self._frame, step.detections))
-        while self.forgetting is not None and self._frame - self._recent[0][0] >= self.forgetting.span:
+        self._recent.append((self._now, step.detections))
+        while self.forgetting is not None and self._now - self._recent[0][0] >= self.forgetting.span:
             self._recent.popleft()
         self.passes += 1
         if self.forgetting is None:

@@ -231,7 +231,7 @@ class WindowEpisode(Episode[ZoomPath]):
     a detection that shows the target (`semfov.decision.settle`). Without evidence slices are looked at in the order of
     the overview's scores, and nothing is `absent`.
 
-    In a stream a look counts for :math:`\ln 2 / r` frames, with the rate r, or until the next look at the same window
+    In a stream a look counts for :math:`\ln 2 / r` seconds, with the rate r, or until the next look at the same window
     (`semfov.zoom.episode.look_by_look`), and what a later look has shown as closely replaces what earlier ones did.
     With rate 0 frames of a still picture give the looks and the objects of an episode of the picture up to its end.
     """
@@ -281,7 +281,6 @@ class WindowEpisode(Episode[ZoomPath]):
         self._camera = _followed_camera() if follows else None
         self._poses: KnownPoses | None = None
         self._lost = False
-        self._frame = 0.0
         self._concluded: Decision | None = None
         self._began = perf_counter()
 
@@ -330,7 +329,6 @@ class WindowEpisode(Episode[ZoomPath]):
                 self._check_size(view.picture.size)
                 if self._glances is None:
                     self.open(LiveGlances(self.eye, view))
-                self._frame += self.passed
                 self._follow(view)
                 if self._decisions is not None:
                     self._decisions.wait(self.passed)
@@ -364,9 +362,9 @@ class WindowEpisode(Episode[ZoomPath]):
         assert isinstance(self._glances, LiveGlances)
         camera = self._camera_step(view)
         if camera is None or self._newest is None:
-            self._glances.show(view, self._frame)
+            self._glances.show(view, self.passed)
             return
-        self._glances.show(view, self._frame, camera)
+        self._glances.show(view, self.passed, camera)
         self._lost = camera.motion is None and camera.recovered is None
         if camera.is_still:
             return
@@ -394,14 +392,15 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def _turn(self) -> bool:
         """Make the next look of the search or the exploration; returns whether one was left."""
+        assert self._glances is not None
         turn = next(self._turns, None)
         if turn is None:
             return False
         self._last = turn
         self._number(turn.look)
         if self.forgetting is not None:
-            oldest = self._frame - self.forgetting.span
-            self._closer_looks = [look for look in self._closer_looks if look.frame >= oldest]
+            oldest = self._glances.time - self.forgetting.span
+            self._closer_looks = [look for look in self._closer_looks if look.time >= oldest]
         if self._decisions is not None:
             last = turn.ahead == 0 or self.limits.room(self.passes) <= 1
             self._decisions.see(turn, self.passes, last=last)
@@ -411,7 +410,7 @@ class WindowEpisode(Episode[ZoomPath]):
     def _close_up(self, box: Tensor) -> Detections:
         """Spend a pass on a closer look at a box."""
         assert self._glances is not None
-        look = KeptLook(look_closely(self._glances, box, self._closer), self._frame, 0.0)
+        look = KeptLook(look_closely(self._glances, box, self._closer), self._glances.time, 0.0)
         self._number(look)
         self._closer_looks.append(look)
         return look.taken.candidates

@@ -169,7 +169,7 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   --find CLASSES       classes of which all objects are to be found, with commas between them
   --how KIND           auto (default: windows of any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
-  --rate R             rate at which evidence fades from frame to frame (0: never)
+  --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
   --closer N           most closer looks in the time until half of the evidence has faded (0: none)
   --prior P            how often the target is there: the share of the frames that hold it (default: half)

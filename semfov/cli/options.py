@@ -203,7 +203,7 @@ class LiveOptions(AgentOptions):
         how: kind of look: `fovea`, `windows`, or `auto`: windows, or a fovea where frames are small and the agent has
             no evidence for photographs or `start` is given.
         frames: number of frames to look at (none: all of them; a camera until Ctrl-C).
-        rate: rate at which evidence fades from frame to frame; 0: never (none: 0.1 for a fovea, 0.03 for windows).
+        rate: rate at which evidence fades, per second; 0: never (none: 2.5 for a fovea, 0.75 for windows).
         confirm: the target is found from this probability on, with closer looks that of its place (none: that of the
             model).
         give_up: probability of the target below which a look is not worth a frame (none: that of the belief).

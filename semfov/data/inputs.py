@@ -27,6 +27,7 @@ PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
 STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")  # kinds of addresses of cameras and streams
+FRAME = 1 / 25  # seconds between two frames where nothing tells them
 
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 

@@ -5,20 +5,23 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.inputs import STREAMS
+from semfov.data.animations import animation
+from semfov.data.containers import Container, container_of, frames_stated
+from semfov.data.inputs import FRAME, STREAMS
 from semfov.data.reading import read_image
 from semfov.data.tone import White, black_and_white, bytes_between, check_white
 from semfov.errors import DataError, SemfovError, check, check_data, needing, printable
-from semfov.io.files import MADE_HERE, reading
+from semfov.io.files import MADE_HERE
 
 PHOTOGRAPHS = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".apng", ".webp", ".avif", ".avifs", ".heic", ".heif", ".hif"),
@@ -32,22 +35,22 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")  # e
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)  # seconds between the attempts to open a stream again that broke off
 _MOST_FRAMES = 1e9  # of a file; streams state numbers that mean nothing
+_MOST_ATTEMPTS = 10_000  # to read a frame of a file; if none succeeds it has ended, whatever it states
 _FASTEST = 1000  # frames per second
-_USUAL_RATE = 25.0  # of a stream that does not give its own
+_LONGEST = 1e9  # seconds between two frames
+_ROUNDING = 1e-3  # seconds by which differences of the time stamps of Matroska may be off
 
 _WIDE = {int.from_bytes(code, "little") for code in (b"Y1\0\x10", b"Y16 ")}
 """Codes of frames of 16 bits, grey, of FFmpeg and of a camera."""
 
-_PLAYLIST = b"#EXTM3U"
-
 
 class Picture(NamedTuple):
-    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`, and frames of a stream that passed since the last."""
+    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`, and in a stream seconds since the last frame."""
 
     name: str
     image: Tensor
     boxes: Tensor | None = None
-    passed: float = 1.0
+    passed: float = FRAME
 
 
 def picture_files(source: Path, *, recursive: bool = False, frames: bool = False) -> list[Path]:
@@ -122,12 +125,15 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     if isinstance(source, Path) and source.is_dir():
         skips: Counter[str] = Counter()
         return Stream(name, None, _read_frames(picture_files(source, frames=True)[:most], skips, white), skips)
+    container = container_of(source) if isinstance(source, Path) else "other"
+    check_data(container != "playlist", name, "a video", "a playlist, which names other files; give these")
+    gaps: Counter[str] = Counter()
+    if isinstance(source, Path) and container == "animation":
+        shown = animation(source, white)
+        begun = next(shown)
+        return Stream(name, 1 / begun[1], _animate(chain([begun], shown), name, most, gaps), gaps)
     with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
-    if isinstance(source, Path):
-        with reading(source, f"source: {source}"), source.open("rb") as file:
-            video = file.read(len(_PLAYLIST)) != _PLAYLIST
-            check_data(video, name, "a video", "a playlist, which names other files; give these")
     recorder = _recorder(cv2, source)
     if not recorder.isOpened():
         what = "OpenCV reads videos of this format"
@@ -137,15 +143,14 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
             what = "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
         raise DataError(f"{name}: cannot be opened; check that {what}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
-    gaps: Counter[str] = Counter()
-    frames = _record(cv2, recorder, source, name, most, gaps, white)
+    frames = _record(cv2, recorder, source, name, most, gaps, white, container)
     first = next(frames)
     return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
 
 
 def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
     """Frames of files; one that cannot be read, or is not as large as the first, is skipped with a warning."""
-    size, passed = None, 1.0
+    size, passed = None, FRAME
     for file in files:
         try:
             image = read_image(file, white=white)
@@ -157,11 +162,25 @@ def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None)
             reason = error if isinstance(error, SemfovError) else f"{type(error).__name__}: {error}"
             warnings.warn(f"skipped {file.name}: {reason}", stacklevel=2)
             gaps["skipped"] += 1
-            passed += 1
+            passed += FRAME
             continue
         yield Picture(file.name, image, passed=passed)
-        passed = 1.0
+        passed = FRAME
     check_data(size is not None, "source", "a frame that can be read", f"{len(files)} that cannot")
+
+
+def _animate(
+    shown: Iterator[tuple[Tensor, float]], name: str, most: int | None, gaps: Counter[str]
+) -> Iterator[Picture]:
+    """Frames of an animation, each after the seconds for which the one before is shown; a damaged one ends it."""
+    passed = FRAME
+    try:
+        for number, (image, seconds) in enumerate(islice(shown, most)):
+            yield Picture(f"{name}, frame {number}", image, passed=passed)
+            passed = seconds
+    except DataError as error:
+        warnings.warn(f"{name} ends with a frame that cannot be read: {error}", stacklevel=2)
+        gaps["lost"] += 1
 
 
 def _name(address: str) -> str:
@@ -171,6 +190,32 @@ def _name(address: str) -> str:
     check(kind in kinds, "source", f"an address of a stream ({', '.join(kinds)})", f"{kind}://…")
     host, separator, path = rest.partition("/")
     return f"{kind}://{host.rpartition('@')[2]}{separator}{path.partition('?')[0]}"
+
+
+class _Clock:
+    """Time in a stream, by the time stamps of its frames in seconds, or by its rate where they do not increase.
+
+    Attributes:
+        frame: seconds between two frames by the rate.
+        rounded: whether time stamps are rounded to milliseconds; those that fit the rate are taken to follow it.
+        stamp: the last time stamp, infinite for none.
+    """
+
+    def __init__(self, frame: float, *, rounded: bool) -> None:
+        self.frame, self.rounded, self.stamp = frame, rounded, math.inf
+
+    @property
+    def frames(self) -> int:
+        """Number of frames up to the last time stamp, by the rate."""
+        return round(self.stamp / self.frame) + 1 if math.isfinite(self.stamp) else 0
+
+    def passed(self, stamp: float, lost: int) -> float:
+        """Seconds since the last frame, at the time stamp of one before which some were lost."""
+        seconds, self.stamp = stamp - self.stamp, stamp
+        if not 0 < seconds < math.inf:
+            return (1 + lost) * self.frame
+        by_rate = round(seconds / self.frame) * self.frame
+        return by_rate if self.rounded and by_rate and abs(seconds - by_rate) <= _ROUNDING else seconds
 
 
 def _recorder(cv2: Any, source: str | Path | int) -> Any:
@@ -196,6 +241,14 @@ def _prepare(cv2: Any, recorder: Any, white: White | None) -> None:
         recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
 
+def _rgb(pixels: NDArray[Any], white: White | None) -> Tensor:
+    """A frame of OpenCV as RGB bytes `(3, H, W)`."""
+    if white is not None:
+        pixels = bytes_between(pixels, black_and_white(white, pixels))
+        pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
+    return torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
+
+
 def _record(
     cv2: Any,
     recorder: Any,
@@ -204,42 +257,41 @@ def _record(
     most: int | None,
     gaps: Counter[str],
     white: White | None = None,
+    container: Container = "other",
 ) -> Iterator[Picture]:
     """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again."""
     total, rate = (float(recorder.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-    whole_file = 0 < total < _MOST_FRAMES
-    rate = rate if 0 < rate < _FASTEST else _USUAL_RATE
-    read, missed, passed, stamp = 0, 0, 1.0, math.inf
+    is_file = isinstance(source, Path) or 0 < total < _MOST_FRAMES
+    clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=container == "matroska")
+    read, missed, waited = 0, 0, 0.0
     _prepare(cv2, recorder, white)
     try:
         while read != most:
             there, pixels = recorder.read()
             if there:
                 gaps["lost"] += missed
-                if white is not None:
-                    pixels = bytes_between(pixels, black_and_white(white, pixels))
-                    pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
-                picture = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
-                before, stamp = stamp, float(recorder.get(cv2.CAP_PROP_POS_MSEC))
-                if not isinstance(source, int) and before < stamp < math.inf:
-                    passed = max(passed, round((stamp - before) / 1000 * rate) - missed)
-                passed = min(passed + missed, _MOST_FRAMES)
-                yield Picture(f"{name}, frame {read + gaps['lost']}", picture, passed=passed)
-                read, missed, passed = read + 1, 0, 1.0
+                is_camera = isinstance(source, int)
+                stamp = time.monotonic() if is_camera else float(recorder.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+                passed = min(clock.passed(stamp, missed) + waited, _LONGEST)
+                yield Picture(f"{name}, frame {read + gaps['lost']}", _rgb(pixels, white), passed=passed)
+                read, missed, waited = read + 1, 0, 0.0
                 continue
-            if whole_file and read + gaps["lost"] + missed < total:
+            if is_file and missed < _MOST_ATTEMPTS and read + gaps["lost"] + missed < total:
                 missed += 1
                 continue
             if not read:
                 raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
             began = time.monotonic()
-            if whole_file or isinstance(source, Path) or not _reopened(cv2, recorder, source):
+            if is_file or not _reopened(cv2, recorder, source):
+                stated = frames_stated(source, container, total) if isinstance(source, Path) else 0
+                # AVI counts the frames that a film leaves out, too, over which its time stamps go.
+                seen = max(read + gaps["lost"], clock.frames if container == "avi" else 0)
                 # The number of frames that a file states may be off by one.
-                gaps["lost"] += missed if missed > 1 else 0
+                gaps["lost"] += stated - seen if stated - seen > 1 else 0
                 return
             _prepare(cv2, recorder, white)
             gaps["reconnected"] += 1
-            passed, stamp = 1 + (time.monotonic() - began) * rate, math.inf
+            waited, clock.stamp = time.monotonic() - began, math.inf
     finally:
         recorder.release()
 

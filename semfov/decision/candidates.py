@@ -12,6 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.prior import Prior
 from semfov.belief.verification import closer_features
+from semfov.data.inputs import FRAME
 from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
@@ -65,8 +66,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
     def __init__(self, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
         self.prior = Prior() if prior is None else prior
-        self._frame = 0.0
-        # Each with its frame: what looks show, boxes `(2, 4)` and cells `(X·Y,)` of examined places, and their
+        self._now = 0.0  # seconds of a stream
+        # Each with its time: what looks show, boxes `(2, 4)` and cells `(X·Y,)` of examined places, and their
         # probabilities.
         self._looks: list[tuple[float, Any]] = []
         self._examined: list[tuple[float, Tensor, Tensor]] = []
@@ -99,11 +100,11 @@ class CandidatePlaces(ABC, Generic[LookType]):
         if self.grid is not None:
             covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
             covered[candidate.cell] = True
-        self._examined.append((self._frame, boxes, covered))
+        self._examined.append((self._now, boxes, covered))
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
         """Make the record of the last closer look; box `(4,)`."""
-        self._known.append((self._frame, place))
+        self._known.append((self._now, place))
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._number)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
@@ -121,10 +122,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self.dismiss(candidate, box)
         return features, box
 
-    def wait(self, frames: float = 1) -> None:
-        """Let frames pass: forget looks, and list places again, of which less than half the evidence is left."""
-        self._frame += frames
-        oldest = self._frame - self.forgetting.span
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass: forget looks, and list places again, of which less than half the evidence is left."""
+        self._now += passed
+        oldest = self._now - self.forgetting.span
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
         self._examined = [place for place in self._examined if place[0] >= oldest]
         self._known = [known for known in self._known if known[0] >= oldest]
@@ -134,7 +135,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         if motion is None:
             self._looks, self._examined, self._known = [], [], []
             return
-        self._examined = [(frame, motion.boxes(boxes), cells) for frame, boxes, cells in self._examined]
+        self._examined = [(time, motion.boxes(boxes), cells) for time, boxes, cells in self._examined]
 
     def cell(self, box: Tensor) -> int | None:
         """The cell that a box `(4,)` covers most; None where places are no cells."""
@@ -173,7 +174,7 @@ class CandidateCells(CandidatePlaces[Step]):
         self.presence = float(look.belief.presence(self._target))
         # Computed when a place is chosen for the first time.
         footprint = cache(partial(self.grid.footprint, look.detections.boxes, "soft"))
-        self._looks.append((self._frame, (look.detections, footprint)))
+        self._looks.append((self._now, (look.detections, footprint)))
         # Largest probability of a cell that was not fixated, given that no fixated cell holds the target.
         self._left = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
 
@@ -190,8 +191,8 @@ class CandidateCells(CandidatePlaces[Step]):
         # Faded scores of the detections of all looks, 0 for objects that were examined.
         keep = self.forgetting.keep
         faded = [
-            seen.mask[0] * (seen.scores[0, :, self.target] * keep ** (self._frame - frame))
-            for frame, (seen, _) in self._looks
+            seen.mask[0] * (seen.scores[0, :, self.target] * keep ** (self._now - time))
+            for time, (seen, _) in self._looks
         ]
         scores = torch.cat(faded) * ~self._again(boxes) if self._examined else torch.cat(faded)
         evidence = scores[:, None] * torch.cat([footprint()[0] for _, (_, footprint) in self._looks])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, follow_target
+from semfov.data.inputs import FRAME
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
 from semfov.decision.rule import OUTCOMES, CloseUp, Decision, verified
 from semfov.episode import Step
@@ -25,7 +26,7 @@ _FLOOR = 1e-6
 
 
 class _Verdict(NamedTuple):
-    """A closer look at a place, and the number of frames since then."""
+    """A closer look at a place, and the seconds since then."""
 
     look: CloseUp
     age: float = 0
@@ -40,13 +41,13 @@ class Verifier(Generic[LookType]):
     (`verified`). In a photograph that is looked at by windows no place ends it (`by_worth`), as the next may be surer.
 
     Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream (`look`). Their
-    probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a frames
+    probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a seconds
 
     .. math:: \operatorname{logit} P_a = e^{-ra} \operatorname{logit} P_0 + (1 - e^{-ra}) \operatorname{logit} B
 
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
-    place never rises above :math:`P_0`. After :math:`\ln 2 / r` frames the place may be examined again, and after twice
-    as many the verdict is forgotten. If r is not 0, the boxes of the verdicts follow the detections of each look.
+    place never rises above :math:`P_0`. After :math:`\ln 2 / r` seconds the place may be examined again, and after
+    twice as many the verdict is forgotten. If r is not 0, the boxes of the verdicts follow the detections of each look.
     """
 
     def __init__(
@@ -73,10 +74,10 @@ class Verifier(Generic[LookType]):
     def looks(self) -> list[CloseUp]:
         return [verdict.look for verdict in self.verdicts]
 
-    def wait(self, frames: float = 1) -> None:
-        """Let the time of frames pass. In a stream, call it before every frame."""
-        self.places.wait(frames)
-        aged = (verdict._replace(age=verdict.age + frames) for verdict in self.verdicts)
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass. In a stream, call it before every frame."""
+        self.places.wait(passed)
+        aged = (verdict._replace(age=verdict.age + passed) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def follow(self, motion: Motion | None) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
+from semfov.data.inputs import FRAME
 from semfov.detection.detections import Detections
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye, View
@@ -24,7 +25,7 @@ class Sight:
         look: evidence of the looks, from `Observer.weigh`.
         detections: function that returns the detections, a batch of A.
         seconds: time by stage.
-        frames: frames of a stream since the look before, including this one.
+        passed: seconds since the look before, in a stream.
 
     >>> from semfov.belief.observers.semantic import SemanticLook
     >>> look = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
@@ -36,7 +37,7 @@ class Sight:
     look: Look
     detections: Callable[[], Detections]
     seconds: dict[str, float]
-    frames: float = 1
+    passed: float = FRAME
 
 
 class Looks(ABC):
@@ -84,7 +85,7 @@ class LiveLooks(Looks):
             is faster on the CPU, also beside a GPU: its operations are short, and many.
 
     Attributes:
-        frames: frames of a stream since the look before, including the one of the next look.
+        passed: seconds of a stream between the look before and the next one.
 
     Example::
 
@@ -98,7 +99,7 @@ class LiveLooks(Looks):
     ) -> None:
         self.eye, self.view, self.grid, self.target = eye, view, grid, target
         self.like = view.canvas.new_empty(0, device=device)
-        self.frames: float = 1
+        self.passed = FRAME
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""
@@ -106,7 +107,7 @@ class LiveLooks(Looks):
         detections = self.eye.look(self.view, fixation, watch.lap).to(self.like.device)
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")
-        return Sight(look, lambda: detections, watch.seconds, self.frames)
+        return Sight(look, lambda: detections, watch.seconds, self.passed)
 
 
 class StoredLooks(Looks):

@@ -71,8 +71,8 @@ def attend(
     watch = Stopwatch(sight.seconds)
     belief, age = memory.belief, memory.age
     if forgetting is not None:
-        age = age + sight.frames
-        belief = observer.fade(belief, sight.look, forgetting.keep**sight.frames, forgetting.visited(age))
+        age = age + sight.passed
+        belief = observer.fade(belief, sight.look, forgetting.keep**sight.passed, forgetting.visited(age))
     belief = observer.update(belief, sight.look)
     watch.lap("update belief")
     visited = memory.visited.scatter(-1, cell[:, None], True)

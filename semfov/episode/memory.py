@@ -16,20 +16,20 @@ from semfov.errors import check_number
 class Forgetting:
     r"""Forgetting in a scene that changes between looks.
 
-    Each look multiplies past evidence by :math:`e^{-r}` (`Observer.fade`). Inhibition of return keeps the gaze from a
-    fixated cell for :math:`\ln 2 / r` looks, until half of its evidence is left. If all cells are inhibited, the one
-    that was fixated longest ago is free.
+    After t seconds :math:`e^{-rt}` of past evidence is left (`Observer.fade`). Inhibition of return keeps the gaze from
+    a fixated cell for :math:`\ln 2 / r` seconds, until half of its evidence is left. If all cells are inhibited, the
+    one that was fixated longest ago is free.
 
     Attributes:
-        rate: r, 0 or more; 0 forgets nothing.
-        keep: share of the evidence that is left after a look, :math:`e^{-r}`.
-        span: number of looks for which a fixated cell is inhibited, :math:`\ln 2 / r`.
+        rate: r per second, 0 or more; 0 forgets nothing.
+        keep: share of the evidence that is left after a second, :math:`e^{-r}`.
+        span: seconds for which a fixated cell is inhibited, :math:`\ln 2 / r`.
 
     Raises:
         InputError: `rate` is negative or above 100.
 
-    >>> round(Forgetting(0.1).keep, 3), round(Forgetting(0.1).span, 1)
-    (0.905, 6.9)
+    >>> round(Forgetting(2.5).keep, 3), round(Forgetting(2.5).span, 3)
+    (0.082, 0.277)
     """
 
     rate: float = 0.0
@@ -45,7 +45,7 @@ class Forgetting:
         """Cells that inhibition of return keeps the gaze from.
 
         Args:
-            age: `(A, X·Y)`, number of looks since each cell was fixated; infinity for never.
+            age: `(A, X·Y)`, seconds since each cell was fixated; infinity for never.
 
         Returns:
             `(A, X·Y)` boolean.
@@ -62,7 +62,7 @@ class Forgetting:
 class Memory:
     """State of A episodes between two looks: their belief, and cells `(A, X·Y)` that the gaze is kept from (`visited`).
 
-    The `age` `(A, X·Y)` of a cell is the number of looks since its fixation, infinity for never, with forgetting.
+    With forgetting, the `age` `(A, X·Y)` of a cell is the time in seconds since its fixation, infinity for never.
     """
 
     belief: Belief

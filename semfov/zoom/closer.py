@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior
+from semfov.data.inputs import FRAME
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
@@ -86,7 +87,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
-            self._looks.append((self._frame, (look.detections.boxes[0][of_target], scores[of_target])))
+            self._looks.append((self._now, (look.detections.boxes[0][of_target], scores[of_target])))
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
         """The most evident box, if it is likely enough, or at the end probable enough."""
@@ -111,7 +112,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         """Carry the boxes of the target along, too."""
         super().follow(motion)
         if motion is not None:
-            self._looks = [(frame, (motion.boxes(boxes), scores)) for frame, (boxes, scores) in self._looks]
+            self._looks = [(time, (motion.boxes(boxes), scores)) for time, (boxes, scores) in self._looks]
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is at the place of a closer look, by the detections that overlap it."""
@@ -125,7 +126,7 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         if not self._looks:
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
-        faded = [scores * keep ** (self._frame - frame) for frame, (_, scores) in self._looks]
+        faded = [scores * keep ** (self._now - time) for time, (_, scores) in self._looks]
         return torch.cat([boxes for _, (boxes, _) in self._looks]), torch.cat(faded)
 
     def _chance(self, score: float) -> float:
@@ -180,9 +181,9 @@ class PhotographPlaces(CandidateBoxes):
         self._number, detections = self._shown[window]
         return replace(detections, mask=detections.mask & ~self._again(detections.boxes[0]))
 
-    def wait(self, frames: float = 1) -> None:
-        """Let frames pass; closer looks of earlier ones show other pixels where the scene changes."""
-        super().wait(frames)
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass; closer looks at earlier frames show other pixels where the scene changes."""
+        super().wait(passed)
         if self.forgetting.rate:
             self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
 

@@ -153,10 +153,10 @@ class WindowDecisions:
             return Prior() if self._share is None else Prior(self._share)
         return Prior.of(self._share, photograph.shares, self.target)
 
-    def wait(self, frames: float = 1) -> None:
-        """Let the time of frames pass. In a stream, call it before every frame."""
+    def wait(self, passed: float) -> None:
+        """Let seconds pass. In a stream, call it before every frame."""
         if self.verifier is not None:
-            self.verifier.wait(frames)
+            self.verifier.wait(passed)
 
     def follow(self, motion: Motion | None) -> None:
         """Carry examined places along with the camera, or forget them where a frame fits none before."""

@@ -34,15 +34,15 @@ class KeptLook:
     Attributes:
         taken: the look, in pixels of the frame in which it was taken.
         glance: the look in pixels of the present frame.
-        frame: number of the frame in which it was taken.
+        time: seconds of the stream at which it was taken.
         value: the value that it was chosen for.
         number: number of its pass of the detector.
         seconds: time at its end, on the clock of the episode.
     """
 
-    def __init__(self, taken: Glance, frame: float, value: float) -> None:
+    def __init__(self, taken: Glance, time: float, value: float) -> None:
         self.taken, self.glance = taken, taken
-        self.frame, self.value = frame, value
+        self.time, self.value = time, value
         self.number, self.seconds = 0, 0.0
         self._since: Motion | None = None
 
@@ -98,8 +98,8 @@ class _Recent(Generic[_Belief]):
     the looks of a scene that the camera has lost and may find again.
     """
 
-    def __init__(self, belief: _Belief, lattice: Lattice, forgetting: Forgetting | None) -> None:
-        self.belief, self.lattice, self.forgetting = belief, lattice, forgetting
+    def __init__(self, belief: _Belief, glances: Glances, forgetting: Forgetting | None) -> None:
+        self.belief, self.glances, self.forgetting = belief, glances, forgetting
         self.kept: list[KeptLook] = []
         self.aside: list[KeptLook] = []
         self.windows: set[Window] = set()
@@ -109,9 +109,9 @@ class _Recent(Generic[_Belief]):
     def looks(self) -> list[Glance]:
         return [look.glance for look in self.kept]
 
-    def add(self, glance: Glance, frame: float, value: float) -> KeptLook:
-        """Add a look at a frame, and forget those that it replaces and those that are too old."""
-        look = KeptLook(glance, frame, value)
+    def add(self, glance: Glance, value: float) -> KeptLook:
+        """Add a look at the present frame, and forget those that it replaces and those that are too old."""
+        look = KeptLook(glance, self.glances.time, value)
         self.kept.append(look)
         if self.forgetting is not None and self._forget(self.forgetting.span):
             self._believe_anew()
@@ -137,7 +137,7 @@ class _Recent(Generic[_Belief]):
 
     def _carry(self, looks: Sequence[KeptLook], motion: Motion) -> None:
         for look in looks:
-            look.carry(motion, self.lattice)
+            look.carry(motion, self.glances.lattice)
 
     def _believe_anew(self) -> None:
         self.windows = {look.glance.window for look in self.kept}
@@ -157,10 +157,11 @@ class _Recent(Generic[_Belief]):
             look
             for look in self.kept
             if look in (first, newest)
-            or (newest.frame - look.frame <= span and look.glance.window != newest.glance.window)
+            or (newest.time - look.time <= span and look.glance.window != newest.glance.window)
         ]
-        is_old = newest.frame + 1 - first.frame > span
-        self.renewed = is_old or share_shown(first.glance.window, self.lattice) < _LEAST_SHOWN
+        at_next_frame = newest.time + self.glances.passed
+        is_old = at_next_frame - first.time > span
+        self.renewed = is_old or share_shown(first.glance.window, self.glances.lattice) < _LEAST_SHOWN
         return len(self.kept) < count
 
 
@@ -176,17 +177,17 @@ def look_by_look(
     """Look at the whole picture, and then at the windows of an order, until it has none left.
 
     The next windows are chosen after a turn was taken; the guessed one is resampled by a second thread during the look
-    before. In a stream a look counts for the frames in which half of its evidence would fade, or until the next look at
+    before. In a stream a look counts for the time in which half of its evidence would fade, or until the next look at
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
-    recent, first = _Recent(belief, glances.lattice, forgetting), Window.overview(glances.lattice)
+    recent, first = _Recent(belief, glances, forgetting), Window.overview(glances.lattice)
 
     def choose() -> Sequence[WindowChoice]:
         if not recent.kept:
             return [(first, float("inf"))]
         choices = order(recent.looks, recent.windows)
         if forgetting is not None and (recent.renewed or not choices):
-            oldest = min(recent.kept, key=lambda look: look.frame).taken.window
+            oldest = min(recent.kept, key=lambda look: look.time).taken.window
             return [(first, choices[0][1])] if choices else [(oldest, 0.0)]
         return choices
 
@@ -206,7 +207,7 @@ def look_by_look(
             glances.meanwhile = partial(prepare, choices[0][0])
         looks = glances.see([window for window, _ in choices], hints=hints)
         for glance, (_, value) in zip(looks, choices, strict=True):
-            look = recent.add(glance, glances.frame, value)
+            look = recent.add(glance, value)
             turn = WindowStep(look, belief, tuple(recent.kept), choose)
             yield turn
         camera = glances.camera_step()

@@ -101,7 +101,10 @@ class Glances(ABC):
     """Base of sources of looks at one picture: live ones, and stored ones."""
 
     lattice: Lattice
-    frame: float = 0
+    time: float = 0
+    """Seconds of a stream up to the present frame."""
+    passed: float = 0
+    """Seconds of a stream between the frame before and the present one."""
     blank: Callable[[], Tensor | None] = staticmethod(lambda: None)
     """Gives the cells where there is nothing to see, `(rows, columns)`; None for none."""
     meanwhile: Callable[[], object] | None = None
@@ -127,9 +130,10 @@ class LiveGlances(Glances):
         self._prepared: dict[Window, Resampled] = {}
         self._camera: CameraStep | None = None  # the motion of frames whose looks were closer ones
 
-    def show(self, view: WindowView, frame: float, camera: CameraStep | None = None) -> None:
-        """Take the next frame of a stream, its number, and how the camera moved since the frame before."""
-        self.view, self.frame = view, frame
+    def show(self, view: WindowView, passed: float, camera: CameraStep | None = None) -> None:
+        """Take the next frame of a stream, the seconds that passed, and how the camera moved since the frame before."""
+        self.view, self.passed = view, passed
+        self.time += passed
         self._prepared.clear()
         if camera is not None:
             self._camera = camera if self._camera is None else self._camera.then(camera)

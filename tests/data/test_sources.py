@@ -3,12 +3,15 @@
 import re
 import sys
 from collections import Counter
+from itertools import accumulate
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 import semfov
@@ -18,6 +21,7 @@ from semfov.data.sources import PHOTOGRAPHS, open_stream, picture_files
 from semfov.errors import DataError
 from semfov.report.episode import jpeg
 from tests import small
+from tests.films import encode
 from tests.refusals import refused, unusable
 
 SHADES = (20, 90, 160, 230)
@@ -92,7 +96,7 @@ def test_the_pictures_of_a_folder_are_the_frames_of_a_stream(tmp_path, monkeypat
         Image.new("RGB", (8, 6), (50 * number, 0, 0)).save(tmp_path / f"frame{number}.png")
     taken = list(open_stream(tmp_path).frames)
     assert [float(picture.image[0].mean()) * 255 for picture in taken] == pytest.approx([0, 50, 100])
-    assert [(picture.name, picture.passed) for picture in taken][1] == ("frame1.png", 1.0)
+    assert [(picture.name, picture.passed) for picture in taken][1] == ("frame1.png", 0.04)
     assert len(list(open_stream(str(tmp_path), 2).frames)) == 2
 
 
@@ -139,7 +143,7 @@ def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
     stream = open_stream(tmp_path / "damaged.avi")
     taken = list(stream.frames)
     assert [picture.name for picture in taken] == [f"damaged.avi, frame {number}" for number in (0, 1, 4, 6, 7)]
-    assert [picture.passed for picture in taken] == [1, 1, 3, 2, 1]
+    assert [picture.passed for picture in taken] == pytest.approx([0.2, 0.2, 0.6, 0.4, 0.2])
     assert stream.gaps == {"lost": 3}
     (tmp_path / "cut.avi").write_bytes(video.read_bytes()[: starts[3]])
     stream = open_stream(tmp_path / "cut.avi")
@@ -148,12 +152,94 @@ def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
 
 
 def test_frames_pass_by_their_time_stamps(monkeypatch):
-    """Frames at 0, 40, 80 and 1080 ms, 25 a second; of a camera the same frames are those that are waited for."""
-    for source, expected in ((Path("a.mp4"), [1, 1, 1, 25]), (0, [1, 1, 1, 1])):
+    """Frames at 0, 40, 80 and 1080 ms; those of a camera come when they are read, at 5, 5.1, 5.6 and 5.7 s."""
+    monkeypatch.setattr(sources.time, "monotonic", iter([5, 5.1, 5.6, 5.7]).__next__)
+    for source, expected in ((Path("a.mp4"), [0.04, 0.04, 0.04, 1]), (0, [0.04, 0.1, 0.5, 0.1])):
         recorder = Recorder([[0, 40, 80, 1080], []])
         monkeypatch.setattr(recorder, "get", lambda key, of=recorder: of.now if key == cv2.CAP_PROP_POS_MSEC else 25.0)
         taken = sources._record(cv2, recorder, source, "a", 4, Counter())
-        assert [picture.passed for picture in taken] == expected
+        assert [picture.passed for picture in taken] == pytest.approx(expected)
+
+
+@given(
+    rate=st.sampled_from([15, 24000 / 1001, 24, 25, 30000 / 1001, 30, 50, 60, 120, 240]),
+    begin=st.floats(0, 100),
+    gaps=st.lists(st.integers(1, 5000), min_size=1, max_size=20),
+)
+def test_time_stamps_rounded_to_milliseconds_give_the_seconds_of_the_rate(rate, begin, gaps):
+    clock = sources._Clock(1 / rate, rounded=True)
+    clock.passed(round(begin, 3), 0)
+    for gap, number in zip(gaps, accumulate(gaps), strict=True):
+        assert clock.passed(round(begin + number / rate, 3), 0) == pytest.approx(gap / rate, abs=1e-9)
+
+
+def test_time_stamps_that_do_not_fit_the_rate_are_kept():
+    clock = sources._Clock(1 / 30, rounded=True)
+    assert [round(clock.passed(stamp, 0), 6) for stamp in (0, 0.05, 0.067, 0.567)] == [0.033333, 0.05, 0.017, 0.5]
+
+
+def test_a_film_that_begins_late_lacks_no_frame(tmp_path):
+    for end, codec in ((".mkv", "libx264"), (".mp4", "libx264"), (".avi", "mpeg4")):
+        stream = open_stream(encode(tmp_path / f"late{end}", codec, range(150, 162)))
+        assert len(list(stream.frames)) == 12
+        assert not stream.gaps["lost"]
+
+
+def test_a_header_that_states_too_many_frames_is_not_believed(video, tmp_path):
+    """The film ends with its last frame, of which none is lost."""
+    content = bytearray(video.read_bytes())
+    for place in (content.index(b"avih") + 24, content.index(b"strh") + 40):
+        assert content[place : place + 4] == (8).to_bytes(4, "little")
+        content[place : place + 4] = (900_000_000).to_bytes(4, "little")
+    (tmp_path / "long.avi").write_bytes(content)
+    stream = open_stream(tmp_path / "long.avi")
+    assert len(list(stream.frames)) == 8
+    assert not stream.gaps["lost"]
+
+
+def test_an_mp4_file_lacks_frames_if_it_is_cut_and_none_if_it_does_not_show_them(tmp_path):
+    """The first five frames come before the film begins, as an editor trims it."""
+    whole = encode(tmp_path / "whole.mp4", "mpeg4", range(20), movflags="faststart")
+    place = whole.read_bytes().index(b"mdat")
+    (tmp_path / "cut.mp4").write_bytes(whole.read_bytes()[: place + (whole.stat().st_size - place) // 2])
+    stream = open_stream(tmp_path / "cut.mp4")
+    read = len(list(stream.frames))
+    assert 0 < read < 19
+    assert stream.gaps["lost"] == 20 - read
+    stream = open_stream(encode(tmp_path / "trimmed.mp4", "libx264", range(-5, 15), bf="0"))
+    assert len(list(stream.frames)) == 15
+    assert not stream.gaps["lost"]
+
+
+@pytest.mark.parametrize("kind", ["gif", "webp"])
+def test_animations_are_films(tmp_path, monkeypatch, kind):
+    """Each frame follows when the one before was shown for its time, without OpenCV; a browser shows 0 as 100 ms."""
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    path, times = tmp_path / f"film.{kind}", [40, 250, 0, 90] if kind == "gif" else [40, 250, 1, 90]
+    first, *others = [Image.new("RGB", (16, 12), (shade, shade, shade)) for shade in SHADES]
+    first.save(
+        path, save_all=True, append_images=others, duration=times, **({} if kind == "gif" else {"lossless": True})
+    )
+    stream = open_stream(path)
+    taken = list(stream.frames)
+    assert stream.rate == 25
+    assert [picture.name for picture in taken] == [f"film.{kind}, frame {number}" for number in range(4)]
+    assert [float(picture.image.mean()) * 255 for picture in taken] == pytest.approx(SHADES, abs=1)
+    assert [picture.passed for picture in taken] == pytest.approx([0.04, 0.04, 0.25, 0.1 if kind == "gif" else 0.001])
+    assert len(list(open_stream(path, 2).frames)) == 2
+    (tmp_path / "head").write_bytes(path.read_bytes()[:20])
+    unusable("image .*head", open_stream, tmp_path / "head")
+
+
+def test_a_damaged_animation_ends_with_a_warning(tmp_path):
+    noise = [Image.fromarray(np.random.default_rng(n).integers(0, 255, (48, 64), np.uint8)) for n in range(4)]
+    noise[0].save(tmp_path / "film.gif", save_all=True, append_images=noise[1:], duration=40)
+    content = (tmp_path / "film.gif").read_bytes()
+    (tmp_path / "cut.gif").write_bytes(content[: len(content) * 5 // 8])
+    stream = open_stream(tmp_path / "cut.gif")
+    with pytest.warns(UserWarning, match=r"cut\.gif ends with a frame that cannot be read: image .*truncated"):
+        assert len(list(stream.frames)) == 2
+    assert stream.gaps == {"lost": 1}
 
 
 def test_frames_of_sixteen_bits_are_shown_between_black_and_white(tmp_path):
@@ -206,5 +292,5 @@ def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
     taken = list(sources._record(cv2, recorder, "rtsp://camera", "camera", None, gaps))
     assert [int(picture.image[0, 0, 0]) for picture in taken] == [1, 2, 3, 4]
     assert gaps == {"reconnected": 1, "lost": 0}
-    assert [picture.passed for picture in taken[:2]] == [1, 1]
-    assert taken[2].passed > 1
+    assert [picture.passed for picture in taken[:2]] == [0.04, 0.04]
+    assert taken[2].passed > 0.04

@@ -109,7 +109,7 @@ def test_a_closer_look_takes_the_frame_of_a_look():
     made = agent(Lasting((chances, 0.9)))
     passes, propose = [], made.eye.detector.propose
     made.eye.detector.propose = lambda canvas: passes.append(1) or propose(canvas)
-    live = made.live("red", rate=0.1, start=5)
+    live = made.live("red", rate=2.5, start=5)
     first = live.step(spots(5, contrast=0.9))
     assert (first.cell, first.next_cell, first.examined) == (5, 5, None)
     assert first.decision.outcome == "undecided"
@@ -138,8 +138,8 @@ class Counted(Semantic):
 
 
 def test_evidence_fades_in_the_frame_of_a_closer_look_too():
-    """β − β₀ is multiplied by e^(−2r) from a look to the next one if a closer look was in between."""
-    live = agent(Counted(3, prior=0.25), Thresholds(0.99, 0.01, 0.3)).live("red", rate=0.2, start=5)
+    """β − β₀ is multiplied by e^(−rt) over the t seconds from a look to the next one, with a closer look in between."""
+    live = agent(Counted(3, prior=0.25), Thresholds(0.99, 0.01, 0.3)).live("red", rate=5, start=5)
     first = live.step(spots(5))
     assert first.next_cell == 5
     assert live.step(GREY).examined is not None
@@ -147,7 +147,7 @@ def test_evidence_fades_in_the_frame_of_a_closer_look_too():
     torch.testing.assert_close(after.belief.beta - 0.25, math.exp(-0.4) * (first.belief.beta - 0.25))
     again = live.step(GREY)
     torch.testing.assert_close(again.belief.beta - 0.25, math.exp(-0.6) * (first.belief.beta - 0.25))
-    # Inhibition of return counts frames, too: 3.47 of them.
+    # Inhibition of return counts the seconds of this frame, too: 0.139 of them, 3.47 frames.
     assert [moment.visited[5] for moment in (after, again, live.step(GREY))] == [True, True, False]
 
 
@@ -163,16 +163,16 @@ def faded(told, here, weight):
 
 
 def test_the_verdict_fades_towards_the_belief():
-    rate = 0.1
+    rate = 2.5
     judge, _ = verifier({5: SURE}, rate)
     judge.see(step(0, {5: 0.6}, [5], 0.5, look(5)))
     judge.wait()
     told = judge.look()
     assert (told.place, told.presence) == (pytest.approx(0.9), pytest.approx(0.45, abs=0.5))
     assert judge.decision().place == told.place
-    for age in range(1, 12):
-        now = step(age, {5: 0.3}, [5], 0.2)
-        judge.wait()
+    for number in range(1, 12):
+        now, age = step(number, {5: 0.3}, [5], 0.2), number / 10
+        judge.wait(0.1)
         judge.see(now)
         place = faded(told.place, 0.3, math.exp(-rate * age))
         decision = judge.decision()
@@ -185,7 +185,7 @@ def test_the_verdict_fades_towards_the_belief():
 
 def test_a_found_target_is_followed_in_a_scene_that_changes():
     """Box and cell follow the detections; without forgetting, and without a detection, they stay."""
-    for rate in (0.05, 0.0):
+    for rate in (1.25, 0.0):
         judge, _ = verifier({5: SURE}, rate)
         judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
         judge.wait()
@@ -215,7 +215,7 @@ def test_a_found_target_is_followed_in_a_scene_that_changes():
 
 
 def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
-    judge, _ = verifier({5: 0.4}, 0.1)
+    judge, _ = verifier({5: 0.4}, 2.5)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
     judge.look()
@@ -227,9 +227,9 @@ def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
     assert not judge.verdicts
 
 
-@pytest.mark.parametrize(("rate", "free"), [(0.1, 7), (0.3, 3), (0.0, None)])
+@pytest.mark.parametrize(("rate", "free"), [(2.5, 7), (7.5, 3), (0.0, None)])
 def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, free):
-    """ln 2 / 0.1 = 6.9 frames and ln 2 / 0.3 = 2.3 frames; without forgetting never."""
+    """ln 2 / 2.5 s are 6.9 frames of 25 a second, and ln 2 / 7.5 s 2.3; without forgetting never."""
     judge, _ = verifier({5: 0.4}, rate)
     examined = []
     for number in range(20):
@@ -248,7 +248,7 @@ def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, fr
 
 
 def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
-    judge, closer = verifier({5: SURE}, 0.3)
+    judge, closer = verifier({5: SURE}, 7.5)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
     judge.look()
@@ -266,7 +266,7 @@ def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
 
 def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgotten():
     for most in (1, 2):
-        judge, _ = verifier(dict.fromkeys(range(12), 0.3), 0.1, most=most)
+        judge, _ = verifier(dict.fromkeys(range(12), 0.3), 2.5, most=most)
         closely = []
         for number in range(60):
             judge.wait()
@@ -283,7 +283,7 @@ def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgo
 
 def test_recent_detections_count_more_as_evidence():
     """Two places, equally probable: the one that was seen later is examined, unless nothing is forgotten."""
-    for rate, cell in ((0.2, 7), (0.0, 5)):
+    for rate, cell in ((5, 7), (0.0, 5)):
         judge, _ = verifier({}, rate)
         judge.see(step(0, {5: 0.6, 7: 0.6}, [0], 0.9, look(5, score=0.8)))
         judge.wait()
@@ -306,7 +306,7 @@ def test_thresholds_are_those_of_the_verification_unless_given():
 
 
 def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():
-    judge, _ = verifier({}, 0.1)
+    judge, _ = verifier({}, 2.5)
     for cells, presence, outcome in (({9: 0.2}, 0.2, "undecided"), ({}, 0.2, "absent"), ({}, 0.6, "undecided")):
         judge.wait()
         now = step(0, cells, [0], presence, Detections.empty(1, 3))

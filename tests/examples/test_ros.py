@@ -195,4 +195,9 @@ def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     assert target[-1].detections[0].results[0].hypothesis.score == pytest.approx(0.982, abs=1e-3)
     centre = target[-1].detections[0].bbox.center.position
     assert (centre.x, centre.y) == pytest.approx((55, 35), abs=1.5)
+    # A recording that begins anew, and its second image.
+    seconds = [
+        node.passed(SimpleNamespace(sec=sec, nanosec=nanosec)) for sec, nanosec in ((9, 0), (3, 0), (3, 250_000_000))
+    ]
+    assert seconds == [2, 0, 0.25]
     sys.modules.pop("examples.ros_node")

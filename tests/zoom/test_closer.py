@@ -407,7 +407,7 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     assert (len(looked), places.record(box, 0.4, 0.5).number) == (1, 1)
 
 
-@pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (0.1, 2)])
+@pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (2.5, 2)])
 def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     boxes = torch.tensor([[[4.0, 4, 24, 24], [30.0, 4, 50, 24], [120.0, 90, 140, 110]]])
     scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0.1], [0, 0.2, 0]]])

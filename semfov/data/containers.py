@@ -1,0 +1,60 @@
+"""What the file of a video says of itself: its container by the first bytes, and how far its statements hold."""
+
+from pathlib import Path
+from typing import Literal
+
+from semfov.io.files import reading
+
+Container = Literal["animation", "avi", "matroska", "mp4", "playlist", "other"]
+
+_MARKS: dict[tuple[int, bytes], Container] = {
+    (0, b"GIF8"): "animation",
+    (8, b"WEBP"): "animation",
+    (8, b"AVI "): "avi",
+    (0, b"\x1a\x45\xdf\xa3"): "matroska",
+    (4, b"ftyp"): "mp4",
+    (0, b"#EXTM3U"): "playlist",
+}
+"""Bytes that tell a container, with their place in the file. WebM is Matroska."""
+
+_HEAD = 16  # bytes of a file, or of a box of MP4, that tell what it is
+_LEAST_FRAME = 8  # bytes of the smallest frame of an AVI file, those of its head
+_MOST_BOXES = 100_000  # outer boxes of an MP4 file that are followed
+
+
+def container_of(path: Path) -> Container:
+    """Tell the container of a video by its first bytes; raises `DataError` for a file that cannot be read."""
+    with reading(path, f"source: {path}"), path.open("rb") as file:
+        head = file.read(_HEAD)
+    return next((kind for (at, mark), kind in _MARKS.items() if head.startswith(mark, at)), "other")
+
+
+def frames_stated(path: Path, container: Container, count: float) -> int:
+    """Number of frames that a file should give, by the count that it states; 0 where that does not tell it.
+
+    An AVI file states a count that its bytes can hold. That of an MP4 file counts frames that are not to be shown, too,
+    so that it tells what is missing only where the file was cut. In others, the count is estimated from a duration.
+    """
+    if container == "avi":
+        is_true = count * _LEAST_FRAME <= path.stat().st_size
+    else:
+        is_true = container == "mp4" and _is_cut(path)
+    return int(count) if is_true else 0
+
+
+def _is_cut(path: Path) -> bool:
+    """Tell whether the outer boxes of an MP4 file reach beyond its end."""
+    end, at = path.stat().st_size, 0
+    with path.open("rb") as file:
+        for _ in range(_MOST_BOXES):
+            file.seek(at)
+            head = file.read(_HEAD)
+            size = int.from_bytes(head[:4], "big")
+            if size == 1:  # it is in the next eight bytes
+                size = int.from_bytes(head[8:16], "big")
+            if size < 8:  # 0 goes to the end of the file
+                return False
+            at += size
+            if at >= end:
+                return at > end
+    return False
