@@ -180,7 +180,7 @@ KNOWN = {
     "docs/guides/live.md": {
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
-        f"{log(2) / _WINDOW_RATE:.2f} by default": "code",
+        f"{log(2) / _WINDOW_RATE:.1f} s by default": "code",
         f"rate, {_FOVEA_RATE}, is {_FOVEA_RATE * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
         f"1/{1 / FRAME:.0f} s is taken": "code",
         "of 16 bits": "a type",
