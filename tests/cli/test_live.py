@@ -26,7 +26,7 @@ cv2 = pytest.importorskip("cv2")
 
 def write(path, frames):
     height, width = frames[0].shape[-2:]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (width, height))
     for frame in frames:
         writer.write(np.ascontiguousarray((frame * 255).byte().permute(1, 2, 0).numpy()[..., ::-1]))
     writer.release()
