@@ -4,6 +4,7 @@ Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfo
 screen, in pixels of a picture, or in cells. `Letterbox` and `Fixations.resized` convert between these.
 """
 
+from semfov.data.fixations.exports import read_export
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import (
     coco_name,
@@ -18,7 +19,7 @@ from semfov.data.fixations.pysaliency import from_pysaliency, to_pysaliency
 from semfov.data.fixations.reading import read_fixations
 from semfov.data.fixations.record import Fixations, Letterbox, by_picture
 from semfov.data.fixations.suspicions import suspicions
-from semfov.data.fixations.table import read_export, read_table, write_table
+from semfov.data.fixations.table import read_table, write_table
 
 __all__ = [
     "Fixations",

@@ -7,10 +7,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from semfov.data.fixations.exports import table_reader
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import table_reader
 from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import read_text
 

@@ -1,0 +1,248 @@
+"""Programs of eye trackers, and the columns of the tables that they export."""
+
+import re
+import unicodedata
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+Units = Literal["pixels", "fractions"]
+"""Unit of the coordinates of a table: pixels, whose centres are at integers, or fractions of the sides of the frame."""
+
+Origin = Literal["top left", "bottom left", "centre", "centre, y up"]
+"""Where the coordinates of a table are 0. y points down from the top left and from the centre, else up."""
+
+LENGTHS: dict[str, Units] = {
+    **dict.fromkeys(("px", "pixel", "pixels", "pix"), "pixels"),
+    **dict.fromkeys(("norm", "normalized", "normalised", "fraction", "fractions"), "fractions"),
+}
+"""Units of points by the words in the names of columns."""
+
+TIMES = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1000.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1.0),
+    **dict.fromkeys(("us", "μs", "usec", "μsec", "microsecond", "microseconds"), 1e-3),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-6),
+}
+"""Milliseconds of a unit of time by the words in the names of columns."""
+
+_BRACKET = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+_ENDING = re.compile(r"_(px|norm|ms|msec|us|ns)$", re.IGNORECASE)
+_FRAME = re.compile(r"^(mcs|dacs|ucs|hucs|rcs)\s*")
+
+
+class Column(NamedTuple):
+    """A column of a table, and what its name tells: `Fixation point X [MCS px]` has a frame and a unit.
+
+    Attributes:
+        name: as the table has it.
+        key: the name without case, spaces, signs, frame and unit.
+        frame: `mcs` (the picture), `dacs` (the screen), or nothing.
+        unit: such as `px`, `ms` or `μs`, or nothing.
+
+    >>> Column.of("Fixation point X [MCS px]")
+    Column(name='Fixation point X [MCS px]', key='fixationpointx', frame='mcs', unit='px')
+    """
+
+    name: str
+    key: str
+    frame: str
+    unit: str
+
+    @classmethod
+    def of(cls, name: str) -> "Column":
+        """Take a name to pieces.
+
+        Args:
+            name: as the table has it.
+
+        Returns:
+            The column.
+        """
+        end = _BRACKET.search(name) or _ENDING.search(name)
+        plain = name if end is None else name[: end.start()]
+        words = "" if end is None else unicodedata.normalize("NFKC", end[1]).lower().strip()  # of two signs for micro
+        frame = _FRAME.match(words)
+        unit = words if frame is None else words[frame.end() :]
+        return cls(name, re.sub(r"[^a-z0-9]", "", plain.lower()), "" if frame is None else frame[1], unit)
+
+
+class Program(NamedTuple):
+    """The columns of a program's table, each by its possible keys (`Column.key`).
+
+    Attributes:
+        name: of the program.
+        point: keys of x and y.
+        frames: frames that x and y may have.
+        units: unit of x and y where their names have none.
+        origin: from where x and y are counted.
+        duration: keys of the duration.
+        time: unit of the duration where its name has none.
+        picture: keys of the picture's name.
+        subject: keys of the person's name.
+        trial: keys of a trial.
+        number: keys of a fixation's number.
+        size: keys of the width and the height of the frame.
+        keep: a column, and how its fields begin in the lines that count.
+        needs: further keys that tell the table from others.
+        lacks: keys that it does not have.
+    """
+
+    name: str
+    point: tuple[str, str]
+    frames: tuple[str, ...] = ("",)
+    units: Units = "pixels"
+    origin: Origin = "top left"
+    duration: tuple[str, ...] = ("duration",)
+    time: str = "ms"
+    picture: tuple[str, ...] = ()
+    subject: tuple[str, ...] = ()
+    trial: tuple[str, ...] = ()
+    number: tuple[str, ...] = ()
+    size: tuple[str, str] | None = None
+    keep: tuple[str, tuple[str, ...]] | None = None
+    needs: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
+
+    def fits(self, columns: Sequence[Column]) -> bool:
+        """Tell whether a table is of this program.
+
+        Args:
+            columns: of the table.
+
+        Returns:
+            Whether it has what the program's tables have, and nothing that they lack.
+        """
+        keys = {column.key for column in columns}
+        placed = all(self.of_point(key, columns) for key in self.point)
+        return placed and keys.issuperset(self.needs) and keys.isdisjoint(self.lacks)
+
+    def of_point(self, key: str, columns: Sequence[Column]) -> list[Column]:
+        """Find the columns of x or of y, in any unit.
+
+        Args:
+            key: of x or y.
+            columns: of the table.
+
+        Returns:
+            Those in a frame of the program.
+        """
+        return [column for column in columns if column.key == key and column.frame in self.frames]
+
+
+_TRUE = ("true", "1")
+_TOBII: dict[str, Any] = {
+    "point": ("fixationpointx", "fixationpointy"),
+    "duration": ("gazeeventduration", "eyemovementeventduration"),
+    "subject": ("participantname",),
+    "trial": ("recordingname",),
+}
+_PRO_LAB: dict[str, Any] = {
+    **_TOBII,
+    "picture": ("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
+    "number": ("eyemovementtypeindex",),
+    "keep": ("eyemovementtype", ("fixation",)),
+}
+_CLOUD: dict[str, Any] = {
+    "point": ("fixationx", "fixationy"),
+    "subject": ("recordingid",),
+    "trial": ("sectionid",),
+    "number": ("fixationid",),
+}
+_PLAYER: dict[str, Any] = {"point": ("normposx", "normposy"), "units": "fractions", "origin": "bottom left"}
+
+PROGRAMS = (
+    Program(
+        "Tobii Pro Lab",
+        frames=("mcs",),
+        size=("presentedmediawidth", "presentedmediaheight"),
+        needs=("presentedmediawidth", "presentedmediaheight"),
+        **_PRO_LAB,
+    ),
+    Program(
+        "Tobii Pro Lab",
+        frames=("dacs", ""),
+        size=("recordingresolutionwidth", "recordingresolutionheight"),
+        **_PRO_LAB,
+    ),
+    Program(
+        "Tobii Studio",
+        frames=("mcs", ""),
+        picture=("medianame",),
+        number=("fixationindex",),
+        size=("mediawidth", "mediaheight"),
+        keep=("gazeeventtype", ("fixation",)),
+        needs=("gazeeventtype",),
+        **_TOBII,
+    ),
+    Program("Tobii Pro Lab", frames=("mcs",), **_PRO_LAB),
+    Program(
+        "Pupil Cloud",
+        keep=("fixationdetectedinreferenceimage", _TRUE),
+        needs=("fixationdetectedinreferenceimage",),
+        **_CLOUD,
+    ),
+    Program("Pupil Cloud", keep=("fixationdetectedonsurface", _TRUE), needs=("fixationdetectedonsurface",), **_CLOUD),
+    Program("Pupil Cloud", needs=("fixationid",), **_CLOUD),
+    Program("Pupil Player", number=("fixationid",), keep=("onsurf", _TRUE), needs=("onsurf", "fixationid"), **_PLAYER),
+    Program("Pupil Player", number=("id",), needs=("dispersion",), lacks=("onsurf",), **_PLAYER),
+    Program(
+        "PsychoPy",
+        ("averagegazex", "averagegazey"),
+        origin="centre, y up",
+        time="s",
+        subject=("sessionid",),
+        needs=("duration",),
+    ),
+    Program(
+        "Gazepoint",
+        ("fpogx", "fpogy"),
+        units="fractions",
+        duration=("fpogd",),
+        time="s",
+        picture=("medianame", "mediaid"),
+        subject=("user", "username"),
+        number=("fpogid",),
+        keep=("fpogv", _TRUE),
+    ),
+    Program(
+        "SMI BeGaze",
+        ("fixationpositionx", "fixationpositiony"),
+        duration=("eventduration", "fixationduration"),
+        picture=("stimulus", "stimulusname"),
+        subject=("participant", "participantname", "subject"),
+        trial=("trial", "trialname"),
+        keep=("category", ("fixation", "visual intake")),
+        needs=("category",),
+    ),
+    Program("PyGaze", ("endx", "endy"), needs=("starttime", "endtime"), lacks=("startx",)),
+    Program(
+        "pymovements",
+        ("locationx", "locationy"),
+        picture=("stimulus", "image", "imageid", "textid"),
+        subject=("subjectid", "participantid", "subject"),
+        trial=("trialid", "trial"),
+        keep=("name", ("fixation",)),
+        needs=("onset", "offset"),
+    ),
+    Program(
+        "EyeLink Data Viewer",
+        ("currentfixx", "currentfixy"),
+        duration=("currentfixduration",),
+        picture=("image", "imagename", "imagefile", "picture"),
+        subject=("recordingsessionlabel", "datafile"),
+        trial=("trialindex", "triallabel"),
+    ),
+)
+"""Programs whose tables are read; of two that fit a table, the first is taken."""
+
+
+def program_of(columns: Sequence[Column]) -> Program | None:
+    """Find the program of a table.
+
+    Args:
+        columns: of the table.
+
+    Returns:
+        The program; None where no program has such columns.
+    """
+    return next((each for each in PROGRAMS if each.fits(columns)), None)
