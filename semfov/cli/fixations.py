@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, suspicions
+from semfov.data.fixations.exports import PictureError
 from semfov.data.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
 from semfov.data.fixations.table import FrameError
 from semfov.data.large import picture_size
@@ -93,10 +95,14 @@ def _records(
     reader: Callable[..., list[Fixations]], path: Path, given: dict[str, Any], sizes: _PictureSizes | None
 ) -> list[Fixations]:
     """The records of a file; where it has no frames, they are the pictures."""
+    unnamed = {name: value for name, value in given.items() if name != "picture"}
     if "picture" in given and "picture" not in signature(reader).parameters:
         # The file names its pictures.
         check(sizes is not None, "picture", "a picture or folder that exists", given["picture"])
-        given = {name: value for name, value in given.items() if name != "picture"}
+        return _records(reader, path, unnamed, sizes)
+    if "picture" in given and sizes is not None:  # a photograph, which may be one of those that the table names
+        with suppress(PictureError):
+            return _records(reader, path, unnamed, sizes)
     try:
         return read_by(reader, path, given)
     except FrameError as error:

@@ -1,9 +1,13 @@
-"""Fixations in the text files of EyeLink trackers (ASC, as edf2asc writes them)."""
+"""Fixations in the text files of EyeLink trackers (ASC, as edf2asc writes them), by the clock of the recording."""
 
+import math
 import re
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -12,9 +16,63 @@ from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, check, check_data
 from semfov.io.files import read_text
 
-_PICTURE = re.compile(r"^(?:!V IMGLOAD \S+|!V TRIAL_VAR (?:image|picture|img|stimulus))\s+(\S+)", re.IGNORECASE)
+_MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.*)$")
+"""The time of a message, the milliseconds by which it is late, and its text."""
+
+_LOAD = re.compile(r"^!V\s+IMGLOAD\s+(\S+)\s+(.+?)\s*$", re.IGNORECASE)
+_VARIABLE = re.compile(r"^!V\s+TRIAL_VAR\s+(?:image|picture|img|stimulus)\s+(.+?)\s*$", re.IGNORECASE)
+_CLEAR = re.compile(r"^!V\s+CLEAR\b", re.IGNORECASE)
+_PLACED = re.compile(r"^(.+?)\s+(-?[\d.]+)\s+(-?[\d.]+)(?:\s+([\d.]+)\s+([\d.]+))?$")
 _SIDE = r"[\s,]+(-?[\d.]+)"
 _FRAME = re.compile(rf"^MSG\s+\S+\s+(?:DISPLAY|GAZE)_COORDS\s*=?{4 * _SIDE}")
+_LOST = re.compile(r"\b(?:MESSAGES?|MSGS?|EVENTS?|DATA)\s+LOST\b|\bLOST_?\s?DATA\w*", re.IGNORECASE)
+
+_Place = tuple[float, float, float, float]
+
+
+class _Fixation(NamedTuple):
+    """A line `EFIX`: its eye, `L` or `R`, its beginning in ms, its duration and its place on the screen."""
+
+    eye: str
+    start: float
+    duration: float
+    x: float
+    y: float
+
+
+@dataclass
+class _View:
+    """A picture on the screen: from when to when, in ms, and `(x, y, width, height)` where its message tells them."""
+
+    picture: str
+    start: float
+    end: float = math.inf
+    place: _Place | None = None
+    fixations: list[_Fixation] = field(default_factory=list)
+
+
+@dataclass
+class _Trial:
+    """A trial: its name, its time, and the views of the pictures that were loaded in it."""
+
+    name: str
+    start: float
+    end: float = math.inf
+    views: list[_View] = field(default_factory=list)
+
+    def hide(self, time: float) -> None:
+        """End the view of the picture that is on the screen."""
+        if self.views:
+            self.views[-1].end = min(self.views[-1].end, time)
+
+    def close(self, time: float) -> None:
+        """End the trial."""
+        self.hide(time)
+        self.end = min(self.end, time)
+
+    def viewed(self) -> list[_View]:
+        """The views of its pictures; the whole trial where no picture was loaded."""
+        return self.views or [_View(self.name, self.start, self.end)]
 
 
 def read_eyelink(
@@ -26,19 +84,24 @@ def read_eyelink(
 ) -> list[Fixations]:
     r"""Read the fixations of an ASC file of an EyeLink tracker.
 
-    Fixations are the lines `EFIX`, and trials begin with the message `TRIALID`. A trial is of the picture that a
-    message `!V IMGLOAD` or `!V TRIAL_VAR image` names, else of the name after `TRIALID`. The frame is that of
-    `DISPLAY_COORDS` or `GAZE_COORDS`, from whose first corner the points are counted (EyeLink 1000 User Manual,
-    section 4.9). Fixations without a place, and those before the first trial, are left out.
+    Fixations are the lines `EFIX`, and trials begin with the message `TRIALID`. A picture is on the screen from its
+    message `!V IMGLOAD` to the next one, to `!V CLEAR` or `TRIAL_RESULT`, or to the `END` of the recording; it has the
+    fixations that begin in this time. A trial without such a message is of the picture that `!V TRIAL_VAR image` names,
+    else of the name after `TRIALID`.
+
+    The frame is that of `DISPLAY_COORDS` or `GAZE_COORDS`, from whose first corner the points are counted (EyeLink 1000
+    User Manual, section 4.9). It is the picture where `!V IMGLOAD CENTER` or `TOP_LEFT` has its place and size.
+    Fixations without a place, and those at other times, are left out.
 
     Args:
         path: the file.
         size: `(width, height)` of the screen; None takes that of the file.
-        eye: `left` or `right`; None takes the right one where both were recorded.
+        eye: `left` or `right`; None takes, of each picture in each trial, the right one where both were recorded.
         subject: name of the person; None takes that of the file.
 
     Returns:
-        One record for each trial with fixations; convert them by `Fixations.in_picture`.
+        One record for each picture in each trial with fixations; convert those of a screen by `Fixations.in_picture`,
+        and others by `Fixations.resized`.
 
     Raises:
         DataError: the file cannot be read, or has no fixation or no size of the screen.
@@ -55,34 +118,134 @@ def read_eyelink(
     path = Path(path)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     lines = read_text(path, "cp1252").splitlines()
-    trials: list[tuple[str, dict[str, list[tuple[float, float, float]]]]] = []
     frame = next((match for line in lines if (match := _FRAME.match(line))), None)
-    x1, y1, x2, y2 = (0.0, 0.0, 0.0, 0.0) if frame is None else map(float, frame.groups())
+    trials, fixations = _events(path, lines)
+    views = [view for trial in trials for view in trial.viewed()]
+    _share_out(fixations, views)
+    check_data(any(view.fixations for view in views), path, "lines EFIX after a message TRIALID", _none(trials))
+    check_data(size is not None or frame is not None, path, "a message DISPLAY_COORDS", "none; give size=")
+    left, top, right, bottom = (0.0, 0.0, 0.0, 0.0) if frame is None else map(float, frame.groups())
+    screen = (round(right - left) + 1, round(bottom - top) + 1) if size is None else size
+    records = []
+    for view in views:
+        rows = _of_one_eye(view.fixations, eye)
+        if rows:
+            x, y, width, height = view.place or (left, top, *screen)
+            points = np.array([(row.x - x, row.y - y) for row in rows])
+            durations = np.array([row.duration for row in rows])
+            name = path.stem if subject is None else subject
+            records.append(Fixations(view.picture, name, points, (round(width), round(height)), durations=durations))
+    check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
+    said = [*_lost(lines), *_outside_views(trials, fixations)]
+    seen = sum(bool(view.fixations) for view in views)
+    if len(records) < seen:
+        said.append(f"{seen - len(records)} of {seen} pictures have no fixation of the {eye} eye")
+    if said:
+        warnings.warn(f"{path}: {'; '.join(said)}", stacklevel=2)
+    return warn_of_frames(path, records)
+
+
+def _events(path: Path, lines: Iterable[str]) -> tuple[list[_Trial], list[_Fixation]]:
+    """The trials of a recording with the pictures in them, and all fixations that have a place."""
+    trials: list[_Trial] = []
+    fixations: list[_Fixation] = []
     for number, line in enumerate(lines, start=1):
         words = line.split()
         try:
-            if words[:1] == ["MSG"]:
-                message = line.split(None, 2)[2] if len(words) > 2 else ""
-                picture = _PICTURE.match(message)
-                if message.startswith("TRIALID"):
-                    trials.append((message[7:].strip() or f"trial {len(trials) + 1}", {}))
-                elif picture is not None and trials:
-                    trials[-1] = (picture[1].replace("\\", "/").rpartition("/")[2], trials[-1][1])
-            elif words[:1] == ["EFIX"] and trials and "." not in words[5:7]:
-                time, x, y = (float(words[place]) for place in (4, 5, 6))
-                trials[-1][1].setdefault(words[1][:1], []).append((x - x1, y - y1, time))
+            if words[:1] == ["EFIX"] and trials:
+                if "." not in words[5:7]:
+                    start, _, duration, x, y = map(float, words[2:7])
+                    fixations.append(_Fixation(words[1][:1], start, duration, x, y))
+            elif words[:1] == ["END"] and trials:
+                trials[-1].hide(float(words[1]))
+            elif words[:1] == ["MSG"] and (message := _MESSAGE.match(line)):
+                _read_message(message[3], float(message[1]) - float(message[2] or 0), trials)
         except (ValueError, IndexError):
             raise DataError(f"{path}: line {number}: expected an event of EyeLink, got {line[:60]!r}") from None
-    seen = {each for _, eyes in trials for each in eyes}
-    check_data(bool(seen), path, "lines EFIX after a message TRIALID", "none; convert the events, too")
-    check_data(size is not None or frame is not None, path, "a message DISPLAY_COORDS", "none; give size=")
-    size = (round(x2 - x1) + 1, round(y2 - y1) + 1) if size is None else size
-    chosen = eye[0].upper() if eye is not None else "R" if "R" in seen else "L"
-    name = path.stem if subject is None else subject
-    records = []
-    for picture_name, eyes in trials:
-        rows = np.array(eyes.get(chosen, []), dtype=np.float64)
-        if len(rows):
-            records.append(Fixations(picture_name, name, rows[:, :2], size, durations=rows[:, 2]))
-    check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
-    return warn_of_frames(path, records)
+    return trials, fixations
+
+
+def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
+    """Add what a message tells to the trials: a new one, its end, or the pictures on the screen."""
+    if text.startswith("TRIALID"):
+        if trials:
+            trials[-1].close(time)
+        trials.append(_Trial(text[7:].strip() or f"trial {len(trials) + 1}", time))
+        return
+    if not trials:
+        return
+    trial = trials[-1]
+    if text.startswith("TRIAL_RESULT"):
+        trial.close(time)
+    elif _CLEAR.match(text):
+        trial.hide(time)
+    elif load := _LOAD.match(text):
+        trial.hide(time)
+        picture, place = _loaded(load[1].upper(), load[2])
+        trial.views.append(_View(picture, time, place=place))
+    elif variable := _VARIABLE.match(text):
+        trial.name = _file_name(variable[1])
+
+
+def _loaded(how: str, rest: str) -> tuple[str, _Place | None]:
+    """The picture of a message `IMGLOAD`, and its place on the screen where the message tells it with its size."""
+    placed = None if how == "FILL" else _PLACED.match(rest)
+    if placed is None:
+        return _file_name(rest), None
+    if placed[4] is None:
+        return _file_name(placed[1]), None
+    x, y, width, height = (float(placed[number]) for number in (2, 3, 4, 5))
+    if min(width, height) < 1:
+        return _file_name(placed[1]), None
+    if how == "CENTER":
+        x, y = x - width / 2, y - height / 2
+    return _file_name(placed[1]), (x, y, width, height)
+
+
+def _file_name(path: str) -> str:
+    return path.strip('"').replace("\\", "/").rpartition("/")[2]
+
+
+def _share_out(fixations: Iterable[_Fixation], views: Sequence[_View]) -> None:
+    """Give each fixation to the view in whose time it begins."""
+    ordered = sorted(views, key=lambda view: view.start)
+    starts = np.array([view.start for view in ordered])
+    for fixation in fixations:
+        number = int(np.searchsorted(starts, fixation.start, side="right")) - 1
+        if number >= 0 and fixation.start < ordered[number].end:
+            ordered[number].fixations.append(fixation)
+
+
+def _of_one_eye(fixations: Sequence[_Fixation], eye: str | None) -> list[_Fixation]:
+    """The fixations of an eye; None takes the right one where it has any."""
+    sides = {fixation.eye for fixation in fixations}
+    side = eye[0].upper() if eye is not None else "R" if "R" in sides else "L"
+    return [fixation for fixation in fixations if fixation.eye == side]
+
+
+def _none(trials: Sequence[_Trial]) -> str:
+    """What is there instead of fixations in trials."""
+    return "none in the time of a picture" if trials else "none; convert the events, too"
+
+
+def _lost(lines: Sequence[str]) -> list[str]:
+    """A sentence on messages and data that the recording says were lost, with their lines."""
+    lost = [number for number, line in enumerate(lines, start=1) if _LOST.search(line)]
+    if not lost:
+        return []
+    where = ", ".join(map(str, lost[:5])) + (", …" if lost[5:] else "")
+    return [f"messages or data were lost (line {where}), so pictures may be missing or wrong from there on"]
+
+
+def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> list[str]:
+    """A sentence on trials whose fixations all lie outside the time of their pictures."""
+    empty = [trial for trial in trials if trial.views and not any(view.fixations for view in trial.views)]
+    starts = np.sort([fixation.start for fixation in fixations])
+    missed = [trial for trial in empty if np.diff(np.searchsorted(starts, (trial.start, trial.end)))[0] > 0]
+    if not missed:
+        return []
+    picture = missed[0].views[0].picture
+    return [
+        f"the fixations of {len(missed)} of {len(trials)} trials, such as that of {picture}, are left out, as none "
+        "begins while the picture is on the screen (IMGLOAD to TRIAL_RESULT or END)"
+    ]

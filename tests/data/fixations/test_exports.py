@@ -185,12 +185,13 @@ END\t2158002 \tSAMPLES\tEVENTS\tRES\t  38.54\t  31.12
 
 def test_trials_have_their_picture_and_one_eye(tmp_path):
     path = tmp_path / "ann.asc"
-    path.write_text(HEAD + TRIALS.replace("a b.jpg", "a.jpg"))
+    path.write_text(HEAD + TRIALS)
     first, second = read_eyelink(path)
-    assert (first.picture, second.picture, first.subject, first.size) == ("a.jpg", "2 b.jpg", "ann", (1024, 768))
+    assert (first.picture, second.picture, first.subject, first.size) == ("a b.jpg", "2 b.jpg", "ann", (1024, 768))
     np.testing.assert_array_equal(first.points, [[512.3, 384.1], [100.0, 50.5]])
     np.testing.assert_array_equal(first.durations, [200, 282])
-    (left,) = read_eyelink(path, eye="left", subject="7")
+    with pytest.warns(UserWarning, match="1 of 2 pictures have no fixation of the left eye"):
+        (left,) = read_eyelink(path, eye="left", subject="7")
     assert (left.subject, left.points.tolist(), left.durations.tolist()) == ("7", [[510.3, 380.1]], [180])
 
 
@@ -229,3 +230,46 @@ def test_names_of_pictures_may_be_in_the_encoding_of_windows(tmp_path):
     for encoding in ("utf-8", "utf-16", "cp1252"):
         (tmp_path / "ann.asc").write_bytes(text.encode(encoding))
         assert "übung.jpg" in {each.picture for each in read_eyelink(tmp_path / "ann.asc")}
+
+
+LOADS = """MSG\t1000 DISPLAY_COORDS 0 0 1023 767
+MSG\t1001 TRIALID 1
+MSG\t1002 !V IMGLOAD FILL cross.png
+START\t1003 \tLEFT\tSAMPLES\tEVENTS
+EFIX L   1010\t1200\t190\t  511.0\t  383.0\t   1200
+MSG\t1500 -250 !V IMGLOAD CENTER pictures/big cat 2.jpg 512 384 800 600
+EFIX L   1600\t1900\t300\t  112.0\t  84.0\t   1200
+EFIX L   1760\t2000\t240\t  612.0\t  184.0\t   1200
+MSG\t2200 !V CLEAR 128 128 128
+EFIX L   2210\t2300\t90\t  1.0\t  1.0\t   1200
+MSG\t2400 TRIAL_RESULT 0
+EFIX L   2500\t2600\t100\t  2.0\t  2.0\t   1200
+MSG\t3000 TRIALID 2
+MSG\t3001 !V IMGLOAD TOP_LEFT b.jpg 100 50
+EFIX R   3100\t3300\t200\t  300.0\t  200.0\t   1200
+END\t3500 \tSAMPLES\tEVENTS\tRES\t  38.54\t  31.12
+EFIX R   3600\t3700\t100\t  3.0\t  3.0\t   1200
+"""
+
+
+def test_fixations_are_of_the_picture_that_is_on_the_screen_when_they_begin(tmp_path):
+    """A message that is late by -250 ms is of 1750 ms; the eye is that of each trial."""
+    (tmp_path / "a.asc").write_text(LOADS)
+    cross, cat, second = read_eyelink(tmp_path / "a.asc")
+    assert [each.picture for each in (cross, cat, second)] == ["cross.png", "big cat 2.jpg", "b.jpg"]
+    assert (cross.points.tolist(), cat.points.tolist()) == ([[511, 383], [112, 84]], [[500, 100]])
+    (tmp_path / "a.asc").write_text(LOADS.replace("1500 -250 !V", "1500 10 !V"))
+    cross, cat, second = read_eyelink(tmp_path / "a.asc")
+    assert (cross.points.tolist(), cross.size, cross.durations.tolist()) == ([[511, 383]], (1024, 768), [190])
+    assert (cat.points.tolist(), cat.size) == ([[0, 0], [500, 100]], (800, 600))
+    assert (second.points.tolist(), second.size) == ([[300, 200]], (1024, 768))
+
+
+def test_what_was_lost_or_shown_at_no_time_is_said(tmp_path):
+    (tmp_path / "a.asc").write_text(LOADS.replace("1500 -250", "1500") + "MSG\t4000 MESSAGES LOST 3\n")
+    with pytest.warns(UserWarning, match=r"messages or data were lost \(line 18\)"):
+        assert len(read_eyelink(tmp_path / "a.asc")) == 3
+    late = LOADS.replace("1500 -250", "1500").replace("3001 !V", "3400 !V")
+    (tmp_path / "a.asc").write_text(late)
+    with pytest.warns(UserWarning, match=r"the fixations of 1 of 2 trials, such as that of b\.jpg, are left out"):
+        assert [each.picture for each in read_eyelink(tmp_path / "a.asc")] == ["cross.png", "big cat 2.jpg"]
