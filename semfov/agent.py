@@ -1,6 +1,7 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self, get_args
@@ -371,7 +372,8 @@ class ActivePerception(nn.Module):
             settings: dict[str, Any] = {"start": start, "seed": seed, "boxes": boxes, "confirm": confirm}
             settings |= {"give_up": give_up, "shifts": shifts, "prior": prior}
             most = MOST_CLOSER if closer is None else closer
-            return self.fovea.search(image, target, bounds, closer=most, **settings)
+            record = self.fovea.search(image, target, bounds, closer=most, **settings)
+            return replace(record, source=opened.path)
         several = "one class for a search by windows or a head; find_all takes several"
         check(len(targets) == 1, "target", several, target)
         arguments = without_none(confirm=confirm, give_up=give_up, prior=prior, **limits)
@@ -436,7 +438,8 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            return counted_from(self.fovea.find_all(image, targets, bounds, shifts=shifts), least)
+            found = self.fovea.find_all(image, targets, bounds, shifts=shifts)
+            return counted_from(replace(found, source=opened.path), least)
         arguments = without_none(worth=worth, **limits)
         if kind == "head":
             arguments |= without_none(duration=duration)
@@ -500,7 +503,8 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
             seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)
-            return counted_from(self.fovea.explore(seen, bounds, **given), least)
+            explored = self.fovea.explore(seen, bounds, **given)
+            return counted_from(replace(explored, source=opened.path), least)
         arguments = without_none(worth=worth, passes=passes, seconds=seconds, on_look=on_look)
         if kind == "head":
             arguments |= without_none(start=start, duration=duration)
@@ -537,9 +541,9 @@ class ActivePerception(nn.Module):
             InputError: no model is shipped for the detector, the given one is another's, or the fovea bends it.
             DataError: the file of the picture or of the model cannot be read.
         """
-        image = OpenedPicture.of(picture, color, white, bands).image(self.eye.sensor.like)[0]
-        source = fspath(picture) if isinstance(picture, str | PathLike) else None
-        return GazePrediction.of(self.eye, image, model=model, source=source, seen=seen)
+        opened = OpenedPicture.of(picture, color, white, bands)
+        image = opened.image(self.eye.sensor.like)[0]
+        return GazePrediction.of(self.eye, image, model=model, source=opened.path, seen=seen)
 
     @checked_keywords
     def live(

@@ -84,6 +84,12 @@ class OpenedPicture:
         settings: dict[str, Any] = {"color": self.color, "white": self.white}
         return as_image(cast(ImageLike, source), like=like, argument="picture", **settings)[None]
 
+    @property
+    def path(self) -> str | None:
+        """The file of the picture; None if it does not come from a file."""
+        path = self.source.path if isinstance(self.source, LargePicture) else self.source
+        return os.fspath(path) if isinstance(path, str | PathLike) else None
+
     @cached_property
     def large(self) -> LargePicture:
         """The picture for windows."""

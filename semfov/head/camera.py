@@ -17,6 +17,7 @@ from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
 
+_RADIANS = {"pan": 2 * math.pi, "tilt": math.pi / 2}  # the largest angles in radians
 _TRIES = 25  # largest number of frames that are asked for until one is from the right direction
 _WIDEST = 8192  # pixels of the panorama in which objects are located
 _DRAWING_WIDTH = 480  # width of the frames that are kept for drawing
@@ -98,12 +99,7 @@ class _CameraScene(Sphere):
         fields = check_fields(camera.fields)
         for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
             check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
-        sides = [abs(float(side)) for side in (*camera.pan, *camera.tilt)]
-        if 0 < max(sides) <= 2 * math.pi:
-            whole = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
-            unit = whole if max(sides) <= 1 else "radians; use math.degrees"
-            got = f"{camera.pan} with tilt {camera.tilt}, which look like {unit}"
-            raise InputError(f"pan: expected limits in degrees, got {got}")
+            _check_degrees(name, limits)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         picture, pan, tilt = (width, width // 2), camera.pan, camera.tilt
         super().__init__(picture, camera.size, pan=pan, tilt=tilt, fields=fields, speeds=camera.speeds)
@@ -156,6 +152,15 @@ class _CameraScene(Sphere):
             x, y = points[inside].round().long().unbind(-1)
             canvas[:, inside] = frame[:, y.clamp(0, height - 1), x.clamp(0, width - 1)].float() / 255
         return canvas.unflatten(-1, size[::-1])
+
+
+def _check_degrees(name: str, limits: Sequence[float]) -> None:
+    """Refuse limits of `pan` or `tilt` that look like radians or shares; both are judged alone, as units may differ."""
+    widest = max(abs(float(side)) for side in limits)
+    unit = "radians; use math.degrees"
+    if widest <= 1:
+        unit = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
+    check(widest == 0 or widest > _RADIANS[name], name, "limits in degrees", f"{limits}, which look like {unit}")
 
 
 SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike

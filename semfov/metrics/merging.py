@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError
+from semfov.errors import InputError, check
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.metrics.labels import as_numbers, as_outcomes
@@ -49,11 +49,19 @@ class AreaUnderRoc(Metric):
             score: `(M,)`, higher where the target is more likely.
             present: `(M,)`, whether it is there: booleans, or 0 and 1.
         """
-        self.score.append(as_numbers(score, "score").detach())
+        self.score.append(as_numbers(score, "score").detach().double())
         self.present.append(as_outcomes(present, "present"))
+
+    def sync(self, *arguments: Any, **options: Any) -> None:
+        """Join the cases of all processes, of which each takes part, even without a case (`torchmetrics.Metric`)."""
+        if isinstance(self.score, list) and not self.score:
+            self.score.append(torch.zeros(0, dtype=torch.float64, device=self.device))
+            self.present.append(torch.zeros(0, dtype=torch.bool, device=self.device))
+        super().sync(*arguments, **options)
 
     def compute(self) -> Tensor:
         """The area over all cases; both kinds are needed."""
+        check(len(self.score) > 0, "score", "cases of both kinds", "none; call update first")
         # After a synchronisation the cases of all updates are one tensor already.
         both = (part if isinstance(part, Tensor) else torch.cat(part) for part in (self.score, self.present))
         return torch.tensor(area_under_roc(*both))

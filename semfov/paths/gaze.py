@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, write_table
-from semfov.data.fixations.suspicions import check_viewed, warn_outside
+from semfov.data.fixations.suspicions import check_viewed, warn_of_frames
 from semfov.detection import Detections, Detector, FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
@@ -281,27 +281,24 @@ class GazePrediction:
         viewed = _fixations_of(scanpath, "scanpath", self.size, self.source)
         return self._over_pixels(self.given([viewed], len(viewed)).log())
 
-    def compare(self, people: Sequence[Fixations]) -> dict[str, float]:
+    def compare(
+        self, people: Fixations | Record | Sequence[Fixations | Record] | str | PathLike[str]
+    ) -> dict[str, float]:
         """Compare the density with fixations of people in the same picture, all but the first of each person.
 
         Args:
-            people: their fixations, in any size of the picture.
+            people: their fixations, in any size of the picture, or the path of a file of them, of which those in the
+                picture are taken (`semfov.data.fixations.read_fixations`).
 
         Returns:
             By name: `NSS`, `AUC`, `AUC Judd`, `log likelihood` in bits above uniform, and against the density of the
             people, blurred by 3 % of the longer side, `CC`, `SIM` and `KL` in nats. Fixations outside are left out.
 
         Raises:
-            InputError: there are no fixations beside the first ones, they are of several pictures, or their frame has
-                other proportions.
+            InputError: there are no fixations beside the first ones, they are of several pictures or of another one, or
+                their frame has other proportions.
+            DataError: the file cannot be read.
         """
-        each_of_them = isinstance(people, Sequence) and all(isinstance(each, Fixations) for each in people)
-        check(each_of_them, "people", "a list of Fixations, one for each person", type(people).__name__)
-        check(len(people) > 0, "people", "fixations of at least one person", "none")
-        pictures = sorted({each.picture for each in people})
-        check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-        for each in people:
-            check_viewed(each, "people", self.size)
         from semfov.metrics.scanpath.beside import compare_density
 
         return compare_density(self, people)
@@ -443,4 +440,4 @@ def _fixations_of(given: object, argument: str, size: tuple[int, int], source: s
     if not isinstance(given, Fixations):
         raise InputError(f"{argument}: expected {one}, got {type(given).__name__}")
     check_viewed(given, argument, size, source)
-    return warn_outside(argument, [given], stacklevel=4)[0].resized(size)
+    return warn_of_frames(argument, [given], stacklevel=4)[0].resized(size)

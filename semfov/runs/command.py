@@ -31,7 +31,7 @@ from typing import (
 
 from semfov.errors import InputError, SemfovError
 from semfov.io.files import discard_unfinished
-from semfov.runs.settings import Settings, check_settings
+from semfov.runs.settings import Settings, check_settings, load_yaml
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -58,7 +58,8 @@ def make_parser(
     """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted."""
     import argparse
 
-    from jsonargparse import ArgumentParser, DefaultHelpFormatter, set_parsing_settings
+    import yaml
+    from jsonargparse import ArgumentParser, DefaultHelpFormatter, set_loader, set_parsing_settings
 
     class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
         """Keep the line breaks of the description, and print types in a readable form."""
@@ -79,12 +80,14 @@ def make_parser(
             print(f"error: {_in_one_line(message, config, options, every)}", file=sys.stderr)
             self.exit(2)
 
+    set_loader("settings", load_yaml, exceptions=(yaml.YAMLError,))
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
     module = sys.modules["__main__"].__spec__
     parser = Parser(
         prog=program or (module and f"python -m {module.name.removesuffix('.__main__')}"),
         description=description,
         default_env=False,
+        parser_mode="settings",
         formatter_class=Formatter,
         exit_on_error=True,
         allow_abbrev=False,  # --conf would be --config

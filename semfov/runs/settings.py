@@ -75,6 +75,34 @@ class Settings:
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
 
+_DEEPEST = 100
+"""Lists and objects within each other that a text of settings may have; loaders call themselves for each."""
+
+
+def load_yaml(text: str) -> Any:
+    """Read settings, without aliases, which a few lines multiply to any number of values, and not nested without end.
+
+    Args:
+        text: YAML.
+
+    Returns:
+        The value, as the parser of commands takes it.
+
+    Raises:
+        yaml.YAMLError: the text is no such YAML.
+    """
+    from jsonargparse import get_loader
+
+    depth = 0
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError(f"line {event.start_mark.line + 1}: expected values, got the alias *{event.anchor}")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise yaml.YAMLError(f"expected lists and objects at most {_DEEPEST} deep, got deeper ones")
+    return get_loader("yaml")(text)
+
+
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Convert settings to JSON values: paths become text, tuples become lists."""
     return json.loads(json.dumps(settings, default=str))

@@ -464,6 +464,9 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
         (((-3.15, 3.15), (-0.5, 1.57)), "radians"),
         (((-1, 1), (-1, 1)), "ONVIF"),
         (((0, 0), (-1, 0.5)), "ONVIF"),
+        (((-1.57, 1.57), (-90, 90)), "radians"),
+        (((-180, 180), (-0.5, 1.57)), "radians"),
+        (((-1, 1), (-20, 90)), "ONVIF"),
     ],
 )
 def test_limits_in_other_units_are_refused(limits, unit):
@@ -473,4 +476,4 @@ def test_limits_in_other_units_are_refused(limits, unit):
         def look_at(self, direction, field):
             return torch.rand(3, 30, 40)
 
-    refused(f"pan: expected .*limits in degrees.*{unit}", open_scene, Narrow())
+    refused(f"(pan|tilt): expected .*limits in degrees.*{unit}", open_scene, Narrow())

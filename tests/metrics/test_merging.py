@@ -46,3 +46,24 @@ def test_reliability_is_that_of_the_whole_sample(cases):
     area = AreaUnderRoc()
     area.update(torch.tensor([0.5]), torch.tensor([True]))
     refused("both true and false", area.compute)
+
+
+def test_no_case_is_refused_by_name():
+    area = AreaUnderRoc()
+    with pytest.warns(UserWarning, match="before the ``update`` method"):
+        refused("score: expected cases of both kinds, got none; call update first", area.compute)
+
+
+def test_a_process_without_a_case_takes_part():
+    """Both of two processes gather their states; one of them has none, and the figure is that of the other's cases."""
+    states = [torch.tensor([0.9, 0.4, 0.4, 0.1]).double(), torch.tensor([True, True, False, False])]
+    sent = []
+
+    def gather(state, group):
+        sent.append(state)
+        return [states[len(sent) - 1], state]
+
+    area = AreaUnderRoc(dist_sync_fn=gather, distributed_available_fn=lambda: True)
+    with pytest.warns(UserWarning, match="before the ``update`` method"):
+        assert float(area.compute()) == 0.875
+    assert [(len(state), state.dtype) for state in sent] == [(0, each.dtype) for each in states]

@@ -10,7 +10,7 @@ from PIL import Image
 from torch.nn import functional as F
 
 from semfov import Eye, Foveation, InputError, foveate
-from semfov.data.fixations import Fixations, read_table
+from semfov.data.fixations import Fixations, read_table, write_table
 from semfov.gaze.saliency import FixationDensity
 from semfov.metrics.scanpath import auc, correlation, nss
 from semfov.paths import GazePrediction
@@ -187,7 +187,7 @@ def test_files_hold_what_was_predicted(gaze, tmp_path):
 
 def test_comparison_equals_the_measures(gaze):
     points = [np.array([[50.0, 40.0], [20.0, 17.0], [81.0, 60.0]]), np.array([[5.0, 5.0], [22.0, 15.0]])]
-    people = [Fixations("a.png", str(n), each, (104, 78)) for n, each in enumerate(points)]
+    people = [Fixations("poster.png", str(n), each, (104, 78)) for n, each in enumerate(points)]
     scores = gaze.compare(people)
     later = np.concatenate([each[1:] for each in points])
     x, y = ((later + 0.5) / 2 - 0.5).T
@@ -202,15 +202,35 @@ def test_comparison_equals_the_measures(gaze):
     assert gaze.compare(doubled)["NSS"] == pytest.approx(scores["NSS"])
 
 
+def test_people_are_given_as_to_a_scanpath_and_their_unit_is_looked_at(gaze, tmp_path):
+    """Of a file those in the picture are taken, which any path and ending of its name tells."""
+    people = gaze.scanpaths(6, seed=1)
+    scores = gaze.compare(people)
+    write_table(tmp_path / "t.csv", [*people, replace(people[0], picture="other.png")])
+    assert gaze.compare(tmp_path / "t.csv") == pytest.approx(scores)
+    assert gaze.compare([replace(each, picture="x/poster.jpg") for each in people]) == scores
+    assert gaze.compare(people[0]) == gaze.compare(people[:1])
+    with pytest.raises(InputError, match=r"people: expected fixations in 'poster', got in 'other.png'; if both"):
+        gaze.compare([replace(each, picture="other.png") for each in people])
+    for said, change in (
+        ("fractions of the sides", lambda points: (points + 0.5) / (104, 78)),
+        ("pixels from the centre", lambda points: points - (52, 39)),
+    ):
+        wrong = [replace(each, points=change(each.points)) for each in people]
+        with pytest.warns(UserWarning, match=f"people: .* look like {said}") as said_here:
+            assert gaze.compare(wrong)["NSS"] < scores["NSS"]
+        assert said_here[0].filename == __file__
+
+
 def test_what_cannot_be_drawn_or_compared_is_refused(gaze):
     for name, value in [("people", 0), ("seconds", 0.0), ("seconds", 1e9)]:
         refused(name, gaze.scanpaths, **{name: value})
-    square = Fixations("a.png", "1", np.array([[5.0, 5.0], [7.0, 8.0]]), (100, 100))
+    square = Fixations("poster.png", "1", np.array([[5.0, 5.0], [7.0, 8.0]]), (100, 100))
     refused("proportions of 104 × 78", gaze.compare, [square])
     refused("at least one person", gaze.compare, [])
-    for wrong in (None, square, [square, "b.png"]):
-        refused(r"^people: expected a list of Fixations, one for each person, got ", gaze.compare, wrong)
-    only = Fixations("a.png", "1", np.array([[5.0, 5.0]]), (104, 78))
+    for wrong in (None, [square, "b.png"]):
+        refused(r"^people: expected fixations, records of an agent, or a file, got a ", gaze.compare, wrong)
+    only = Fixations("poster.png", "1", np.array([[5.0, 5.0]]), (104, 78))
     refused("after the first of each person", gaze.compare, [only])
     assert "entropy" in gaze.describe()
     assert repr(gaze).count("\n") == len(gaze.peaks())

@@ -18,11 +18,15 @@ from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_con
 _PIXELS = Array(Number(low=-1e6, high=1e6), least=1)
 _MILLISECONDS = Array(Number(low=0, high=1e9))
 _SIDE = Number(above=0, high=1e6)
+_SCREEN = 1680, 1050  # of COCO-Search18
 _BOX = Maybe(Array(Number(low=-1e6, high=1e6), 4))
 
 _COCOSEARCH = Array(
     Object(
-        {"name": Text(), "task": Text(), "X": _PIXELS, "Y": _PIXELS, "T": _MILLISECONDS, "bbox": _BOX},
+        {
+            **{"name": Text(), "task": Text(), "X": _PIXELS, "Y": _PIXELS, "T": _MILLISECONDS, "bbox": _BOX},
+            **dict.fromkeys(("width", "height"), _SIDE),
+        },
         others=Json(),
         required=("name", "X", "Y"),
     )
@@ -52,17 +56,18 @@ _RUARTE = Object(
 def read_cocosearch(
     path: str | PathLike[str],
     *,
-    screen: tuple[int, int] = (1680, 1050),
+    screen: tuple[int, int] | None = None,
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> list[Fixations]:
     """Read the trials of a COCO-Search18 file.
 
     The file is a list of objects with `name`, `X` and `Y`, and optionally `subject`, `task`, `bbox`, `T`, `fixOnTarget`
-    and other keys.
+    (booleans, or 1 and 0), `width` and `height` (of the frame of the trial), and other keys.
 
     Args:
         path: the file.
-        screen: `(width, height)` of the screen in pixels, to which the coordinates refer.
+        screen: `(width, height)` of the screen in pixels, to which the coordinates refer, for trials without a `width`
+            and a `height`; None takes 1680 × 1050, the data set's.
         sizes: `(width, height)` of the pictures by name. Where it is given, trials of these pictures are converted from
             the screen, on which the picture is letterboxed, to pixels of the picture, and other trials are left out.
 
@@ -83,17 +88,18 @@ def read_cocosearch(
     """
     path, scanpaths = Path(path), []
     for number, trial in enumerate(_read(path, _COCOSEARCH)):
-        flag, box = trial.get("fixOnTarget"), trial.get("bbox")
+        box = trial.get("bbox")
+        name = f"[{number}] ({trial['name']})"
         record = _record(
             path,
-            f"[{number}] ({trial['name']})",
+            name,
             trial,
             picture=trial["name"],
             subject=str(trial.get("subject", path.stem)),
-            size=screen,
+            size=_frame(f"{path}: {name}", trial, screen),
             target=trial.get("task"),
             box=None if box is None else tuple(map(float, (box[0], box[1], box[0] + box[2], box[1] + box[3]))),
-            found=flag if isinstance(flag, bool) else None,
+            found=_flag(f"{path}: {name}.fixOnTarget", trial.get("fixOnTarget")),
         )
         scanpaths.append(record)
     if sizes is not None:
@@ -237,9 +243,7 @@ def read_ruarte(
     for name, trial in _read(path, _RUARTE).items():
         # In cells, the last row and column are inside the box, which ends where the next cell begins.
         cells = trial.get("receptive_width") == trial.get("receptive_height") == 1
-        flag, box = trial.get("target_found"), trial.get("target_bbox")
-        told = flag is None or isinstance(flag, bool)
-        check_data(told, f"{path}: {name}.target_found", "true or false", repr(flag))
+        box = trial.get("target_bbox")
         record = _record(
             path,
             name,
@@ -249,7 +253,7 @@ def read_ruarte(
             size=(int(trial["image_width"]), int(trial["image_height"])),
             target=trial.get("target_object"),
             box=None if box is None else tuple(map(float, (box[1], box[0], box[3] + cells, box[2] + cells))),
-            found=flag,
+            found=_flag(f"{path}: {name}.target_found", trial.get("target_found")),
         )
         scanpaths.append(record if screen is None else record.resized(screen))
     if sizes is not None:
@@ -324,6 +328,24 @@ def _read(path: Path, kind: Json) -> Any:
     value = read_json(path)
     check_content(path, value, kind)
     return value
+
+
+def _flag(where: str, value: Any) -> bool | None:
+    """A boolean of a file, or 1 or 0 in its place."""
+    check_data(value is None or value in (True, False), where, "true or false", repr(value))
+    return None if value is None else bool(value)
+
+
+def _frame(where: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) -> tuple[int, int]:
+    """The frame of a trial of COCO-Search18: its own, else the screen."""
+    own = trial.get("width"), trial.get("height")
+    if own == (None, None):
+        return _SCREEN if screen is None else screen
+    check_data(None not in own, where, "both a width and a height, or neither", own)
+    frame = int(own[0]), int(own[1])  # type: ignore[arg-type]  # which are not None
+    check_data(frame == own, where, "a width and a height in whole pixels", own)
+    check_data(screen is None or (*screen,) == frame, where, f"{screen}, which is given", frame)
+    return frame
 
 
 def _record(

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, check_number
 
 _Values = NDArray[np.float64]
 _Size = tuple[int, int]
@@ -207,18 +207,48 @@ class Fixations:
         box = None if self.box is None else _box(np.array(self.box).reshape(2, 2) * scale)
         return replace(self, points=(self.points + 0.5) * scale - 0.5, size=size, box=box)
 
-    def in_picture(self, size: tuple[int, int]) -> "Fixations":
-        """Convert the fixations to pixels of a picture that was shown letterboxed on the frame.
+    def in_picture(
+        self,
+        size: tuple[int, int],
+        *,
+        scale: float | None = None,
+        place: tuple[float, float, float, float] | None = None,
+    ) -> "Fixations":
+        """Convert the fixations to pixels of a picture that was shown on the frame.
 
         Args:
             size: `(width, height)` of the picture.
+            scale: screen pixels per picture pixel of a picture in the middle of the frame, 1 for one that was shown at
+                its own size; None for the largest picture that fits (`Letterbox`).
+            place: `(x, y, width, height)` that the picture covered, from the corner of the frame, in its pixels; None
+                for a picture in the middle.
 
         Returns:
             The converted record; points outside the picture are kept.
+
+        Raises:
+            InputError: a size is not above 0, or both `scale` and `place` are given.
+
+        >>> seen = Fixations("a.jpg", "1", np.array([[400.0, 300.0]]), (1600, 1200))
+        >>> seen.in_picture((800, 600), scale=1).points, seen.in_picture((400, 300), place=(0, 0, 800, 600)).points
+        (array([[0., 0.]]), array([[199.75, 149.75]]))
         """
         placed = Letterbox(self.size, size)
-        box = None if self.box is None else placed.box_to_picture(self.box)
-        return replace(self, points=placed.to_picture(self.points), size=size, box=box)
+        check(scale is None or place is None, "place", "None beside scale, or scale=None", place)
+        corner = np.array(placed.offset)
+        across = np.array((placed.scale, placed.scale))  # screen pixels per picture pixel
+        if scale is not None:
+            check_number(scale, "scale", 1e-6, 1e6)
+            corner = (np.array(self.size) - scale * np.array(size)) / 2
+            across = np.array((scale, scale))
+        elif place is not None:
+            sides = as_array(place, "place", finite=True)
+            covers = sides.shape == (4,) and bool((sides[2:] > 0).all())
+            check(covers, "place", "(x, y, width, height), with a width and a height above 0", place)
+            corner = sides[:2]
+            across = sides[2:] / size
+        box = None if self.box is None else _box((np.array(self.box).reshape(2, 2) - corner) / across)
+        return replace(self, points=(self.points + 0.5 - corner) / across - 0.5, size=size, box=box)
 
     def first(self, count: int) -> "Fixations":
         """Take the first fixations.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.record import Fixations
+from semfov.data.fixations.record import Fixations, Letterbox
 from semfov.errors import check
 
 _Array = NDArray[np.float64]
@@ -19,6 +19,8 @@ _FAR = 0.5
 
 _MANY = 20  # fixations from which on shares tell something
 _BAR, _LEVEL = 0.06, 0.03  # shares of a side that is empty where a picture was letterboxed, and where it was not
+_MOST_FILLED = 0.6  # shares of a frame that fixations of several pictures fill in its middle, and no more
+_ENLARGED, _SEVERAL = 1.15, 5  # how much larger a frame would show a picture, and pictures that tell what one does not
 _MOST_OUTSIDE, _MOST_REPEATED, _MOST_ALIKE, _MOST_SHORT = 0.1, 0.02, 0.02, 0.1  # shares of the fixations
 _STRETCH = 0.02  # what rounding to whole pixels may do to proportions
 _SHORT, _LONG = 50.0, 5000.0  # milliseconds
@@ -30,7 +32,8 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
       or many outside it; with `sizes`, frames of other proportions than those of their pictures, and points within the
       pixels of pictures that are smaller than their frames.
-    - A letterbox: bars at two opposite sides without fixations, while the others reach the border.
+    - A letterbox: bars at two opposite sides without fixations, while the others reach the border; and a picture at its
+      own size in the middle: bars at all sides.
     - Points that repeat the one before, records that occur twice, and many fixations at one same point, such as what
       a tracker writes during a blink.
     - Durations in seconds or microseconds, all alike, or of samples; and fixations of less than 50 ms or of more than
@@ -57,7 +60,8 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     if looks is None and outside > _MOST_OUTSIDE:
         found.append(f"{100 * outside:.0f} % of the fixations lie outside their frame (check its size and the origin)")
     if looks is None:
-        found += _letterbox(points, sides)
+        own = [] if sizes is None else _own_size(records, sizes)
+        found += own or _letterbox(points, sides) or _middle(records, points, sides)
     if sizes is not None:
         found += _pictures(records, sizes)
     return [*found, *_repeats(records, points), *_durations(records)]
@@ -107,6 +111,40 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
             width = f"{100 * min(bars):.0f} % of the frame at the {name}"
             return [f"no {places} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
+
+
+def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list[str]:
+    """Bars without fixations at all sides of one frame, whatever the picture."""
+    pictures = len({record.picture for record in records})
+    if len(points) < 5 * _MANY or pictures < _SEVERAL or (sides != sides[0]).any():
+        return []
+    low, high = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)
+    filled = high - low
+    if (filled > _MOST_FILLED).any() or (np.abs(low + high - 1) > 2 * _LEVEL).any():
+        return []
+    across, down = (f"{100 * part:.0f} %" for part in filled)
+    return [
+        f"fixations fill {across} × {down} of their frame, in the middle: were the pictures shown at their own size "
+        "(Fixations.in_picture with scale=1), or are the points in degrees?"
+    ]
+
+
+def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Fixations that keep to their pictures' own size in the middle of frames that would hold them much larger."""
+    smaller = [
+        record
+        for record in records
+        if record.picture in sizes and Letterbox(record.size, sizes[record.picture]).scale >= _ENLARGED
+    ]
+    count = sum(map(len, smaller))
+    within = sum(int(record.in_picture(sizes[record.picture], scale=1).inside.sum()) for record in smaller)
+    if count < 5 * _MANY or count < 0.5 * sum(map(len, records)) or within < 0.99 * count:
+        return []
+    (across, down), frame = sizes[smaller[0].picture], smaller[0].size
+    return [
+        f"fixations keep to the middle of their frames, such as {across} × {down} in {frame[0]} × {frame[1]} of "
+        f"{smaller[0].picture}: was it shown at its own size? (Fixations.in_picture with scale=1)"
+    ]
 
 
 def _pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -184,11 +222,15 @@ def _durations(records: Sequence[Fixations]) -> list[str]:
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
     """Refuse fixations in a frame of other proportions than `(width, height)`, or in another picture than the file."""
     got = f"{fixations.size[0]} × {fixations.size[1]} of {fixations.subject!r}"
-    expected = f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture)"
+    expected = (
+        f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture((width, height)), with scale=1 if "
+        "the picture was shown at its own size)"
+    )
     check(_alike(fixations.size, size), argument, expected, got)
     name = Path(picture or fixations.picture).stem
     same = Path(fixations.picture).stem == name
-    check(same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}")
+    remedy = "if both are one picture, dataclasses.replace(fixations, picture=…) names it"
+    check(same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}; {remedy}")
 
 
 def warn_of_frames(

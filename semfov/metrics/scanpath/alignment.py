@@ -11,6 +11,7 @@ from semfov.metrics.scanpath.sequence import cell_labels
 
 _Array = NDArray[np.float64]
 
+_MOST_SCREENS = 10  # diagonals of a screen over which fixations may spread; more are of another unit
 _MOST_LETTERS = 10_000  # of a scanpath: the table of an alignment has their product
 
 
@@ -60,6 +61,8 @@ def multimatch(
     - position :math:`1 - \mathrm{med} \|p - q\| / D`, with the points p and q where the saccades start
     - duration :math:`1 - \mathrm{med} |s - t| / \max(s, t)`, with the durations s and t of the fixations there
 
+    Where fixations outside the screen are farther apart than its diagonal, similarities end at 0.
+
     The result equals that of `multimatch_gaze.docomparison` without grouping where one path is the cheapest. Of equally
     cheap paths, as between fixations at the centres of cells, the reference may take another one.
 
@@ -73,7 +76,8 @@ def multimatch(
         The five similarities.
 
     Raises:
-        InputError: fixations are not points, or durations are not as many as fixations.
+        InputError: fixations are not points, or spread over more than ten screens, as those in another unit do; or
+            durations are not as many as fixations.
 
     >>> path = [[0, 0], [30, 0], [30, 40]]
     >>> multimatch(path, path, (300, 400)).mean
@@ -83,10 +87,13 @@ def multimatch(
     check(all(np.isfinite(side) and side > 0 for side in size), "size", "(width, height), positive numbers", size)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
+    diagonal = float(np.hypot(*size))
+    spread = float(np.hypot(*np.ptp(np.concatenate([a, b]), axis=0)))
+    got = f"fixations over {spread:g}, {spread / diagonal:.0f} of its diagonals"
+    check(spread <= _MOST_SCREENS * diagonal, "size", "the screen in the unit of the fixations", got)
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
     i, j = _aligned(np.linalg.norm(u[:, None] - v[None], axis=-1))
     u, v = u[i], v[j]
-    diagonal = float(np.hypot(*size))
     turn = np.abs(np.arctan2(u[:, 1], u[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))
     lengths = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
     duration = float("nan")
@@ -99,10 +106,10 @@ def multimatch(
         longer = np.maximum(s[i], t[j])
         duration = 1 - float(np.median(np.abs(s[i] - t[j]) / np.where(longer > 0, longer, 1)))
     return MultiMatch(
-        shape=1 - float(np.median(np.linalg.norm(u - v, axis=1))) / (2 * diagonal),
+        shape=max(0.0, 1 - float(np.median(np.linalg.norm(u - v, axis=1))) / (2 * diagonal)),
         direction=1 - float(np.median(np.minimum(turn, 2 * np.pi - turn))) / np.pi,
-        length=1 - float(np.median(lengths)) / diagonal,
-        position=1 - float(np.median(np.linalg.norm(a[i] - b[j], axis=1))) / diagonal,
+        length=max(0.0, 1 - float(np.median(lengths)) / diagonal),
+        position=max(0.0, 1 - float(np.median(np.linalg.norm(a[i] - b[j], axis=1))) / diagonal),
         duration=duration,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations import Fixations, read_fixations
-from semfov.data.fixations.suspicions import check_viewed, warn_outside
+from semfov.data.fixations.suspicions import check_viewed, warn_of_frames
 from semfov.errors import check
 from semfov.metrics.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
 from semfov.metrics.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
@@ -94,34 +94,43 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
     >>> compare_scanpath(path, [path])["sequence score"].scanpath
     1.0
     """
-    own = scanpath.picture if isinstance(scanpath, Fixations) else scanpath.source
-    name = None if own is None else Path(own).stem
+    picture = scanpath.picture if isinstance(scanpath, Fixations) else scanpath.source
+    viewed = _viewers(people, picture, scanpath.size)
+    ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(viewed[0].picture)
+    if ours is scanpath:
+        warn_of_frames("scanpath", [ours])
+    targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
+    check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
+    size = viewed[0].size
+    mine, *theirs = [each.resized(size).points for each in (ours, *viewed)]
+    comparison = ScanpathComparison()
+    for name, measure in _measures(size).items():
+        among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
+        comparison[name] = BesidePeople(measure(mine, theirs), _mean(among))
+    return comparison
+
+
+def _viewers(people: _People, picture: str | None, size: tuple[int, int]) -> list[Fixations]:
+    """The fixations of people in a picture of `(width, height)`, checked; None is a picture without a name.
+
+    Of a file those in the picture are taken. Coordinates that do not look like those of their frame give a warning.
+    """
     if isinstance(people, str | PathLike):
         table = read_fixations(people)
+        name = None if picture is None else Path(picture).stem
         people = [each for each in table if name is None or Path(each.picture).stem == name]
         check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
     people = [people] if isinstance(people, Fixations | Record) or not isinstance(people, Iterable) else [*people]
-    named = own or next((each.picture for each in people if isinstance(each, Fixations)), "")
+    named = picture or next((each.picture for each in people if isinstance(each, Fixations)), "")
     viewed = [each.as_fixations(each.source or named) if isinstance(each, Record) else each for each in people]
     others = [type(each).__name__ for each in viewed if not isinstance(each, Fixations)]
     check(not others, "people", "fixations, records of an agent, or a file", f"a {others[0]}" if others else "")
     check(len(viewed) > 0, "people", "fixations of at least one person", "none")
     pictures = sorted({each.picture for each in viewed})
     check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-    ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(pictures[0])
-    targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
-    check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
     for each in viewed:
-        check_viewed(each, "people", ours.size, own)
-    size = viewed[0].size
-    records = [each.resized(size) for each in (ours, *viewed)]
-    warn_outside("fixations", records)
-    mine, *theirs = [each.points for each in records]
-    comparison = ScanpathComparison()
-    for name, measure in _measures(size).items():
-        among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
-        comparison[name] = BesidePeople(measure(mine, theirs), _mean(among))
-    return comparison
+        check_viewed(each, "people", size, picture)
+    return warn_of_frames("people", viewed, stacklevel=5)
 
 
 def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
@@ -190,9 +199,10 @@ def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, in
     return np.asarray(down @ across.T)
 
 
-def compare_density(prediction: GazePrediction, people: Sequence[Fixations]) -> dict[str, float]:
+def compare_density(prediction: GazePrediction, people: _People) -> dict[str, float]:
     """Measures of a density against all fixations of people but their first ones, and against their blurred density."""
-    records = warn_outside("people", [each.resized(prediction.size) for each in people])
+    viewed = _viewers(people, prediction.source, prediction.size)
+    records = [each.resized(prediction.size) for each in viewed]
     points = np.concatenate([each.points[1:][each.inside[1:]] for each in records])
     check(len(points) > 0, "people", "fixations inside the picture after the first of each person", "none")
     cells = prediction.cells.double().numpy()

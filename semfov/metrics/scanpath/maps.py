@@ -8,6 +8,8 @@ from semfov.errors import check, check_number
 
 _Array = NDArray[np.float64]
 
+_ROUNDING = 0.01  # what rounding may do to the sum of a density
+
 
 def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
     """Area under the ROC of Judd et al. (2009) as the MIT benchmark computes it (Bylinskii et al., 2019).
@@ -110,12 +112,17 @@ def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
         `(...)`, from -1 to 1; 0 where a map is constant.
 
     Raises:
-        InputError: the shapes differ.
+        InputError: the shapes differ, or a map has NaN or infinite values.
 
     >>> correlation([[0.0, 1.0]], [[2.0, 4.0]])
     array(1.)
     """
-    one, other = (each - each.mean(-1, keepdims=True) for each in _pair(first, second))
+    pair = _pair(first, second)
+    for each in pair:
+        missing = int((~np.isfinite(each)).sum())
+        got = f"NaN or infinity in {missing} of {each.size} pixels; replace them (numpy.nan_to_num)"
+        check(not missing, "maps", "finite numbers", got)
+    one, other = (each - each.mean(-1, keepdims=True) for each in pair)
     spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
     return np.asarray(np.where(spread > 0, (one * other).sum(-1) / np.where(spread > 0, spread, 1), 0.0))
 
@@ -286,12 +293,19 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
         `(..., n)`, in bits; 0 for a uniform density.
 
     Raises:
-        InputError: the shapes do not fit together, or a fixation lies outside its map.
+        InputError: the shapes do not fit together, a fixation lies outside its map, or `density` is no logarithm of a
+            density, whose exponentials have sum 1.
 
     >>> log_likelihood(log_density([[1.0, 1.0], [1.0, 5.0]]), [1], [1]).round(3)
     array([1.322])
     """
     values, at = _looked_up(density, x, y)
+    most = values.max((-1, -2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        totals = np.exp(values).sum((-1, -2))
+    normal = bool((np.isfinite(most) & (np.abs(totals - 1) <= _ROUNDING)).all())
+    got = f"exponentials with sum {totals.flat[np.abs(totals - 1).argmax()]:g}; log_density makes them of maps"
+    check(normal, "density", "natural logarithms of densities, whose exponentials have sum 1", got)
     return np.asarray((at + np.log(values.shape[-1] * values.shape[-2])) / np.log(2))
 
 

@@ -283,3 +283,43 @@ def test_target_boxes_in_cells_of_models_match_those_in_pixels_of_people(shared)
     assert len(shifted) > 500
     assert max(shifted) <= 1 + 1e-6
     assert coco_name("100000298773.jpg") == "000000298773.jpg"
+
+
+@given(sides, sides, st.floats(0.1, 5))
+def test_a_picture_at_a_place_or_scale_keeps_its_corners_and_its_middle(across, down, scale):
+    """The place of a picture in the middle is written by hand."""
+    place = ((1600 - scale * across) / 2, (1200 - scale * down) / 2, scale * across, scale * down)
+    x, y, width, height = place
+    points = [[x - 0.5, y - 0.5], [799.5, 599.5], [x + width - 0.5, y + height - 0.5]]
+    shown = Fixations("a.jpg", "1", points, (1600, 1200), box=(x, y, x + width, y + height))
+    corners = [[-0.5, -0.5], [across / 2 - 0.5, down / 2 - 0.5], [across - 0.5, down - 0.5]]
+    for back in (shown.in_picture((across, down), scale=scale), shown.in_picture((across, down), place=place)):
+        np.testing.assert_allclose(back.points, corners, atol=1e-6 * max(across, down))
+        assert back.box == pytest.approx((0, 0, across, down), abs=1e-6 * max(across, down))
+
+
+def test_a_place_is_refused_by_name():
+    shown = record()
+    refused(r"^place: expected None beside scale", shown.in_picture, (80, 60), scale=1, place=(0, 0, 8, 6))
+    refused(r"^place: expected \(x, y, width, height\)", shown.in_picture, (80, 60), place=(0, 0, 0, 6))
+    refused(r"^scale: ", shown.in_picture, (80, 60), scale=0)
+
+
+def test_trials_of_cocosearch_have_their_own_frame_and_flags(tmp_path):
+    path = tmp_path / "trials.json"
+    trial = {"name": "a.jpg", "X": [8, 9], "Y": [5, 6], "width": 512, "height": 320, "fixOnTarget": 1}
+    path.write_text(json.dumps([trial, {**trial, "width": 640, "fixOnTarget": 0}]))
+    assert [(each.size, each.found) for each in read_cocosearch(path)] == [((512, 320), True), ((640, 320), False)]
+    unusable(
+        r"\[1\] \(a.jpg\): expected \(512, 320\), which is given, got \(640", read_cocosearch, path, screen=(512, 320)
+    )
+    for change, said in (
+        ({"height": None}, r"height: "),
+        ({"fixOnTarget": "yes"}, r"fixOnTarget: expected true or false, got 'yes'"),
+        ({"width": 512.5}, r"a width and a height in whole pixels"),
+    ):
+        path.write_text(json.dumps([{**trial, **change}]))
+        unusable(said, read_cocosearch, path)
+    del trial["height"]
+    path.write_text(json.dumps([trial]))
+    unusable(r"both a width and a height, or neither", read_cocosearch, path)

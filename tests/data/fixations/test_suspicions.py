@@ -208,3 +208,21 @@ def test_a_file_tells_its_reader(tmp_path):
     ):
         (tmp_path / "e.json").write_text(text)
         unusable(said, read_fixations, tmp_path / "e.json")
+
+
+def test_pictures_at_their_own_size_are_told_with_their_sizes_and_without():
+    """400 × 300 in the middle of 800 × 600: without sizes by the empty border, with them by the pictures."""
+    own = moved(lambda points: (points + 0.5) / 2 + [200, 150] - 0.5)
+    said = "shown at their own size (Fixations.in_picture with scale=1), or are the points in degrees?"
+    (line,) = suspicions(own)
+    assert line.startswith("fixations fill ")
+    assert said in line
+    sizes = {each.picture: (400, 300) for each in own}
+    (line,) = suspicions(own, sizes)
+    assert "such as 400 × 300 in 800 × 600 of 0.jpg: was it shown at its own size?" in line
+    assert all(each.in_picture((400, 300), scale=1).inside.all() for each in own)
+    assert suspicions(people(), sizes) == []
+    # Of one picture people may look at the middle alone.
+    one = [replace(each, picture="a.jpg", subject=each.picture) for each in own]
+    assert suspicions(one) == []
+    assert len(suspicions(one, {"a.jpg": (400, 300)})) == 1

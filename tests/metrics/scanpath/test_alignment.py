@@ -254,3 +254,12 @@ def test_only_the_warning_about_bins_is_suppressed(monkeypatch):
     monkeypatch.setattr(MeanShift, "fit", lambda self, points: warnings.warn("another", stacklevel=1))
     with pytest.warns(UserWarning, match="another"):
         fitted_clusters(points)
+
+
+def test_similarities_beyond_the_screen_end_at_0_and_another_unit_is_refused():
+    ours, theirs = np.array([[0.0, 0], [300, 0], [0, 0]]), np.array([[2000.0, 0], [0, 0], [2000, 0]])
+    same = multimatch(ours, theirs, (400, 300))
+    assert (same.shape, same.length, same.position) == (0, 0, 0)
+    assert 0 <= same.direction <= 1
+    expected = r"size: expected the screen in the unit of the fixations, got fixations over .*, \d+ of its diagonals"
+    refused(expected, multimatch, ours, theirs, (1, 1))

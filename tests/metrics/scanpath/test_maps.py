@@ -68,11 +68,11 @@ def test_log_likelihood_of_a_gaussian_matches_its_entropy():
 def test_batches_of_tensors_equal_single_maps():
     maps = torch.rand(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x, y = torch.zeros(2, 3, 4), torch.ones(2, 3, 4)
-    for figure in (nss, auc, log_likelihood):
-        together = figure(maps, x, y)
+    for figure, given in ((nss, maps), (auc, maps), (log_likelihood, torch.tensor(log_density(maps)))):
+        together = figure(given, x, y)
         assert together.shape == (2, 3, 4)
-        np.testing.assert_allclose(together[1, 2], figure(maps[1, 2], x[1, 2], y[1, 2]))
-    values = np.arange(6.0).reshape(2, 3)
+        np.testing.assert_allclose(together[1, 2], figure(given[1, 2], x[1, 2], y[1, 2]))
+    values = log_density(np.arange(6.0).reshape(2, 3))
     assert log_likelihood(values, [0.49], [0.4]) == log_likelihood(values, [0], [0])
     assert log_likelihood(values, [0.51], [0.4]) == log_likelihood(values, [1], [0])
 
@@ -96,7 +96,7 @@ def test_densities_have_a_floor_and_all_metrics_double_precision():
     maps = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6))
     assert nss(maps, [3], [4]) == nss(maps.double(), [3], [4])
     # 1025.5 cannot be represented in half precision.
-    wide = np.arange(2000.0)[None]
+    wide = log_density(np.arange(2000.0)[None])
     assert log_likelihood(wide, np.array([1025], np.float16), np.array([0], np.float16)) == log_likelihood(
         wide, [1025], [0]
     )
@@ -228,3 +228,22 @@ def test_maps_of_any_type_have_the_same_figures():
         assert information_gain(log_density(maps), log_density(np.ones((2, 2))), [1], [1])[0] == pytest.approx(
             np.log2(0.4 / 0.25)
         )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_correlation_without_numbers_is_refused(value):
+    maps = np.random.default_rng(0).random((2, 4, 5))
+    maps[1, 2, 3] = value
+    for pair in ((maps[0], maps[1]), (maps[1], maps[0])):
+        refused("maps: expected finite numbers, got NaN or infinity in 1 of 20 pixels", correlation, *pair)
+
+
+def test_a_log_likelihood_needs_logarithms_of_a_density():
+    density = np.random.default_rng(0).random((4, 5))
+    density /= density.sum()
+    expected = np.log2(density[2, 3] * 20)
+    assert log_likelihood(np.log(density), [3], [2])[0] == pytest.approx(expected)
+    assert log_likelihood(np.log(density).astype(np.float16), [3], [2])[0] == pytest.approx(expected, abs=0.01)
+    for wrong in (density, np.log(density) + 3, np.log2(density), np.full((4, 5), -np.inf), density * 1e4):
+        refused("density: expected natural logarithms of densities", log_likelihood, wrong, [3], [2])
+        refused("density: expected natural logarithms", information_gain, np.log(density), wrong, [3], [2])
