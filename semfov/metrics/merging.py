@@ -61,10 +61,11 @@ class AreaUnderRoc(Metric):
 
     def compute(self) -> Tensor:
         """The area over all cases; both kinds are needed."""
-        check(len(self.score) > 0, "score", "cases of both kinds", "none; call update first")
         # After a synchronisation the cases of all updates are one tensor already.
-        both = (part if isinstance(part, Tensor) else torch.cat(part) for part in (self.score, self.present))
-        return torch.tensor(area_under_roc(*both))
+        states = (self.score, self.present)
+        cases = [state if isinstance(state, Tensor) else torch.cat(state) for state in states if len(state)]
+        check(bool(cases) and len(cases[0]) > 0, "score", "cases of both kinds", "none; call update first")
+        return torch.tensor(area_under_roc(*cases))
 
 
 class Reliability(Metric):

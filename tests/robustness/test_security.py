@@ -101,6 +101,23 @@ def test_settings_that_would_run_code_are_refused(tmp_path, capsys):
     assert not mark.exists()
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seed: " + "[" * 200_000, "expected lists and objects at most 100 deep, got deeper ones"),
+        ("a: &a [1, 2]\nseed: *a\n", "line 2: expected values, got the alias *a"),
+    ],
+)
+def test_settings_that_would_fill_the_memory_or_the_stack_are_refused(tmp_path, capsys, text, said):
+    from eval.search import main
+
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main(["--config", str(tmp_path / "settings.yaml")])
+    assert stopped.value.code == 2
+    assert said in capsys.readouterr().err
+
+
 def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
     """Write a tar file with members of (name, content, target of a link)."""
     with tarfile.open(path, "w:gz") as tar:
