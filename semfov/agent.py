@@ -1,7 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self, get_args
@@ -372,8 +371,7 @@ class ActivePerception(nn.Module):
             settings: dict[str, Any] = {"start": start, "seed": seed, "boxes": boxes, "confirm": confirm}
             settings |= {"give_up": give_up, "shifts": shifts, "prior": prior}
             most = MOST_CLOSER if closer is None else closer
-            record = self.fovea.search(image, target, bounds, closer=most, **settings)
-            return replace(record, source=opened.path)
+            return opened.named(self.fovea.search(image, target, bounds, closer=most, **settings))
         several = "one class for a search by windows or a head; find_all takes several"
         check(len(targets) == 1, "target", several, target)
         arguments = without_none(confirm=confirm, give_up=give_up, prior=prior, **limits)
@@ -438,8 +436,7 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             only_for(kind, "windows", "passes", worth=worth)
             image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            found = self.fovea.find_all(image, targets, bounds, shifts=shifts)
-            return counted_from(replace(found, source=opened.path), least)
+            return counted_from(opened.named(self.fovea.find_all(image, targets, bounds, shifts=shifts)), least)
         arguments = without_none(worth=worth, **limits)
         if kind == "head":
             arguments |= without_none(duration=duration)
@@ -503,8 +500,7 @@ class ActivePerception(nn.Module):
         if kind == "fovea":
             given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
             seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)
-            explored = self.fovea.explore(seen, bounds, **given)
-            return counted_from(replace(explored, source=opened.path), least)
+            return counted_from(opened.named(self.fovea.explore(seen, bounds, **given)), least)
         arguments = without_none(worth=worth, passes=passes, seconds=seconds, on_look=on_look)
         if kind == "head":
             arguments |= without_none(start=start, duration=duration)

@@ -136,7 +136,7 @@ KNOWN = {
         f"window is {USUAL_WINDOW[0]} times as long": "code",
         f"within {_WIDE_BORDER:g} canvas px": "code",
         "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
-        f"probability {LIKELY} on": "code",
+        "2,048 pixels for each byte of its files, or 16.8 million": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",
         "0.41 MB": "upper bound by the size of the tensors",
         "134 MB": "of copies with at most 2 to the 25th pixels, three bytes each, and a third more",
@@ -148,6 +148,7 @@ KNOWN = {
         f"{len(COCO_CLASSES)} scores": "code",
         "take 512 MiB and a pass 10 s": "code, tested with such models",
         "in [0, 1]": "a range",
+        "shows with 0.9 is listed with 0.9": "a rule, tested with every head",
         "counts 1, a wrong place or a find in a photograph without the target -1, and no find 0": "a rule",
         "91 scores": "COCO's category ids with their gaps",
         "91 outputs": "torchvision's",
@@ -168,7 +169,13 @@ KNOWN = {
     },
     "docs/pan-tilt.md": {"from -1 to 1": "a range", "(40 by default)": "code, tested with the agent"},
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
-    "docs/command.md": {f"from score {LEAST}": "code", f"from probability {LIKELY}": "code", "in 16 bits": "a type"},
+    "docs/command.md": {
+        f"from score {LEAST}": "code",
+        f"at least {LIKELY} are": "code",
+        "in 16 bits": "a type",
+        "begin with 0": "a rule",
+        "32 megapixels": "code",
+    },
     "docs/guides/belief.md": {"sum to 1": "a rule", "equation 7": "docs/method.md"},
     "docs/guides/environments.md": {
         "is 0.05 in searches and 0.01 in explorations, and is 1": "signatures in the reference",
@@ -188,7 +195,6 @@ KNOWN = {
     "docs/guides/records.md": {
         f"which is {LEAST} unless": "code",
         f"begin at {FAINTEST}": "code",
-        f"is {LIKELY}, and what": "code",
     },
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},
 }

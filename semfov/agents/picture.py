@@ -53,6 +53,10 @@ class OpenedPicture:
         """Open a picture of any kind; one that is open stays as it is."""
         return source if isinstance(source, cls) else cls(cast(PictureLike, source), color, white, bands)
 
+    def named(self, record: Record) -> Record:
+        """Name the file of the picture in a record of it."""
+        return replace(record, source=self.path)
+
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
         """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""
         how = lookup(how, get_args(How), "kind of look")

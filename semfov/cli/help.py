@@ -68,8 +68,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
 {_AGENT}
 {_LOOKS}
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
-  --closer N           most closer looks at places that seem to hold the target (0: none)
-  --prior P            how often the target is there: the share of the pictures that hold it (default: half)
+  --closer N           most closer looks (0: none); --prior P: share of your pictures with the target (default: half)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
@@ -217,7 +216,6 @@ usage: semfov app [DETECTOR] [options]
 {_AGENT.partition(chr(10))[2]}
   --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; no password is asked for)
   --port N             its port (default: the first free one from 7860 on)
-  --seed N             seed of the examples
 
 Give it a picture or take an example, choose a class, and search, find all objects, explore, or predict where people
 look. Or look yourself: click on the picture, and see what the fovea sees there and what the agent then believes.

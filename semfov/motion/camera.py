@@ -27,6 +27,7 @@ _LEAST_SHARE = 0.4  # least share of the followed corners that agree
 _MOST_SCALE = 1.3  # largest change of scale between two frames
 _MOST_TURN = 25.0  # largest turn between two frames, in degrees
 
+_SAME = 6.0  # largest mean change of a block, in grey values, of a frame without texture that has not changed
 _BLOCKS = (8, 5)  # columns and rows of blocks in which two frames are compared
 _TEXTURE = 3.0  # least standard deviation of the grey values of a block that can be compared
 _ALIKE = 0.6  # correlation from which on a block agrees
@@ -178,7 +179,8 @@ class CameraMotion:
             moved = self._between(last, now, _STILL)
         if moved is None:
             self._key, self._moved = now, _STILL
-            return None
+            # Nothing can be followed where there is no texture, and nothing moves where two frames are the same.
+            return Motion.still() if _largest_change(last.grey, now.grey) < _SAME else None
         since = moved @ np.linalg.inv(self._moved)
         if _largest_shift(since, now.grey.shape) * max(now.ratio) < _STILL_SHIFT:
             return Motion.still()
@@ -258,6 +260,16 @@ def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -
     across, down = ratio
     enlarge = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
     return Motion(enlarge @ similarity @ np.linalg.inv(enlarge))
+
+
+def _largest_change(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+    """Mean difference of two frames in grey values, of the block where it is largest; infinite for other sizes."""
+    if first.shape != second.shape:
+        return float("inf")
+    difference = np.abs(first.astype(np.int16) - second)
+    rows = np.array_split(difference, min(_BLOCKS[1], len(difference)))
+    blocks = (block for row in rows for block in np.array_split(row, min(_BLOCKS[0], row.shape[1]), axis=1))
+    return max(float(block.mean()) for block in blocks)
 
 
 def _corners_of(shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -101,9 +101,9 @@ def episode_data(
 
 
 def object_data(record: Record) -> Data:
-    """Picture, detector, passes and objects of a record, not rounded, since the page rounds what it tells."""
+    """Picture, detector, passes and objects of a record; the page rounds their scores."""
     (width, height), rows = record.size, record.object_rows()
-    told = "score", "look", "confirmed", "pan", "tilt"
+    told = "look", "confirmed", "pan", "tilt"
     return {
         "pixels": f"{width} × {height} px",
         "detector": record.detector,
@@ -112,9 +112,10 @@ def object_data(record: Record) -> Data:
             {
                 "box": [row[side] for side in ("x1", "y1", "x2", "y2")],
                 "label": row["class"],
+                "score": score,
                 **{name: row[name] for name in told if name in row},
             }
-            for row in rows[:_DRAWN]
+            for row, score in zip(rows[:_DRAWN], record.objects.scores.tolist(), strict=False)
         ],
         "count": len(rows),
         "confirmable": record.confirmable,

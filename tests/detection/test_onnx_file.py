@@ -53,7 +53,8 @@ def test_metadata_are_settings_where_their_form_is_known(tmp_path):
     metadata = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "stride": "32", "task": "detect"}
     found = read_settings(tmp_path / "model.onnx", metadata)
     assert found == {"classes": ["person", "dog"], "input_size": [640, 480], "preprocessing": {}}
-    for names in ["person,dog", "{1: 'a'}", "{0: ", "3"]:
+    assert read_settings(tmp_path / "model.onnx", {"names": "person,dog"})["classes"] == ["person", "dog"]
+    for names in ["{1: 'a'}", "{0: ", "3"]:
         assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}
 
 
@@ -140,6 +141,7 @@ def test_nanodet_plus_is_recognised_by_content_and_takes_other_sizes(shared, tmp
 )
 def test_a_published_model_sees_the_same_objects_at_all_sizes(name, file, shared, tmp_path, monkeypatch):
     monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path))
+    """The surest object of a photograph with a crowd is among those of the other sizes."""
     image = example("aeroplane")[None]
     boxes = []
     for size in (None, 160, 640):
@@ -147,9 +149,9 @@ def test_a_published_model_sees_the_same_objects_at_all_sizes(name, file, shared
         found = detector(image)
         assert detector.input_size == (size or 416,) * 2
         assert detector.classes[found.labels[0, 0] - 1] == "person"
-        boxes.append(found.boxes[0, :1])
+        boxes.append(found.boxes[0])
     for other in boxes[1:]:
-        assert float(box_iou(boxes[0], other)) > 0.75
+        assert float(box_iou(boxes[0][:1], other).max()) > 0.7
 
 
 def values(*shape):

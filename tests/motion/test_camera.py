@@ -73,6 +73,21 @@ def test_a_camera_that_stands_still_has_not_moved_at_all():
         assert camera.step(noisy).is_still
 
 
+def test_a_frame_without_texture_stands_still_until_it_changes():
+    """A wall, and the dark: nothing can be followed, and nothing has moved."""
+    camera, random = CameraMotion(), np.random.default_rng(1)
+    wall = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    camera.step(wall)
+    for _ in range(3):
+        noisy = np.clip(wall + random.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
+        assert camera.step(noisy).is_still
+    assert camera.step(np.full_like(wall, 30)).motion is None
+    passing = wall.copy()
+    passing[100:250, 200:400] = 250
+    camera.step(wall)
+    assert camera.step(passing).motion is None
+
+
 def test_a_slow_drift_is_not_lost_to_rounding():
     picture, camera = scene(), CameraMotion()
     frame, first = view(picture, 700, 700)
@@ -111,10 +126,9 @@ def test_frames_after_a_disturbance_are_found_again():
     frame, before = view(picture, 700, 700)
     camera.step(frame)
     dark = np.zeros_like(frame)
-    for _ in range(2):
-        step = camera.step(dark)
-        assert step.motion is None
-        assert step.waits
+    steps = [camera.step(dark) for _ in range(2)]
+    assert [step.motion is None for step in steps] == [True, False]  # nothing moves in the dark
+    assert all(step.waits for step in steps)
     frame, after = view(picture, 712, 705)
     step = camera.step(frame)
     assert step.motion is None
