@@ -14,7 +14,7 @@ _UNTIMED = 0.1  # seconds of a frame that states none, as browsers show it
 
 
 def animation(path: Path, white: White | None = None) -> Iterator[tuple[Tensor, float]]:
-    """The frames of an animation, `(3, H, W)`, each with the seconds for which it is shown."""
+    """Read the frames of an animation, `(3, H, W)`, each with the seconds for which it is shown."""
     with ExitStack() as held:
         with opening(path, "opened"):
             image = held.enter_context(open_pillow(path))
