@@ -282,7 +282,7 @@ def _record(
             if not read:
                 raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
             began = time.monotonic()
-            if is_file or not _reopened(cv2, recorder, source):
+            if is_file or isinstance(source, Path) or not _reopened(cv2, recorder, source):
                 stated = frames_stated(source, container, total) if isinstance(source, Path) else 0
                 # AVI counts the frames that a film leaves out, too, over which its time stamps go.
                 seen = max(read + gaps["lost"], clock.frames if container == "avi" else 0)
