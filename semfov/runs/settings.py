@@ -96,7 +96,8 @@ def load_yaml(text: str) -> Any:
     depth = 0
     for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):
-            raise yaml.YAMLError(f"line {event.start_mark.line + 1}: expected values, got the alias *{event.anchor}")
+            line = "" if event.start_mark is None else f"line {event.start_mark.line + 1}: "
+            raise yaml.YAMLError(f"{line}expected values, got the alias *{event.anchor}")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
             raise yaml.YAMLError(f"expected lists and objects at most {_DEEPEST} deep, got deeper ones")
