@@ -53,7 +53,7 @@ class StreamConfig(Settings):
         frames: number of frames of a flight.
         every: each of so many frames is judged.
         after: the figures of all judged frames leave out those up to this one.
-        rate: rate at which the agent forgets looks, per frame.
+        rate: rate at which the agent forgets looks, per second of 25 frames.
         seed: random seed of the flights.
         out: folder for tables and records.
     """
@@ -71,7 +71,7 @@ class StreamConfig(Settings):
     frames: Count = 48
     every: Count = 8
     after: Whole = 8
-    rate: Positive = 0.03
+    rate: Positive = 0.75
     seed: Seed = 0
     out: Path = Path("runs/stream")
 
