@@ -227,6 +227,7 @@ SHARES = {
         "almost twice as many objects": ("0.312", "0.159"),
     },
     "docs/pan-tilt.md": {"a tenth of its field of view": "a rule"},
+    "docs/measurements/stream.md": {"a fifth of it": "a setting"},
     "docs/measurements/zoom.md": {
         "One of four boxes": ("0.250", 1),
         "less than half of themselves": "visibility in the annotations of the street",
