@@ -75,6 +75,8 @@ def test_a_record_is_compared_by_itself_and_printed_as_a_table():
     assert table == compare_scanpath(scanpath.as_fixations("a.jpg"), others)
     assert str(table).splitlines()[0].split() == ["measure", "scanpath", "people"]
     assert len(str(table).splitlines()) == 1 + len(table)
+    assert replace(scanpath, source="folder/a.png").compare(others) == table
+    refused("people: expected fixations in 'b', got in 'a.jpg'", replace(scanpath, source="b.png").compare, others)
 
 
 def test_people_are_given_as_one_record_or_as_a_table(tmp_path):
