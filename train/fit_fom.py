@@ -24,8 +24,10 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
+from semfov.errors import check
 from semfov.fit.observation import count_misses, fit_published, statistics_of
 from semfov.fit.settings import FitConfig
+from semfov.fit.through_belief import fit_through_belief, mean_landing_loss, searched_looks, starting_model
 from semfov.fit.training import split
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
@@ -56,7 +58,11 @@ class FitFomConfig(FitConfig):
         method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
             and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
             `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
-            calibration is about.
+            calibration is about. `search` starts from it, and learns through the belief where the target of a search
+            is (`semfov.fit.through_belief`): exponents, odds of a miss and refutation.
+        steps: number of steps of the fit through the belief.
+        looks: most looks in a search of this fit.
+        max_target_area: classes that cover a larger share of the image are not searched for in this fit.
         mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
             input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
             `width` and `sensor` are ignored.
@@ -80,7 +86,10 @@ class FitFomConfig(FitConfig):
         cache: folder for the labelled detections (None: `out`).
     """
 
-    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    method: Literal["newton", "fixed_point", "gradient", "discriminative", "search"] = "discriminative"
+    steps: Count = 200
+    looks: Count = 8
+    max_target_area: Positive = 0.2
     mosaics: Whole = 0
     fixations: Count = 8
     levels: Annotated[int, Range(1, 1000)] = 8
@@ -197,6 +206,7 @@ def _write_report(
     model: FovealObservationModel,
     models: _Models,
     judged: Samples,
+    landing: str,
 ) -> list[Path]:
     """Evaluate the models (the fitted one last) on held-out samples, print the tables, and write all files."""
     with torch.inference_mode():
@@ -207,7 +217,7 @@ def _write_report(
         }
     figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
     by_level = _figures_by_level(model, predictions, judged)
-    text = _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
+    text = landing + _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
@@ -236,8 +246,29 @@ def _write_report(
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
 
 
+def _fit_to_search(
+    config: FitFomConfig, sampler: Sampler, model: FovealObservationModel
+) -> tuple[FovealObservationModel, str]:
+    """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
+    searches = {}
+    for shard in sampler.by_shard():
+        searches |= searched_looks(sampler.scenes, shard, (10, 10), config.max_target_area)
+    fitted = [each for index, each in searches.items() if index % config.holdout]
+    judged = [each for index, each in searches.items() if index % config.holdout == 0]
+    options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}
+    better = fit_through_belief(model, fitted, **options, search={**options, "photographs": len(fitted)})
+    if not judged:
+        return better, ""
+    losses = [mean_landing_loss(each, judged, config.looks) for each in (starting_model(model), better)]
+    return better, (
+        f"Searches of {len(judged)} held-out photographs: the negative log of the target's share of the belief in "
+        f"cells not fixated yet is {losses[1]:.3f} on average, before the fit through the belief {losses[0]:.3f}.\n\n"
+    )
+
+
 def fit_fom(config: FitFomConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
+    check(not (config.mosaics and config.method == "search"), "method", "another one with mosaics", config.method)
     folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
     sampler = collect_samples(config, folder, "looking", kind)
     samples = sampler.drawn(config.most)
@@ -247,7 +278,7 @@ def fit_fom(config: FitFomConfig) -> None:
     statistics = statistics_of(edges, classes, training)
     noted = {name: getattr(config, name) for name in ("minimum", "shrinkage", "enough", "fixations", "seed")}
     published = partial(fit_published, sampler.eye, sampler.scenes, statistics, edges, **noted)
-    if config.method == "discriminative":
+    if config.method in ("discriminative", "search"):
         fitted, start = samples[~held_out], published(expected="empirical")
         model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
     else:
@@ -260,6 +291,9 @@ def fit_fom(config: FitFomConfig) -> None:
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
+    landing = ""
+    if config.method == "search":
+        model, landing = _fit_to_search(config, sampler, model)
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
@@ -268,9 +302,9 @@ def fit_fom(config: FitFomConfig) -> None:
         models[f"Dirichlet, {method}"] = published(method=method)
     models["Dirichlet with class prior"] = published(prior=True)
     models["the same, tempered 0.1"] = published(prior=True, tempering=0.1)
-    if config.method == "discriminative":
-        models["discriminative"] = model
-    written = _write_report(config, model, models, samples[held_out])
+    if config.method in ("discriminative", "search"):
+        models[config.method] = model
+    written = _write_report(config, model, models, samples[held_out], landing)
     print("written:")
     for file in [path, *written]:
         print(f"  {file}")

@@ -27,6 +27,7 @@ class SearchConfig(ComparedConfig):
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
             `published` (predictive-calibrated), `target-evidence`, `random`, `vocus2`, `itti-koch`, `people`;
+            `non-predictive-fitted` (an observation model fitted through the belief);
             and `non-predictive` (also called `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
             `place-information`, `entropy-limit` or `ideal-observer`, each followed by `-raw` or `-calibrated`. The last
             four also take `-learned`, which uses the same evidence as `target-evidence`;

@@ -1,7 +1,6 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -53,18 +52,11 @@ def hit_rates(
         targets = legal_targets(annotation, config.max_target_area)
         if len(annotation.labels) < least or not targets:
             continue
-        looks = slice(index * config.fixations, (index + 1) * config.fixations)
-        bounds = torch.searchsorted(samples.look, torch.arange(looks.start, looks.stop + 1)).tolist()
-        detections = Detections.stack(
-            [
-                Detections(samples.boxes[None, a:b], samples.scores[None, a:b], torch.ones(1, b - a, dtype=torch.bool))
-                for a, b in pairwise(bounds)
-            ]
-        )
+        detections, fixations = samples.looks_at(index)
         grid = Grid(config.columns, config.rows, annotation.size)
         covered = grid.footprint(annotation.boxes)
         goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
-        share = hit_rate(observer, detections, samples.fixations[looks], grid, torch.tensor(targets), goal)
+        share = hit_rate(observer, detections, fixations, grid, torch.tensor(targets), goal)
         if share is not None:
             rates[index] = share
     return rates

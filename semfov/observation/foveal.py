@@ -36,9 +36,10 @@ class FovealObservationModel(Pretrained):
 
     With `τ = 1` and a uniform π, the defaults of `fit`, these are the published calibrated scores (equation 11). They
     are overconfident: the density treats its K+1 components as independent evidence, while most scores of a detection
-    are near zero together. A class prior and τ < 1 help. The recommended models use `fit_discriminative`, which trains
-    α and π for the posterior itself. The paper gives neither the number of levels nor their borders, nor its treatment
-    of scores of 0: `edges` and `epsilon` are our choice.
+    are near zero together. A class prior and τ < 1 help, and each level may have an exponent that multiplies τ. The
+    recommended models use `fit_discriminative`, which trains α and π for the posterior itself; `fit_through_belief`
+    trains all parameters for searches. The paper gives neither the number of levels nor their borders, nor its
+    treatment of scores of 0: `edges` and `epsilon` are our choice.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. The model with `α_k = 1 + e_k`, τ = 1
     and a uniform prior therefore returns the scores unchanged (`identity`).
@@ -55,11 +56,20 @@ class FovealObservationModel(Pretrained):
             the scores, as after `fit_discriminative`; None takes the mean of Dir(α).
         miss_rate: `(K+1, N)`, probability that nothing is detected in a cell of each class (background first) at each
             level of distance (`MissCounts.rates`); None if it is not known.
+        exponents: `(N,)`, positive, exponents of the likelihood at each level, in addition to τ; None is 1 at all, as
+            published.
+        miss_odds: `(K+1, N)`, positive, how probable it is that nothing is detected in a cell of each class, relative
+            to background (`Semantic(association="one")`); None takes them from `miss_rate`.
+        refutation: ρ, from 0 to 1, share by which a detection loses weight once a cell that it covers was fixated
+            (`Semantic(association="one")`); 0 is as published.
         metadata: JSON values that are saved with the model: `detector` and `sensor` (the settings that it was fitted
             for), `counts`, and further information.
 
     Attributes:
-        log_alpha: the learnable parameter, `ln α`.
+        log_alpha: `ln α`, a learnable parameter, as are `log_prior` and the following.
+        log_exponents: `(N,)`, logarithm of the exponents.
+        log_miss: `(K+1, N)`, logarithm of the odds of a miss; None if they are not known.
+        refutation: `()`, ρ.
 
     Raises:
         InputError: a shape does not fit, or a value is out of range.
@@ -80,11 +90,13 @@ class FovealObservationModel(Pretrained):
             "tempering": Field((), above=0, high=_MOST_TEMPERING),
             "expected": Field(("K+1", "N", "K+1"), low=0, high=1, simplex=True, optional=True),
             "miss_rate": Field(("K+1", "N"), low=0, high=1, optional=True),
+            "log_exponents": Field(("N",), low=-10, high=10, optional=True),
+            "log_miss": Field(("K+1", "N"), low=-50, high=50, optional=True),
+            "refutation": Field((), low=0, high=1, optional=True),
         },
         {"classes": CLASSES, "epsilon": Number(above=0, high=1)},
     )
     edges: Tensor
-    log_prior: Tensor
     tempering: Tensor
     expected: Tensor | None
     miss_rate: Tensor | None
@@ -100,6 +112,9 @@ class FovealObservationModel(Pretrained):
         tempering: float = 1.0,
         expected: Tensor | None = None,
         miss_rate: Tensor | None = None,
+        exponents: Tensor | None = None,
+        miss_odds: Tensor | None = None,
+        refutation: float | Tensor = 0.0,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -121,21 +136,32 @@ class FovealObservationModel(Pretrained):
         self.metadata = dict(metadata or {})
         self.log_alpha = nn.Parameter(alpha.detach().log())
         self.register_buffer("edges", borders)
+        given: dict[str, Tensor] = {}
         for name, table, size in [
             ("log_prior", log_prior, shape[:2]),
             ("expected", expected, shape),
             ("miss_rate", miss_rate, shape[:2]),
+            ("exponents", exponents, shape[1:2]),
+            ("miss_odds", miss_odds, shape[:2]),
         ]:
             if table is not None:
                 check(tuple(table.shape) == size, name, f"shape {size}", tuple(table.shape))
                 check_finite(table, name)
-                unlikely = name == "miss_rate" and not bool(((table >= 0) & (table <= 1)).all())
-                check(not unlikely, name, "probabilities", "numbers outside [0, 1]")
-                table = table.detach().to(alpha).clone()
-            elif name == "log_prior":
-                table = alpha.new_zeros(size)
-            self.register_buffer(name, table)
+                given[name] = table.detach().to(alpha).clone()
+        for name in given.keys() & {"exponents", "miss_odds"}:
+            check(bool((given[name] > 0).all()), name, "positive numbers", float(given[name].min()))
+        rates, share = given.get("miss_rate"), torch.as_tensor(refutation).detach().to(alpha).clone()
+        unlikely = rates is not None and not bool(((rates >= 0) & (rates <= 1)).all())
+        check(not unlikely, "miss_rate", "probabilities", "numbers outside [0, 1]")
+        check(0 <= float(share) <= 1, "refutation", "a number from 0 to 1", refutation)
+        self.register_buffer("expected", given.get("expected"))
+        self.register_buffer("miss_rate", rates)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
+        self.log_prior = nn.Parameter(given.get("log_prior", alpha.new_zeros(shape[:2])))
+        self.log_exponents = nn.Parameter(given.get("exponents", alpha.new_ones(shape[1:2])).log())
+        odds = given.get("miss_odds")
+        self.log_miss = None if odds is None else nn.Parameter(odds.log())
+        self.refutation = nn.Parameter(share)
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -225,8 +251,10 @@ class FovealObservationModel(Pretrained):
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
         """
-        logits = self.log_likelihood(scores, distance) * self.tempering
-        return (logits + F.embedding(self._level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
+        level = self._level(distance)
+        exponents = self.tempering * self.log_exponents.exp()[level][..., None]
+        logits = self.log_likelihood(scores, distance) * exponents
+        return (logits + F.embedding(level, self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
         """Expected score vector of every class at every level, `E[S | C = k, d]`.
@@ -254,6 +282,29 @@ class FovealObservationModel(Pretrained):
         if self.miss_rate is None:
             raise InputError("miss_rate: expected a model fitted with miss rates (`train.fit_fom`), got one without")
         return F.embedding(self.level(distance), self.miss_rate.t())
+
+    def miss_odds(self, distance: Tensor) -> Tensor:
+        """Odds of a miss: how probable it is that nothing is detected, for every class relative to background.
+
+        Args:
+            distance: `(...)`, in units of the image's longer side.
+
+        Returns:
+            `(..., K+1)`, 1 for background; differentiable in `log_miss`. A model without learned odds takes the ratio
+            of its miss rates.
+
+        Raises:
+            InputError: the model has neither odds of a miss nor miss rates.
+
+        >>> rates = torch.tensor([[0.8], [0.2]])  # of background and of the cup
+        >>> FovealObservationModel.identity(["cup"], [], miss_rate=rates).miss_odds(torch.zeros(1))
+        tensor([[1.0000, 0.2500]])
+        """
+        if self.log_miss is None:
+            rates = self.miss_likelihood(distance)
+            return rates / rates[..., :1]
+        odds = (self.log_miss - self.log_miss[:1]).exp()
+        return F.embedding(self.level(distance), odds.t())
 
     forward = calibrate
 
@@ -351,9 +402,11 @@ class FovealObservationModel(Pretrained):
             epsilon=record["epsilon"],
             expected=tensors.get("expected"),
             miss_rate=tensors.get("miss_rate"),
+            miss_odds=tensors["log_miss"].exp() if "log_miss" in tensors else None,
             metadata=record["metadata"],
         )
-        model.load_state_dict(tensors)
+        # Files from before these parameters lack them: then they have the paper's values.
+        model.load_state_dict({**model.state_dict(), **tensors})
         return model
 
     @classmethod
@@ -436,6 +489,9 @@ class FoldedObservationModel(FovealObservationModel):
             tempering=float(model.tempering),
             expected=model.expected_scores(),
             miss_rate=model.miss_rate,
+            exponents=model.log_exponents.exp(),
+            miss_odds=None if model.log_miss is None else model.log_miss.exp(),
+            refutation=model.refutation,
             metadata=model.metadata,
         )
         with torch.no_grad():

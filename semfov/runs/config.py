@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import CellMemory
+from semfov.belief.observers import Association, CellMemory
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.yolo import Runtime
 from semfov.errors import lookup
@@ -16,7 +16,7 @@ from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch", "people"]
-Scores = Literal["raw", "calibrated", "learned"]
+Scores = Literal["raw", "calibrated", "learned", "fitted"]
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,12 @@ class BeliefConfig(Settings):
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected, with the miss rates of the observation model.
+        association: fuse `each` detection that covers a cell (published), or take at most `one` of a look to show the
+            object of a cell (needs misses).
         model: fitted observation model, by name or file (None: the one shipped for the detector and sensor; for a
             published sensor it is the published one, for others one of our own).
+        search_model: observation model fitted through the belief, by name or file (None: the one shipped for the
+            detector).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
         map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
     """
@@ -171,7 +175,9 @@ class BeliefConfig(Settings):
     tempering: Positive = 1.0
     memory: CellMemory = "all"
     misses: bool = False
+    association: Association = "each"
     model: str | None = None
+    search_model: str | None = None
     target_model: str | None = None
     map_model: str | None = None
 
@@ -187,11 +193,12 @@ class PolicyConfig(Settings):
             cell), or `target-evidence` (uses the learned evidence for the target).
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
             first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
-            evidence in searches.
+            evidence in searches; `fitted` passes them through an observation model that was fitted through the belief.
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected.
+        association: fuse `each` detection that covers a cell, or take at most `one` to show the object of a cell.
         saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2`,
             `itti-koch`, or `people`, the density of fixations from the features of the detector (`FixationDensity`).
         samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
@@ -205,6 +212,7 @@ class PolicyConfig(Settings):
     footprint: Footprint | None = None
     memory: CellMemory | None = None
     misses: bool | None = None
+    association: Association | None = None
     saliency: SaliencyModel | None = None
     samples: Annotated[int, Range(1, 100_000)] | None = None
 

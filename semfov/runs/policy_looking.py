@@ -18,7 +18,7 @@ from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.looking import Looking
 from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
 from semfov.runs.scene_run import SceneRun, digest_of
-from semfov.runs.setup import make_learned, make_observation
+from semfov.runs.setup import make_fitted, make_learned, make_observation
 from semfov.strategy import Strategy
 
 
@@ -65,7 +65,7 @@ class PolicyLooking(Looking):
         return {
             **super().depends_on(),
             "task": self.task,
-            "models": [models.observation, models.evidence, models.map],
+            "models": [models.observation, models.fitted, models.evidence, models.map],
             "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
             "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
             "policies": policies,
@@ -78,6 +78,7 @@ class _Models(NamedTuple):
     """Fitted models that the policies of a run need; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
+    fitted: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
     map: MapEvidence | None = None
 
@@ -86,6 +87,8 @@ def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
     """Load a model that a policy needs, and check that it was fitted for the detector and the sensor."""
     if name == "observation":
         return make_observation(belief.model, eye)
+    if name == "fitted":
+        return make_fitted(belief.search_model, eye)
     if name == "evidence":
         return make_learned(TargetEvidence, belief.target_model, eye)
     return make_learned(MapEvidence, belief.map_model, eye)
@@ -118,7 +121,9 @@ def _make_strategy(
         return Strategy(Target(model("evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(model("map")), chosen)
-    names = ("footprint", "tempering", "memory", "misses")
+    if policy.scores == "fitted":
+        return Strategy(Semantic.searching(model("fitted")), chosen)
+    names = ("footprint", "tempering", "memory", "misses", "association")
     common_or_own = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in names}
     common_or_own["misses"] = model("observation") if common_or_own["misses"] else None
     observation = model("observation") if calibrated else None

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import get_args
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import CellMemory
+from semfov.belief.observers import Association, CellMemory
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Static, Uniform
@@ -17,7 +17,13 @@ from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 TARGET_EVIDENCE = "target-evidence"
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
-_WORDS = {"scores": Scores, "footprint": Footprint, "memory": CellMemory, "saliency": SaliencyModel}
+_WORDS = {
+    "scores": Scores,
+    "footprint": Footprint,
+    "memory": CellMemory,
+    "association": Association,
+    "saliency": SaliencyModel,
+}
 """Settings with a fixed set of values."""
 
 _ALIASES = ("recommended", "published")
@@ -26,7 +32,7 @@ _ALIASES = ("recommended", "published")
 _MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 """Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
 
-_OF_THE_MAP = ("tempering", "footprint", "memory", "misses")  # settings of the map of all classes
+_OF_THE_MAP = ("tempering", "footprint", "memory", "misses", "association")  # settings of the map of all classes
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
@@ -41,6 +47,7 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
         # The scores do not matter to these: no belief guides them, or one of their own.
         alone = {name: PolicyConfig(name) for name in (Uniform.name, TARGET_EVIDENCE)}
         alone |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief} | salient
+        alone["non-predictive-fitted"] = PolicyConfig("non-predictive", "fitted")
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: policy for name, policy in plain.items() if name not in alone}
         alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if FUNCTIONS[name].by_place}
@@ -85,7 +92,7 @@ def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
-    if choice.scores == "learned" or choice.policy == TARGET_EVIDENCE:
+    if choice.scores in ("learned", "fitted") or choice.policy == TARGET_EVIDENCE:
         conflict = next((setting for setting in _OF_THE_MAP if getattr(choice, setting) is not None), None)
         if conflict is not None:
             raise InputError(

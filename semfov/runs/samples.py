@@ -36,6 +36,17 @@ class Samples:
         """Index of the scene of each detection, `(M,)`."""
         return self.scenes[self.look]
 
+    def looks_at(self, index: int) -> tuple[Detections, Tensor]:
+        """All looks at one scene, R of them: their detections, a batch of R, and their fixations `(R, 2)`."""
+        numbers = (self.scenes == index).nonzero()[:, 0]
+        firsts = torch.searchsorted(self.look, numbers).tolist()
+        ends = torch.searchsorted(self.look, numbers + 1).tolist()
+        looks = []
+        for first, end in zip(firsts, ends, strict=True):
+            boxes, scores = self.boxes[None, first:end], self.scores[None, first:end]
+            looks.append(Detections(boxes, scores, torch.ones(1, end - first, dtype=torch.bool)))
+        return Detections.stack(looks), self.fixations[numbers]
+
     @classmethod
     @torch.inference_mode()
     def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> "Samples":

@@ -104,6 +104,13 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     return model.requires_grad_(False)
 
 
+def make_fitted(name: str | None, eye: Eye) -> FovealObservationModel:
+    """Load an observation model that was fitted through the belief: by name, or the one shipped for the eye."""
+    if name is None:
+        name = shipped_model(FovealObservationModel, f"{observation_name(eye)}-search", "MODEL")
+    return make_observation(name, eye)
+
+
 def observation_name(eye: Eye) -> str:
     """Name of the observation model that is shipped for an eye: the published one, or ours for the fovea's growth."""
     detector, settings = eye.detector, eye.sensor.settings()

@@ -117,7 +117,7 @@ def test_calls_use_the_current_parameters():
     with torch.inference_mode():
         first = model.calibrate(scores, distance)
         assert torch.equal(model.calibrate(scores, distance), first)
-    optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
+    optimiser = torch.optim.SGD([model.log_alpha], lr=1.0)
     model.calibrate(scores.requires_grad_(), distance)[..., 0].sum().backward()
     optimiser.step()
     with torch.no_grad():

@@ -1,13 +1,14 @@
 """The paper's observer: a Dirichlet belief about all classes in every cell."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, fields, replace
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from semfov.belief.association import one_of, refuted
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.evidence import farther
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
@@ -19,6 +20,10 @@ from semfov.errors import check, lookup
 from semfov.observation.foveal import FovealObservationModel
 
 CellMemory = Literal["all", "closest"]
+Association = Literal["each", "one"]
+
+_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
+_WEAK = 1e-5  # Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
@@ -30,21 +35,41 @@ class SemanticLook(Look):
     distance: Tensor
 
     @classmethod
-    def join(cls, looks: Sequence["SemanticLook"]) -> "SemanticLook":
+    def join(cls, looks: Sequence[Self]) -> Self:
         """Concatenate several batches of looks, padded to the largest number of detections."""
         most = max(look.likelihood.shape[-2] for look in looks)
-        likelihood, footprint = (
-            torch.cat([pad(each, (0, 0, 0, most - each.shape[-2])) for each in values])
-            for values in ([look.likelihood for look in looks], [look.footprint for look in looks])
-        )
-        return cls(likelihood, footprint, torch.cat([look.distance for look in looks]))
+
+        def joined(name: str) -> Tensor:
+            values = [getattr(look, name) for look in looks]
+            by_detection = name in ("likelihood", "footprint", "covered")
+            return torch.cat([pad(each, (0, 0, 0, most - each.shape[-2])) if by_detection else each for each in values])
+
+        return cls(*(joined(each.name) for each in fields(cls)))
+
+
+@dataclass(frozen=True)
+class AssociatedLook(SemanticLook):
+    """Looks of which one detection may show the object of a cell; likelihoods are relative to background.
+
+    `covered` `(B, L, X·Y)` are the cells under each detection, and `fixated` `(B,)` is the fixated cell.
+    """
+
+    covered: Tensor
+    fixated: Tensor
+
+
+@dataclass(frozen=True)
+class AssociatedBelief(DirichletBelief):
+    """A Dirichlet belief that knows which cells were fixated, `(B, X·Y)`."""
+
+    visited: Tensor = None  # type: ignore[assignment]
 
 
 class Semantic(Observer):
     r"""The paper's observer: a Dirichlet over all classes in every cell, updated by every detection that covers it.
 
-    Three options are not in the paper. They exist because looks at a static scene are not independent, and because
-    cells without detections are evidence, too:
+    Four options are not in the paper. They exist because looks at a static scene are not independent, because cells
+    without detections are evidence, too, and because a cell is shown by one of several detections:
 
     - `tempering` τ: the likelihood λ is replaced by `λ^τ` (`likelihoods`).
     - `memory="closest"`: the belief about a cell comes from its closest look alone; a closer look replaces it,
@@ -52,6 +77,9 @@ class Semantic(Observer):
       .. math:: \beta(x) \leftarrow \mathrm{fuse}(\beta_0, \lambda) \quad \text{if } d(x, f) < \min_{f' < f} d(x, f')
 
     - `misses`: cells without detections are updated with the miss rate of each class at their distance.
+    - `association="one"`: a look has one likelihood for each cell, in which detections and a miss are alternatives
+      (`semfov.belief.association`), and it is fused once. Detections that cover fixated cells lose weight by the
+      `refutation` of `misses`: the belief is that of a search, which goes on only if it has not seen its target.
 
     Args:
         components: K + 1, number of classes with background.
@@ -62,9 +90,12 @@ class Semantic(Observer):
         tempering: exponent τ of the likelihoods, positive.
         memory: `all` fuses all looks, as published; `closest` keeps only the closest look at each cell.
         misses: model of the miss rates; None makes no update in cells without detections.
+        association: `each` fuses every detection that covers a cell, as published; `one` takes at most one of them to
+            show the object, and needs `misses`.
 
     Raises:
-        InputError: `prior` is not positive, or the fusion rule or the memory is unknown.
+        InputError: `prior` is not positive, the fusion rule, the memory or the association is unknown, or `misses` is
+            missing.
 
     >>> from semfov import Detections
     >>> grid, fixation = Grid(2, 1, (10, 10)), torch.tensor([[2.0, 2.0]])
@@ -88,11 +119,14 @@ class Semantic(Observer):
         tempering: float = 1.0,
         memory: CellMemory = "all",
         misses: FovealObservationModel | None = None,
+        association: Association = "each",
     ) -> None:
         super().__init__()
         check(prior > 0, "prior", "a positive number", prior)
         lookup(fusion, RULES, "fusion rule")
         lookup(memory, get_args(CellMemory), "memory")
+        lookup(association, get_args(Association), "association")
+        check(association == "each" or misses is not None, "misses", "a model for association='one'", None)
         self.components = components
         self.observation = observation
         self.prior = prior
@@ -101,29 +135,78 @@ class Semantic(Observer):
         self.tempering = tempering
         self.memory: CellMemory = memory
         self.misses = misses
+        self.association: Association = association
+
+    @classmethod
+    def searching(cls, model: FovealObservationModel) -> Self:
+        """Make the observer of a search whose model was fitted through the belief (`fit_through_belief`).
+
+        Args:
+            model: calibrates the scores, and has the odds of a miss and the refutation.
+
+        Returns:
+            An observer with `association="one"`, the closest look at each cell, and a prior that one look outweighs.
+        """
+        components = len(model.classes) + 1
+        return cls(
+            components,
+            model,
+            prior=_WEAK,
+            footprint="box_centre",
+            memory="closest",
+            misses=model,
+            association="one",
+        )
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
         """The prior in every cell."""
-        return DirichletBelief(like.new_full((batch, len(grid), self.components), self.prior))
+        beta = like.new_full((batch, len(grid), self.components), self.prior)
+        if self.association == "each":
+            return DirichletBelief(beta)
+        return AssociatedBelief(beta, visited=torch.zeros_like(beta[..., 0], dtype=torch.bool))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SemanticLook:
         """Likelihoods of the detections (`likelihoods`), the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.observation, tempering=self.tempering)
         cells = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
-        return SemanticLook(scale_covering(likelihood, cells), cells, grid.distance(fixation).to(likelihood))
+        distance = grid.distance(fixation).to(likelihood)
+        if self.association == "each":
+            return SemanticLook(scale_covering(likelihood, cells), cells, distance)
+        ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
+        covered = grid.footprint(detections.boxes) * detections.mask[..., None]
+        return AssociatedLook(ratio, cells, distance, covered, grid.cell_of(fixation))
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
         belief, look = dirichlet_belief(belief), own(look, SemanticLook, "look")
         before = belief.beta if self.memory == "all" else torch.full_like(belief.beta, self.prior)
-        fused = fuse_scaled(before, look.likelihood.to(before.dtype), look.footprint, self.fusion)
-        if self.misses is not None:
-            nothing = ~(look.footprint > 0).any(-2)
-            unseen = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
-            fused = torch.where(nothing[..., None], unseen, fused)
+        changes = {}
+        if self.association == "each":
+            fused = self._fuse_each(before, look)
+        else:
+            fixated = own(look, AssociatedLook, "look").fixated[:, None]
+            changes["visited"] = own(belief, AssociatedBelief, "belief").visited.scatter(1, fixated, True)
+            fused = self._fuse_one(before, own(look, AssociatedLook, "look"), changes["visited"])
         if self.memory == "closest":
             fused = torch.where((look.distance < belief.closest)[..., None], fused, belief.beta)
-        return DirichletBelief(fused, torch.minimum(belief.closest, look.distance))
+        return replace(belief, beta=fused, closest=torch.minimum(belief.closest, look.distance), **changes)
+
+    def _fuse_each(self, before: Tensor, look: SemanticLook) -> Tensor:
+        """Fuse the detections one after another, and misses in cells without any; before `(B, X·Y, K+1)`."""
+        fused = fuse_scaled(before, look.likelihood.to(before.dtype), look.footprint, self.fusion)
+        if self.misses is None:
+            return fused
+        nothing = ~(look.footprint > 0).any(-2)
+        unseen = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
+        return torch.where(nothing[..., None], unseen, fused)
+
+    def _fuse_one(self, before: Tensor, look: AssociatedLook, visited: Tensor) -> Tensor:
+        """Fuse one likelihood for each cell, in which all detections of a look and a miss are alternatives."""
+        assert self.misses is not None
+        ratio, footprint, covered = (each.to(before) for each in (look.likelihood, look.footprint, look.covered))
+        weight = refuted(footprint, covered, visited, self.misses.refutation.clamp(0, 1).to(before))
+        likelihood = one_of(ratio, weight, self.misses.miss_odds(look.distance).to(before))
+        return RULES[self.fusion](before, likelihood / likelihood.amax(-1, keepdim=True))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
         r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
@@ -133,7 +216,9 @@ class Semantic(Observer):
         belief = dirichlet_belief(belief)
         if keep == 1:
             return belief
-        return DirichletBelief(self.prior + keep * (belief.beta - self.prior), belief.closest + farther(keep))
+        changes = {"visited": visited} if isinstance(belief, AssociatedBelief) else {}
+        beta = self.prior + keep * (belief.beta - self.prior)
+        return replace(belief, beta=beta, closest=belief.closest + farther(keep), **changes)
 
     def extra_repr(self) -> str:
         """Prior, fusion rule, footprint and tempering."""

@@ -1,0 +1,240 @@
+"""One of the detections shows the object of a cell: hypotheses enumerated, loops over cells, gradients, training."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.belief.association import one_of, refuted
+from semfov.belief.observers import Semantic
+from semfov.belief.observers.semantic import AssociatedLook
+from semfov.fit.through_belief import SearchedLooks, fit_through_belief, landing_loss
+from tests.refusals import refused
+
+GRID = Grid(5, 4, (100, 80))
+FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+EDGES = [0.2, 0.5]
+CLASSES = ["cup", "cat", "dog"]
+
+
+def model(dtype=torch.float64, **settings):
+    """A model with three levels and random parameters."""
+    generator = torch.Generator().manual_seed(3)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    parameters = {
+        "log_prior": draw(4, 3),
+        "exponents": draw(3).exp(),
+        "miss_odds": (draw(4, 3) - 1).exp(),
+        "refutation": 0.8,
+    } | settings
+    return FovealObservationModel((draw(4, 3, 4) / 2).exp(), EDGES, CLASSES, **parameters)
+
+
+@pytest.fixture
+def looks(random_looks):
+    return random_looks(GRID, looks=3, most=4, components=4, dtype=torch.float64)
+
+
+def watch(observer, looks, fixations=FIXATIONS):
+    belief = observer.start(1, GRID, looks.scores)
+    said = observer.weigh(looks, fixations.to(looks.boxes), GRID)
+    for number in range(len(fixations)):
+        belief = observer.update(belief, said[number : number + 1])
+    return belief
+
+
+def test_the_likelihood_sums_over_what_each_detection_may_show():
+    """A miss, or one detection shows the object and the others are clutter: the joint density, divided by clutter's."""
+    generator = torch.Generator().manual_seed(0)
+    density = torch.rand(3, 4, generator=generator, dtype=torch.float64) + 0.1  # of three detections, by class
+    weight = torch.rand(3, generator=generator, dtype=torch.float64)
+    miss = torch.rand(4, generator=generator, dtype=torch.float64)
+    clutter = density[:, 0].prod()
+    expected = [1.0]
+    for k in (1, 2, 3):
+        joint = miss[k] * clutter
+        for shown in range(3):
+            others = [density[other, 0] for other in range(3) if other != shown]
+            joint = joint + weight[shown] * density[shown, k] * others[0] * others[1]
+        expected.append(float(joint / clutter))
+    got = one_of(density[None] / density[None, :, :1], weight[None, :, None], miss[None, None])
+    assert got.flatten().tolist() == pytest.approx(expected)
+
+
+def test_the_belief_equals_a_loop_over_cells(looks):
+    fom = model().requires_grad_(False)
+    belief = watch(Semantic.searching(fom), looks)
+    cells, prior = GRID.cell_of(FIXATIONS).tolist(), 1e-5
+    offset = torch.cdist(GRID.centres.double(), FIXATIONS.double()) / 100
+    for x in range(20):
+        closest = int(offset[x].argmin())
+        # A tie keeps the earlier look, as argmin does.
+        level = int(fom.level(offset[x, closest]))
+        likelihood = [1.0] + [float((fom.log_miss[k, level] - fom.log_miss[0, level]).exp()) for k in (1, 2, 3)]
+        for row in looks.mask[closest].nonzero()[:, 0].tolist():
+            box, scores = looks.boxes[closest, row], looks.scores[closest, row]
+            if not bool(GRID.footprint(box[None], "box_centre")[0, x]):
+                continue
+            calibrated = fom.calibrate(scores, GRID.box_distance(box[None], FIXATIONS[closest].double())[0])
+            covers = GRID.footprint(box[None])[0]
+            share = 0.2 if any(bool(covers[cell]) for cell in cells[: closest + 1]) else 1.0
+            for k in (1, 2, 3):
+                likelihood[k] += share * float(calibrated[k] / calibrated[0])
+        posterior = torch.tensor(likelihood) / sum(likelihood)
+        # With the mean of Kaplan's rule: the prior, and one observation of the posterior.
+        expected = (prior + posterior) / (1 + 4 * prior)
+        torch.testing.assert_close(belief.probabilities[0, x].float(), expected, rtol=1e-5, atol=1e-7)
+    assert belief.visited[0].nonzero()[:, 0].tolist() == sorted(cells)
+
+
+@given(st.floats(1e-6, 10.0), st.integers(1, 3))
+def test_the_order_of_the_cells_does_not_depend_on_the_prior(prior, target):
+    generator = torch.Generator().manual_seed(7)
+    corner = torch.rand(3, 4, 2, generator=generator, dtype=torch.float64) * 60
+    scores = torch.rand(3, 4, 4, generator=generator, dtype=torch.float64).softmax(-1)
+    seen = Detections(torch.cat([corner, corner + 15], -1), scores, torch.ones(3, 4).bool())
+    fom = model().requires_grad_(False)
+    options = {"footprint": "box_centre", "memory": "closest", "misses": fom, "association": "one"}
+    orders = [
+        watch(Semantic(4, fom, prior=value, **options), seen).probability(target)[0].argsort(stable=True)
+        for value in (0.5, prior)
+    ]
+    chosen = [watch(Semantic(4, fom, prior=value, **options), seen).probability(target)[0] for value in (0.5, prior)]
+    assert torch.allclose(chosen[0][orders[0]], chosen[0][orders[1]], rtol=1e-9)
+
+
+def test_refutation_takes_what_covers_a_fixated_cell(looks):
+    """With ρ = 1 a look at a covered cell is like one that shows nothing; with ρ = 0 fixations do not matter."""
+    full = Detections(torch.tensor([[[0.0, 0.0, 100.0, 80.0]]]).double(), looks.scores[:1, :1], torch.ones(1, 1).bool())
+    nothing = replace(full, mask=torch.zeros(1, 1).bool())
+    sure = Semantic.searching(model(refutation=1.0).requires_grad_(False))
+    torch.testing.assert_close(watch(sure, full, FIXATIONS[:1]).beta, watch(sure, nothing, FIXATIONS[:1]).beta)
+    weight, covered = torch.rand(2, 3, 20), torch.rand(2, 3, 20)
+    everywhere = torch.ones(2, 20, dtype=torch.bool)
+    assert torch.equal(refuted(weight, covered, everywhere, torch.tensor(0.0)), weight)
+    assert torch.equal(refuted(weight, covered, ~everywhere, torch.tensor(1.0)), weight)
+
+
+def test_gradients_flow_through_three_looks(looks):
+    fom = model()
+    # All boxes cover the cell that is fixated first.
+    boxes = looks.boxes * torch.tensor([0.0, 0, 1, 1])
+    looks = Detections(boxes, looks.scores, torch.ones_like(looks.mask))
+    observer, names = Semantic.searching(fom), [name for name, _ in fom.named_parameters()]
+    assert set(names) == {"log_alpha", "log_prior", "log_exponents", "log_miss", "refutation"}
+
+    def belief(*values):
+        class Held(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.observer = observer
+
+            def forward(self):
+                return watch(observer, looks).probability(2)
+
+        named = {f"observer.observation.{name}": value for name, value in zip(names, values, strict=True)}
+        return torch.func.functional_call(Held(), named, ())
+
+    values = [parameter.detach().clone().requires_grad_() for parameter in fom.parameters()]
+    assert torch.autograd.gradcheck(belief, values)
+    assert all(float(each.abs().sum()) > 0 for each in torch.autograd.grad(belief(*values).log().sum(), values))
+
+
+def test_looks_are_joined_and_fade(looks):
+    fom = model(torch.float32).requires_grad_(False)
+    observer = Semantic.searching(fom)
+    seen = Detections(looks.boxes.float(), looks.scores.float(), looks.mask)
+    said = observer.weigh(seen, FIXATIONS, GRID)
+    few = observer.weigh(Detections(seen.boxes[:1, :2], seen.scores[:1, :2], seen.mask[:1, :2]), FIXATIONS[:1], GRID)
+    together = AssociatedLook.join([few, said[1:]])
+    belief = observer.update(observer.start(3, GRID, seen.scores), together)
+    for row, part in enumerate((few, said[1:2], said[2:])):
+        alone = observer.update(observer.start(1, GRID, seen.scores), part)
+        torch.testing.assert_close(belief.beta[row], alone.beta[0])
+    none = torch.zeros_like(belief.visited)
+    faded = observer.fade(belief, together, 0.5, none)
+    assert not faded.visited.any()
+    torch.testing.assert_close(faded.beta, 1e-5 + 0.5 * (belief.beta - 1e-5))
+
+
+def test_an_association_needs_odds_of_a_miss():
+    refused("misses", lambda: Semantic(4, association="one"))
+    refused("association", lambda: Semantic(4, association="two", misses=model()))
+
+
+def draw_search(generator, dtype=torch.float32):
+    """Looks from all cells of a 5 × 4 grid at a cup; far from the fovea, cups are seen where there are none."""
+    cup, cat = torch.randperm(20, generator=generator)[:2].tolist()
+    centres, boxes, scores, mask = GRID.centres, [], [], []
+    for fixation in range(20):
+        rows = []
+        for cell in range(20):
+            distance = float((centres[cell] - centres[fixation]).norm() / 100)
+            chance = torch.rand(3, generator=generator).tolist()
+            if cell in (cup, cat):
+                sharp = 0.9 - 0.5 * distance
+                of = 1 if cell == cup else 2
+                if chance[0] > 0.2 + 0.5 * distance:
+                    rows.append((cell, of, sharp))
+            elif chance[1] < 0.3 * distance:
+                rows.append((cell, 1, 0.3 + 0.65 * chance[2]))
+        frame = torch.zeros(8, 4), torch.full((8, 4), 0.25), torch.zeros(8, dtype=torch.bool)
+        for number, (cell, of, score) in enumerate(rows[:8]):
+            frame[0][number] = torch.cat([centres[cell] - 5, centres[cell] + 6])
+            frame[1][number] = torch.full((4,), (1 - score) / 3).index_fill(0, torch.tensor(of), score)
+            frame[2][number] = True
+        for kept, each in zip((boxes, scores, mask), frame, strict=True):
+            kept.append(each)
+    goal = (torch.arange(20) == cup)[None]
+    seen = Detections(torch.stack(boxes).to(dtype), torch.stack(scores).to(dtype), torch.stack(mask))
+    return SearchedLooks(seen, centres, GRID, torch.tensor([1]), goal)
+
+
+def landing(observer, searches, looks=3):
+    """Mean loss over searches with three looks, from fixed orders."""
+    generator = torch.Generator().manual_seed(5)
+    orders = [torch.randperm(20, generator=generator)[:looks] for _ in searches]
+    losses = [landing_loss(observer, each, order) for each, order in zip(searches, orders, strict=True)]
+    return torch.stack([loss for loss in losses if loss is not None]).mean()
+
+
+def test_training_through_three_looks_makes_searches_better():
+    """α, misses and exponents learn from the belief after each of three looks; other scenes judge."""
+    generator = torch.Generator().manual_seed(11)
+    searches = [draw_search(generator) for _ in range(40)]
+    train, others = searches[:20], searches[20:]
+    start = FovealObservationModel.identity(CLASSES, EDGES, miss_odds=torch.full((4, 3), 0.3))
+    observer = Semantic.searching(start)
+    before = float(landing(observer, others).detach())
+    chosen = [start.log_alpha, start.log_miss, start.log_exponents]
+    optimiser = torch.optim.Adam(chosen, lr=0.05)
+    kept = [each.detach().clone() for each in chosen]
+    for _ in range(25):
+        optimiser.zero_grad()
+        landing(observer, train).backward()
+        optimiser.step()
+    after = float(landing(observer, others).detach())
+    assert all(not torch.equal(new, old) for new, old in zip(chosen, kept, strict=True))
+    assert after < before - 0.1
+
+
+def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_from():
+    generator = torch.Generator().manual_seed(12)
+    searches = [draw_search(generator) for _ in range(40)]
+    start = FovealObservationModel.identity(CLASSES, EDGES)
+    state = {name: value.clone() for name, value in start.state_dict().items()}
+    fitted = fit_through_belief(start, searches[:20], looks=4, steps=40, batch=4)
+    untrained = fit_through_belief(start, searches[:20], looks=4, steps=1, batch=1, rate=1e-9)
+    losses = [float(landing(Semantic.searching(each), searches[20:]).detach()) for each in (untrained, fitted)]
+    assert losses[1] < losses[0] - 0.1
+    assert all(torch.equal(value, state[name]) for name, value in start.state_dict().items())
+    # Classes of which 171 photographs have a few objects share what is learned.
+    odds = fitted.log_miss.detach()
+    torch.testing.assert_close(odds[1:], odds[1:2].expand(3, 3))
+    assert fitted.metadata["method"] == "search"
