@@ -33,6 +33,15 @@ def test_finetuning_raises_the_chance_of_a_hit(run):
     assert "after training" in output
 
 
+def test_the_whole_chain_learns_together(run):
+    output = run("learned_chain", "--scenes", 4, "--steps", 60)
+    losses = [float(value) for value in re.findall(r"loss ([\d.]+)", output)]
+    widths = [float(value) for value in re.findall(r"fovea ([\d.]+) px", output)]
+    assert losses[1] < losses[0]
+    assert widths[1] != widths[0]
+    assert not output.rstrip().endswith(" 0%")
+
+
 def test_foveating_keeps_the_fixated_region_sharp(run, tmp_path):
     photo, out = tmp_path / "photo.png", tmp_path / "foveated.png"
     noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)

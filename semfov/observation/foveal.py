@@ -252,8 +252,8 @@ class FovealObservationModel(Pretrained):
             InputError: shapes do not fit, or a score is negative or not finite.
         """
         level = self._level(distance)
-        exponents = self.tempering * self.log_exponents.exp()[level][..., None]
-        logits = self.log_likelihood(scores, distance) * exponents
+        exponents = self.log_exponents.exp()[level][..., None].to(scores.dtype)
+        logits = self.log_likelihood(scores, distance) * self.tempering * exponents
         return (logits + F.embedding(level, self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:

@@ -234,7 +234,7 @@ def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_f
     losses = [float(landing(Semantic.searching(each), searches[20:]).detach()) for each in (untrained, fitted)]
     assert losses[1] < losses[0] - 0.1
     assert all(torch.equal(value, state[name]) for name, value in start.state_dict().items())
-    # Classes of which 171 photographs have a few objects share what is learned.
+    # Few photographs show a rare class, so classes share what is learned.
     odds = fitted.log_miss.detach()
     torch.testing.assert_close(odds[1:], odds[1:2].expand(3, 3))
     assert fitted.metadata["method"] == "search"

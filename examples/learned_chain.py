@@ -1,0 +1,109 @@
+"""Train a fovea, a network and an observation model together, through the belief of a search.
+
+The network sees a photograph through the fovea, three times, and scores the classes in every cell. The observation
+model turns scores into likelihoods by class and distance, the belief fuses the looks, and the loss is the negative log
+of the target's share of the belief. Its gradient reaches the width of the fovea, the network and α.
+
+Run it from a checkout: python -m examples.learned_chain
+"""
+
+import argparse
+
+import torch
+from torch import Tensor, nn
+
+import semfov
+from semfov.belief.observers import Semantic
+
+COLUMNS, ROWS, LOOKS = 10, 8, 3
+Search = tuple[Tensor, int, Tensor]  # the image, the class to search for, and the cells that hold it
+
+
+class Chain(nn.Module):
+    """A fovea, a small network and an observation model, in one module.
+
+    Args:
+        classes: names of the classes.
+    """
+
+    def __init__(self, classes: tuple[str, ...]) -> None:
+        super().__init__()
+        components, edges = len(classes) + 1, [0.1, 0.2, 0.4]
+        odds = torch.full((components, len(edges) + 1), 0.1)
+        self.fovea = semfov.Foveation(40.0, learnable=True)
+        self.network = nn.Sequential(
+            nn.Conv2d(3, 16, 5, stride=4, padding=2),
+            nn.GELU(),
+            nn.Conv2d(16, 32, 5, stride=4, padding=2),
+            nn.GELU(),
+            nn.AdaptiveAvgPool2d((ROWS, COLUMNS)),
+            nn.Conv2d(32, components, 3, padding=1),
+        )
+        self.model = semfov.FovealObservationModel.identity(classes, edges, miss_odds=odds)
+
+    def forward(self, image: Tensor, cells: Tensor, target: int, goal: Tensor) -> Tensor:
+        """Search an image `(3, H, W)` from `cells` `(n,)`; returns −ln of the share of the goal `(X·Y,)`, a scalar."""
+        grid, observer = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2])), Semantic.searching(self.model)
+        belief = observer.start(1, grid, image)
+        everywhere = torch.ones(1, len(grid), dtype=torch.bool)
+        for fixation in grid.centres[cells].split(1):
+            scores = self.network(self.fovea(image[None], fixation)).flatten(2).mT.softmax(-1)
+            seen = semfov.Detections(grid.edges[None], scores, everywhere)
+            belief = observer(belief, seen, fixation, grid)
+        share = belief.probability(target)[0].index_fill(0, cells, 0.0)
+        return -((share * goal).sum() / share.sum()).log()
+
+
+def searches_in(scenes: semfov.EmbeddedScenes) -> list[Search]:
+    """List the searches in scenes."""
+    searches: list[Search] = []
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        covered = semfov.Grid(COLUMNS, ROWS, scene.size).footprint(scene.boxes)
+        searches += [(scene.image, target, covered[scene.labels == target].any(0)) for target in scenes.targets(index)]
+    return searches
+
+
+def first_looks(goal: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw cells that do not hold the target."""
+    free = (~goal).nonzero()[:, 0]
+    return free[torch.randperm(len(free), generator=generator)[:LOOKS]]
+
+
+@torch.no_grad()
+def mean_loss(chain: Chain, searches: list[Search]) -> float:
+    """Average the loss of all searches, from cells that do not change."""
+    generator = torch.Generator().manual_seed(1)
+    losses = [chain(image, first_looks(goal, generator), target, goal) for image, target, goal in searches]
+    return float(torch.stack(losses).mean())
+
+
+def train(chain: Chain, searches: list[Search], steps: int) -> None:
+    """Train all parts together."""
+    generator = torch.Generator().manual_seed(0)
+    optimiser = torch.optim.Adam(chain.parameters(), lr=0.01)
+    for _ in range(steps):
+        image, target, goal = searches[int(torch.randint(len(searches), (1,), generator=generator))]
+        loss = chain(image, first_looks(goal, generator), target, goal)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=8, help="number of embedded scenes")
+    parser.add_argument("--steps", type=int, default=200, help="number of training steps")
+    arguments = parser.parse_args()
+    torch.manual_seed(0)
+    scenes = semfov.EmbeddedScenes(("person", "boat", "truck", "car", "horse"), count=arguments.scenes)
+    searches, chain = searches_in(scenes), Chain(scenes.classes)
+    print(f"before training: loss {mean_loss(chain, searches):.2f}, fovea {float(chain.fovea.sigma.detach()):.1f} px")
+    alpha = chain.model.alpha.detach()
+    train(chain, searches, arguments.steps)
+    print(f"after training: loss {mean_loss(chain, searches):.2f}, fovea {float(chain.fovea.sigma.detach()):.1f} px")
+    print(f"α changed by up to {float((chain.model.alpha.detach() / alpha - 1).abs().max()):.0%}")
+
+
+if __name__ == "__main__":
+    main()
