@@ -143,6 +143,7 @@ def test_shipped_models_of_glimpse_evidence(path):
     torch.testing.assert_close(taper, taper.flip(0))
 
 
+SEARCHING = {"yolox-nano-search"}
 DETECTORS = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
 
 
@@ -153,7 +154,24 @@ def test_every_detector_has_all_kinds_of_models():
     kinds = ("", "-sharp", "-published", "-published-narrow", "-zoom")
     at_thresholds = {f"{name}-published-{threshold}" for name in names for threshold in (0.1, 0.25, 0.5)}
     every = {name + kind for name in names | {"nanodet-plus-m-1.5x"} for kind in kinds}
-    assert {path.stem for path in OBSERVATION} == every | at_thresholds
+    assert {path.stem for path in OBSERVATION} == every | at_thresholds | SEARCHING
+
+
+@pytest.mark.parametrize("name", sorted(SEARCHING))
+def test_models_fitted_through_the_belief_go_on_from_the_others(name):
+    """Of the same eye and α; nearer objects are missed less often, and fixated cells refute what covers them."""
+    model = semfov.FovealObservationModel.from_pretrained(name)
+    before = semfov.FovealObservationModel.from_pretrained(name.removesuffix("-search"))
+    assert torch.equal(model.log_alpha, before.log_alpha)
+    assert before.log_miss is None
+    assert not before.log_exponents.any()
+    assert float(before.refutation.detach()) == 0
+    model.check_compatible({"detector": before.metadata["detector"], "sensor": before.metadata["sensor"]})
+    odds = model.miss_odds(torch.tensor([0.0, 0.9])).detach()
+    assert bool((odds[1, 1:] > odds[0, 1:]).all())
+    assert float(model.refutation.detach()) > 0.5
+    assert model.metadata["method"] == "search"
+    assert model.metadata["search"]["photographs"] > 50
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])

@@ -198,12 +198,12 @@ class PolicyConfig(Settings):
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected.
-        association: fuse `each` detection that covers a cell, or take at most `one` to show the object of a cell.
         saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2`,
             `itti-koch`, or `people`, the density of fixations from the features of the detector (`FixationDensity`).
         samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
             `negative-entropy`, `surprise` and `two-peaks` take the expectation; null takes the look with the expected
             scores, as published. The observation model must be one of the densities of scores (`...-published`).
+        association: fuse `each` detection that covers a cell, or take at most `one` to show the object of a cell.
     """
 
     policy: str
@@ -212,9 +212,9 @@ class PolicyConfig(Settings):
     footprint: Footprint | None = None
     memory: CellMemory | None = None
     misses: bool | None = None
-    association: Association | None = None
     saliency: SaliencyModel | None = None
     samples: Annotated[int, Range(1, 100_000)] | None = None
+    association: Association | None = None
 
 
 @dataclass(frozen=True)

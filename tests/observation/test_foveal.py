@@ -111,6 +111,45 @@ def test_levels_follow_the_edges_and_the_table_is_copied():
     assert model.calibrate(torch.zeros(2, 0, 4).double(), torch.zeros(2, 0).double()).shape == (2, 0, 4)
 
 
+def test_learned_exponents_change_a_level_and_their_defaults_change_no_bit():
+    scores, distance = looks(dtype=torch.float32)
+    prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2))
+    plain = FovealObservationModel(table(torch.float32), EDGES, CLASSES, log_prior=prior, tempering=0.3)
+    logits = plain.log_likelihood(scores, distance) * plain.tempering + plain.log_prior.t()[plain.level(distance)]
+    assert torch.equal(plain.calibrate(scores, distance), logits.softmax(-1))
+    changed = torch.tensor([1.0, 0.5, 1.0])
+    model = FovealObservationModel(
+        table(torch.float32), EDGES, CLASSES, log_prior=prior, tempering=0.3, exponents=changed
+    )
+    weak = FovealObservationModel(table(torch.float32), EDGES, CLASSES, log_prior=prior, tempering=0.15)
+    middle = plain.level(distance) == 1
+    assert middle.any()
+    torch.testing.assert_close(model.calibrate(scores, distance)[middle], weak.calibrate(scores, distance)[middle])
+    assert torch.equal(model.calibrate(scores, distance)[~middle], plain.calibrate(scores, distance)[~middle])
+
+
+def test_parameters_of_a_search_are_saved_and_files_without_them_are_read(tmp_path):
+    model = FovealObservationModel(
+        table(), EDGES, CLASSES, exponents=torch.tensor([1.0, 0.5, 2.0]), miss_odds=table()[:, :, 0], refutation=0.7
+    )
+    model.save(tmp_path / "new.safetensors")
+    again = FovealObservationModel.from_pretrained(tmp_path / "new.safetensors")
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+    distance = torch.tensor([0.0, 0.2]).double()
+    expected = table()[:, [0, 1], 0].T / table()[0, [0, 1], 0][:, None]
+    torch.testing.assert_close(again.miss_odds(distance).detach(), expected)
+    old = FovealObservationModel.from_pretrained("yolox-nano-published")
+    assert old.log_miss is None
+    assert not old.log_exponents.any()
+    for name, settings in {
+        "exponents": {"exponents": torch.zeros(3)},
+        "miss_odds": {"miss_odds": -table()[:, :, 0]},
+        "refutation": {"refutation": 1.5},
+    }.items():
+        refused(name, lambda given=settings: FovealObservationModel(table(), EDGES, CLASSES, **given))
+
+
 def test_calls_use_the_current_parameters():
     model = FovealObservationModel(table(), EDGES, CLASSES).eval()
     scores, distance = looks()

@@ -161,6 +161,10 @@ def test_names_give_policy_scores_and_saliency():
     assert resolve("itti-koch-calibrated", "exploration") == PolicyConfig(
         "saliency", "calibrated", saliency="itti-koch"
     )
+    assert resolve("non-predictive-fitted", "search") == PolicyConfig("non-predictive", "fitted")
+    refused("policy", resolve, "non-predictive-fitted", "exploration")
+    fitted = PolicyConfig("non-predictive", "fitted", tempering=0.5)
+    refused("tempering", resolve, fitted, "search")
     assert resolve("recommended", "search") == PolicyConfig("target-evidence")
     assert resolve("recommended", "exploration") == PolicyConfig("closer-look", "learned")
     assert resolve("published", "search") == PolicyConfig("predictive", "calibrated")
