@@ -1,11 +1,13 @@
 """Fit an observation model through the belief, so that searches with it land on their targets sooner."""
 
+import math
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
@@ -99,23 +101,16 @@ def mean_landing_loss(model: FovealObservationModel, searches: Sequence[Searched
     return float(torch.stack([loss for loss in losses if loss is not None]).mean())
 
 
+@torch.no_grad()
 def starting_model(model: FovealObservationModel) -> FovealObservationModel:
     """Copy a model for `fit_through_belief`, with exponents, odds of a miss and refutation to start from."""
-    levels, like = len(model.edges) + 1, model.log_prior
-    return FovealObservationModel(
-        model.alpha,
-        model.edges,
-        model.classes,
-        epsilon=model.epsilon,
-        log_prior=model.log_prior,
-        tempering=float(model.tempering),
-        expected=model.expected_scores(),
-        miss_rate=model.miss_rate,
-        exponents=like.new_full((levels,), _EXPONENT),
-        miss_odds=torch.full_like(like, _MISS),
-        refutation=_REFUTATION,
-        metadata=model.metadata,
-    )
+    start = deepcopy(model)
+    start.log_exponents.fill_(math.log(_EXPONENT))
+    odds = torch.full_like(start.log_prior, math.log(_MISS))
+    odds[0] = 0.0
+    start.log_miss = nn.Parameter(odds)
+    start.refutation.fill_(_REFUTATION)
+    return start
 
 
 def fit_through_belief(

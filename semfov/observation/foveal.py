@@ -59,7 +59,7 @@ class FovealObservationModel(Pretrained):
         exponents: `(N,)`, positive, exponents of the likelihood at each level, in addition to τ; None is 1 at all, as
             published.
         miss_odds: `(K+1, N)`, positive, how probable it is that nothing is detected in a cell of each class, relative
-            to background (`Semantic(association="one")`); None takes them from `miss_rate`.
+            to background, whose row is ignored (`Semantic(association="one")`); None takes them from `miss_rate`.
         refutation: ρ, from 0 to 1, share by which a detection loses weight once a cell that it covers was fixated
             (`Semantic(association="one")`); 0 is as published.
         metadata: JSON values that are saved with the model: `detector` and `sensor` (the settings that it was fitted
@@ -251,9 +251,9 @@ class FovealObservationModel(Pretrained):
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
         """
-        level = self._level(distance)
-        exponents = self.log_exponents.exp()[level][..., None].to(scores.dtype)
-        logits = self.log_likelihood(scores, distance) * self.tempering * exponents
+        likelihood, level = self.log_likelihood(scores, distance), self._level(distance)
+        exponents = self.log_exponents.exp()[level][..., None].to(likelihood)
+        logits = likelihood * self.tempering * exponents
         return (logits + F.embedding(level, self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
@@ -303,7 +303,7 @@ class FovealObservationModel(Pretrained):
         if self.log_miss is None:
             rates = self.miss_likelihood(distance)
             return rates / rates[..., :1]
-        odds = (self.log_miss - self.log_miss[:1]).exp()
+        odds = torch.cat([torch.ones_like(self.log_miss[:1]), self.log_miss[1:].exp()])
         return F.embedding(self.level(distance), odds.t())
 
     forward = calibrate

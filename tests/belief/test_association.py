@@ -76,7 +76,7 @@ def test_the_belief_equals_a_loop_over_cells(looks):
         closest = int(offset[x].argmin())
         # A tie keeps the earlier look, as argmin does.
         level = int(fom.level(offset[x, closest]))
-        likelihood = [1.0] + [float((fom.log_miss[k, level] - fom.log_miss[0, level]).exp()) for k in (1, 2, 3)]
+        likelihood = [1.0] + [float(fom.log_miss[k, level].exp()) for k in (1, 2, 3)]
         for row in looks.mask[closest].nonzero()[:, 0].tolist():
             box, scores = looks.boxes[closest, row], looks.scores[closest, row]
             if not bool(GRID.footprint(box[None], "box_centre")[0, x]):
@@ -232,6 +232,7 @@ def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_f
     fitted = fit_through_belief(start, searches[:20], looks=4, steps=40, batch=4)
     untrained = fit_through_belief(start, searches[:20], looks=4, steps=1, batch=1, rate=1e-9)
     losses = [float(landing(Semantic.searching(each), searches[20:]).detach()) for each in (untrained, fitted)]
+    torch.testing.assert_close(untrained.miss_odds(torch.zeros(1)).detach(), torch.tensor([[1.0, *[1e-4] * 3]]))
     assert losses[1] < losses[0] - 0.1
     assert all(torch.equal(value, state[name]) for name, value in start.state_dict().items())
     # Few photographs show a rare class, so classes share what is learned.
