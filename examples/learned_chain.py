@@ -11,6 +11,7 @@ import argparse
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 import semfov
 from semfov.belief.observers import Semantic
@@ -30,11 +31,11 @@ class Chain(nn.Module):
         super().__init__()
         components, edges = len(classes) + 1, [0.1, 0.2, 0.4]
         odds = torch.full((components, len(edges) + 1), 0.1)
-        self.fovea = semfov.Foveation(40.0, learnable=True)
+        self.fovea = semfov.Foveation(10.0, levels=4, learnable=True)
         self.network = nn.Sequential(
-            nn.Conv2d(3, 16, 5, stride=4, padding=2),
+            nn.Conv2d(3, 16, 5, stride=2, padding=2),
             nn.GELU(),
-            nn.Conv2d(16, 32, 5, stride=4, padding=2),
+            nn.Conv2d(16, 32, 5, stride=2, padding=2),
             nn.GELU(),
             nn.AdaptiveAvgPool2d((ROWS, COLUMNS)),
             nn.Conv2d(32, components, 3, padding=1),
@@ -55,12 +56,13 @@ class Chain(nn.Module):
 
 
 def searches_in(scenes: semfov.EmbeddedScenes) -> list[Search]:
-    """List the searches in scenes."""
+    """List the searches in scenes, which are reduced to a quarter of their sides."""
     searches: list[Search] = []
     for index in range(len(scenes)):
         scene = scenes[index]
+        image = F.avg_pool2d(scene.image, 4)
         covered = semfov.Grid(COLUMNS, ROWS, scene.size).footprint(scene.boxes)
-        searches += [(scene.image, target, covered[scene.labels == target].any(0)) for target in scenes.targets(index)]
+        searches += [(image, target, covered[scene.labels == target].any(0)) for target in scenes.targets(index)]
     return searches
 
 
