@@ -112,8 +112,9 @@ class FitFomConfig(FitConfig):
 
 
 def _fitted_name(config: FitFomConfig) -> str:
-    """Name of the model that is saved, in tables."""
-    return "discriminative" if config.method == "discriminative" else f"Dirichlet, {config.method}"
+    """Name in tables of the model that is saved, or that the fit through the belief starts from."""
+    trained = config.method in ("discriminative", "search")
+    return "discriminative" if trained else f"Dirichlet, {config.method}"
 
 
 def _judgement(config: FitFomConfig, figures: dict[str, Calibration]) -> str:
@@ -291,11 +292,9 @@ def fit_fom(config: FitFomConfig) -> None:
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
-    landing = ""
-    if config.method == "search":
-        model, landing = _fit_to_search(config, sampler, model)
+    saved, landing = _fit_to_search(config, sampler, model) if config.method == "search" else (model, "")
     path = model_path(config, sampler.eye.detector.name)
-    model.save(path)
+    saved.save(path)
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
@@ -303,7 +302,7 @@ def fit_fom(config: FitFomConfig) -> None:
     models["Dirichlet with class prior"] = published(prior=True)
     models["the same, tempered 0.1"] = published(prior=True, tempering=0.1)
     if config.method in ("discriminative", "search"):
-        models[config.method] = model
+        models["discriminative"] = model
     written = _write_report(config, model, models, samples[held_out], landing)
     print("written:")
     for file in [path, *written]:
