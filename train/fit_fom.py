@@ -27,7 +27,13 @@ from torch import Tensor
 from semfov.errors import check
 from semfov.fit.observation import count_misses, fit_published, statistics_of
 from semfov.fit.settings import FitConfig
-from semfov.fit.through_belief import fit_through_belief, mean_landing_loss, searched_looks, starting_model
+from semfov.fit.through_belief import (
+    SearchedLooks,
+    fit_through_belief,
+    mean_landing_loss,
+    searched_looks,
+    starting_model,
+)
 from semfov.fit.training import split
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text
@@ -251,7 +257,7 @@ def _fit_to_search(
     config: FitFomConfig, sampler: Sampler, model: FovealObservationModel
 ) -> tuple[FovealObservationModel, str]:
     """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
-    searches = {}
+    searches: dict[int, SearchedLooks] = {}
     for shard in sampler.by_shard():
         searches |= searched_looks(sampler.scenes, shard, (10, 10), config.max_target_area)
     fitted = [each for index, each in searches.items() if index % config.holdout]
