@@ -16,7 +16,7 @@ from torch.nn import functional as F
 import semfov
 from semfov.belief.observers import Semantic
 
-COLUMNS, ROWS, LOOKS, BATCH = 10, 8, 3, 6
+COLUMNS, ROWS, LOOKS = 10, 8, 3
 Search = tuple[Tensor, int, Tensor]  # the image, the class to search for, and the cells that hold it
 
 
@@ -83,18 +83,18 @@ def mean_loss(chain: Chain, searches: list[Search]) -> float:
 def train(chain: Chain, searches: list[Search], steps: int) -> None:
     """Train all parts together."""
     generator = torch.Generator().manual_seed(0)
-    optimiser = torch.optim.Adam(chain.parameters(), lr=0.005)
+    optimiser = torch.optim.Adam(chain.parameters(), lr=0.01)
     for _ in range(steps):
+        image, target, goal = searches[int(torch.randint(len(searches), (1,), generator=generator))]
+        loss = chain(image, first_looks(goal, generator), target, goal)
         optimiser.zero_grad()
-        for number in torch.randint(len(searches), (BATCH,), generator=generator).tolist():
-            image, target, goal = searches[number]
-            (chain(image, first_looks(goal, generator), target, goal) / BATCH).backward()
+        loss.backward()
         optimiser.step()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=8, help="number of embedded scenes")
+    parser.add_argument("--scenes", type=int, default=6, help="number of embedded scenes")
     parser.add_argument("--steps", type=int, default=100, help="number of training steps")
     arguments = parser.parse_args()
     torch.manual_seed(0)
