@@ -37,7 +37,7 @@ def test_fit_writes_a_model_and_a_report(fitted):
     assert counts[person].sum() > 0
     assert counts[boat].sum() > 0
     report = (fitted / "report.md").read_text()
-    for word in ("raw scores", "Dirichlet, fixed_point", "uses level"):
+    for word in ("raw scores", "Dirichlet, fixed_point", "with levels"):
         assert word in report
     assert json.loads((fitted / "manifest.json").read_text())["model"]["method"] == "newton"
     assert (fitted / "reliability.png").stat().st_size > 3000
