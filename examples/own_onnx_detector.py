@@ -1,8 +1,8 @@
 """Plug in your own detector as an ONNX file, and fit an observation model to its scores away from the fovea.
 
 Run it from a checkout: python -m examples.own_onnx_detector MODEL.onnx --out model.safetensors
-Without a file, it uses that of YOLOX-nano. For real use, fit on thousands of photographs with
-`train.fit_fom`.
+Without a file, it uses that of YOLOX-nano, whose scores a few scenes cannot better. For real use, fit on thousands of
+photographs with `train.fit_fom`.
 """
 
 import argparse
