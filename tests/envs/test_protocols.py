@@ -76,7 +76,7 @@ def test_explorations_equal_the_records_of_the_evaluation(world, policy):
     records = [record for record in records if record["policy"] == scenery.policy]
     assert len(records) == len(episodes) == 6
     wanted = [(record["cells"], [right / record["object_cells"] for right in record["right"]]) for record in records]
-    assert any(len(set(results)) > 2 for _, results in wanted)
+    assert len({rate for _, rates in wanted for rate in rates}) > 1  # not the same everywhere
     for (cells, _, results), (path, rates) in zip(
         run_one_at_a_time(GazeExplore(scenery), episodes), wanted, strict=True
     ):

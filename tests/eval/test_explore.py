@@ -11,7 +11,7 @@ from eval.comparison import saliency as saliency_store
 from eval.comparison.saliency import SaliencyStore, saliency_map, saliency_table
 from eval.explore import explore
 from eval.explore.run import FUSED, PAINTED, ExploreConfig, ExploreRun
-from semfov import observers
+from semfov import Grid, observers
 from semfov.gaze.saliency import VOCUS2, FixationDensity
 from semfov.io.code import _closure
 from semfov.runs.config import DetectorConfig
@@ -113,6 +113,8 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     peak = divmod(int(seen.argmax()), seen.shape[-1])
     peak_cell = int(peak[0] * 3 / seen.shape[0]) * 4 + int(peak[1] * 4 / seen.shape[1])
     assert stored[5].argmax() == peak_cell
+    image = image[..., : 3 * (image.shape[-2] // 3), : 4 * (image.shape[-1] // 4)]  # cells of whole pixels
+    grid = Grid(4, 3, (image.shape[-1], image.shape[-2]))
     picture = saliency_table(VOCUS2(), "picture", "mean", sensor, 640.0, image, grid)
     assert picture.shape == (1, 12)
     expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
