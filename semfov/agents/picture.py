@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -55,7 +56,9 @@ class OpenedPicture:
 
     def named(self, record: Record) -> Record:
         """Name the file of the picture in a record of it."""
-        return replace(record, source=self.path)
+        named = copy(record)  # `replace` would make what a record makes when it is read
+        object.__setattr__(named, "source", self.path)
+        return named
 
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
         """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""

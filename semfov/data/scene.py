@@ -74,7 +74,7 @@ class Scenes(ABC):
     >>> from semfov.data import EmbeddedScenes
     >>> scenes: Scenes = EmbeddedScenes(("person", "cat"), count=2)
     >>> len(scenes), scenes.classes, scenes.annotation(0).size
-    (2, ('person', 'cat'), (640, 480))
+    (2, ('person', 'cat'), (640, 499))
     """
 
     classes: tuple[str, ...]

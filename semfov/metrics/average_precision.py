@@ -42,8 +42,9 @@ def average_precision(
 
     >>> cup = {"category_id": 3, "bbox": [5, 5, 20, 30], "iscrowd": 0}
     >>> file = Annotations({0: {"file_name": "a.jpg"}}, {3: {"name": "cup"}}, {0: [cup]}, "")
-    >>> average_precision(file, [{**cup, "image_id": 0, "score": 0.9}])
-    (1.0, 1.0)
+    >>> found = average_precision(file, [{**cup, "image_id": 0, "score": 0.9}])
+    >>> [round(each, 6) for each in found]
+    [1.0, 1.0]
     """
     image_ids = {
         image: number for number, image in enumerate(sorted(annotations.images if images is None else images), 1)

@@ -53,7 +53,12 @@ class AreaUnderRoc(Metric):
         self.present.append(as_outcomes(present, "present"))
 
     def sync(self, *arguments: Any, **options: Any) -> None:
-        """Join the cases of all processes, of which each takes part, even without a case (`torchmetrics.Metric`)."""
+        """Join the cases of all processes, of which each takes part, even without a case.
+
+        Args:
+            arguments: as of `torchmetrics.Metric.sync`.
+            options: likewise.
+        """
         if isinstance(self.score, list) and not self.score:
             self.score.append(torch.zeros(0, dtype=torch.float64, device=self.device))
             self.present.append(torch.zeros(0, dtype=torch.bool, device=self.device))

@@ -42,6 +42,10 @@ class CameraStep(NamedTuple):
         motion: maps pixels of the last frame to those of this one; None where the two do not fit together.
         recovered: maps pixels of the last frame before a disturbance to those of this one, once the two fit.
         waits: whether frames before a disturbance may still be found again.
+
+    >>> first, second = CameraStep(Motion.similarity(shift=(3, 0))), CameraStep(Motion.similarity(shift=(0, 4)))
+    >>> first.then(second).motion.matrix[:2, 2].tolist()
+    [3.0, 4.0]
     """
 
     motion: Motion | None
@@ -54,7 +58,14 @@ class CameraStep(NamedTuple):
         return self.motion is not None and self.recovered is None and self.motion.is_still
 
     def then(self, later: "CameraStep") -> "CameraStep":
-        """Compose the steps of two successive frames."""
+        """Compose the steps of two successive frames.
+
+        Args:
+            later: the step after this one.
+
+        Returns:
+            The step from the frame before this one to the frame of the later one.
+        """
         motion = None if self.motion is None or later.motion is None else self.motion.then(later.motion)
         recovered = later.recovered
         if recovered is None and self.recovered is not None and later.motion is not None:

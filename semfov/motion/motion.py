@@ -71,7 +71,17 @@ class Motion:
 
     @classmethod
     def of(cls, matrix: "Motion | ArrayLike") -> "Motion":
-        """Take a motion, or make one of a `(3, 3)` or `(2, 3)` matrix, as OpenCV gives."""
+        """Take a motion, or make one of a matrix as OpenCV gives it.
+
+        Args:
+            matrix: a motion, or a `(3, 3)` or `(2, 3)` matrix.
+
+        Returns:
+            The motion.
+
+        Raises:
+            InputError: the matrix has another shape, is not finite, or flattens the frame.
+        """
         if isinstance(matrix, Motion):
             return matrix
         values = np.asarray(matrix, dtype=np.float64)
@@ -83,7 +93,14 @@ class Motion:
         return bool(np.allclose(self.matrix, np.eye(3), atol=1e-9))
 
     def then(self, later: "Motion") -> "Motion":
-        """Compose two motions: this one first, and a later one after it."""
+        """Compose two motions: this one first, and a later one after it.
+
+        Args:
+            later: the map from the second frame to a third.
+
+        Returns:
+            The map from the first frame to the third.
+        """
         return Motion(later.matrix @ self.matrix)
 
     def inverse(self) -> "Motion":

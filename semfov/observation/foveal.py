@@ -252,7 +252,8 @@ class FovealObservationModel(Pretrained):
             InputError: shapes do not fit, or a score is negative or not finite.
         """
         likelihood, level = self.log_likelihood(scores, distance), self._level(distance)
-        exponents = self.log_exponents.exp()[level][..., None].to(likelihood)
+        # An embedding, since indices of tensors are no part of `torch.func`.
+        exponents = F.embedding(level, self.log_exponents.exp()[:, None]).to(likelihood)
         logits = likelihood * self.tempering * exponents
         return (logits + F.embedding(level, self.log_prior.t())).softmax(-1).to(scores.dtype)
 
