@@ -90,11 +90,11 @@ def test_a_run_compares_gaze_and_beliefs_at_the_given_thresholds(config):
 
 
 def detects_at_the_gaze(step, grid, target, least=0.5):
-    """1 if a detection over the fixated cell has the target as its best class and scores at least `least`, else 0."""
+    """1 if a detection over the fixated cell gives the target the detector's own score `least` at least, else 0."""
     detections = step.detections
-    for box, scores, there in zip(detections.boxes[0], detections.scores[0], detections.mask[0], strict=True):
+    for box, own, there in zip(detections.boxes[0], detections.class_scores[0], detections.mask[0], strict=True):
         over = bool(grid.footprint(box[None])[0, int(step.cell)])
-        if bool(there) and over and int(scores.argmax()) == target and float(scores[target]) >= least:
+        if bool(there) and over and float(own[target - 1]) >= least:
             return 1
     return 0
 
