@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -55,10 +54,10 @@ class OpenedPicture:
         return source if isinstance(source, cls) else cls(cast(PictureLike, source), color, white, bands)
 
     def named(self, record: Record) -> Record:
-        """Name the file of the picture in a record of it."""
-        named = copy(record)  # `replace` would make what a record makes when it is read
-        object.__setattr__(named, "source", self.path)
-        return named
+        """Name the file of the picture in a record that was just made of it."""
+        # A copy would make what a record makes when it is read.
+        object.__setattr__(record, "source", self.path)
+        return record
 
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
         """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""

@@ -61,7 +61,7 @@ def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, m
     seen = {}
     for name in presets(task):
         plain = resolve(name, task)
-        own = policy_looking._by_evidence(plain, task) or plain.scores == "learned"
+        own = policy_looking._by_evidence(plain, task) or plain.scores in ("learned", "fitted")
         for policy in (plain,) if own else (plain, replace(plain, tempering=0.5), replace(plain, misses=True)):
             observer = strategy(policy, task, **models).observer
             look = type(observer), repr(observer), [id(part) for part in observer.children()]
