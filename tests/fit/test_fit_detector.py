@@ -234,7 +234,7 @@ def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_p
     assert agent.eye.detector.classes == CLASSES
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors", "verification.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "verification.safetensors"])
 def test_a_changed_file_is_refused(home, tmp_path, name):
     folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()

@@ -156,7 +156,6 @@ ASKED = {
     "device": "tasks/running",
     "drone": "tasks/count",
     "visual angle": "tasks/eye-tracker",
-    "jupyter": "tasks/running",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
