@@ -234,11 +234,12 @@ def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_p
     assert agent.eye.detector.classes == CLASSES
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "verification.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors", "verification.safetensors"])
 def test_a_changed_file_is_refused(home, tmp_path, name):
     folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()
-    (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
+    last = bytes([content[-1] ^ 1])  # another byte, whatever it is
+    (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + last)
     unusable(f"{name}: damaged or changed", ModelFolder, folder)
     (folder / name).unlink()
     listed = r"manifest\.json: no such file; expected a folder of models that semfov fit wrote"
