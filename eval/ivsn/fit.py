@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +27,7 @@ from semfov.errors import DataError
 from semfov.fit.settings import FitConfig
 from semfov.fit.training import training_of
 from semfov.runs.command import command
+from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.tables import table
@@ -44,6 +45,7 @@ class FitTemplatesConfig(FitConfig):
     """
 
     unused = ("sensor", "seed", "cache", "workers", "scheduler")
+    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig("yolov3-tiny"))
     holdout: Annotated[int, Range(2, 10**9)] = 10
     out: Path = Path("runs/fit_templates")
 
