@@ -63,6 +63,7 @@ def look_files(draw: Draw, folder: Path) -> Case:
     whole = {
         "boxes": torch.rand(3, 4, generator=generator) * 30,
         "scores": torch.rand(3, 3, generator=generator).softmax(-1),
+        "confidence": torch.rand(3, generator=generator),
         "count": torch.tensor([1, 2]),
         "actions": torch.tensor([[0.0, 0, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=torch.float64),
     }

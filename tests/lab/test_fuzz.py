@@ -11,7 +11,7 @@ from benchmarks.mutation import listed, outdated
 CASES = 25
 
 
-@pytest.mark.parametrize("name", [name for name in TARGETS if name != "look_files"])
+@pytest.mark.parametrize("name", TARGETS)
 def test_bad_input_gives_a_typed_error_or_the_documented_result(name, caplog):
     caplog.set_level(logging.ERROR, logger="semfov")
     outcomes = run(TARGETS[name], CASES)
