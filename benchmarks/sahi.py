@@ -42,8 +42,8 @@ from semfov.runs.window_looking import TileSize, right_boxes
 from semfov.viz.style import COLOURS, make_figure, save_figure, styled
 from semfov.zoom.episode import Order, WindowStep, look_by_look
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.objects import merge
 from semfov.zoom.slices import slices
 
@@ -222,12 +222,12 @@ def _chosen(run: ZoomRun, passes: int, pixels: _Pixels) -> tuple[Objects, int]:
 
 def _ordered(run: ZoomRun, pixels: _Pixels, *, order: Callable[[Lattice, list[Window]], Order]) -> tuple[Objects, int]:
     """Objects that looks at windows in an order show, merged here, and the number of looks."""
-    glances = LiveGlances(run.eye, run.eye.open(pixels))
-    lattice, config = glances.lattice, run.config
-    turns: Iterable[WindowStep[Any]] = look_by_look(
-        glances, order(lattice, slices(lattice, config.slice, config.step)), None
+    source = LiveWindowLooks(run.eye, run.eye.open(pixels))
+    lattice, config = source.lattice, run.config
+    steps: Iterable[WindowStep[Any]] = look_by_look(
+        source, order(lattice, slices(lattice, config.slice, config.step)), None
     )
-    looks = [turn.glance for turn in islice(turns, config.passes)]
+    looks = [step.look for step in islice(steps, config.passes)]
     return merge(looks, run.target), len(looks)
 
 

@@ -52,7 +52,7 @@ def programs(agent: ZoomAgent, side: int, height: int) -> dict[str, tuple[Run, R
 def detector_alone(agent: ZoomAgent, view: WindowView, path: ZoomPath) -> Run:
     """The detector with the selection of its boxes, on the canvases of a path."""
     detector = agent.eye.detector
-    fixations = torch.tensor([glance.window.fixation for glance in path.glances], dtype=torch.float64)
+    fixations = torch.tensor([look.window.fixation for look in path.window_looks], dtype=torch.float64)
     # Bytes, channels last, as the eye passes them on.
     canvases = agent.eye.glimpse(view, fixations)[0].mul(255).round().to(torch.uint8, memory_format=torch.channels_last)
 

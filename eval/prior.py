@@ -34,10 +34,10 @@ from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Seed, Share, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.runs.tables import table
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glances
+from semfov.zoom.looks import WindowLooks
 
 RANDOM, PAIR = "a class drawn from all", "one there, one not"
 """Names of the questions that are not about one class."""
@@ -99,7 +99,7 @@ class PriorRun(SceneRun):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         watch, annotation = Stopwatch(), self.scenes.annotation(index)
-        glances = StoredGlances(self.eye, self.scenes, index, None)
+        source = StoredWindowLooks(self.eye, self.scenes, index, None)
         generator = generator_for("prior", self.config.seed, self.scenes.ids[index])
         drawn = (torch.randperm(len(self.scenes.classes), generator=generator) + 1)[: self.config.drawn].tolist()
         pair = choose_classes(self.scenes, index, annotation, 1, self.config.max_target_area, self.config.seed)
@@ -114,18 +114,18 @@ class PriorRun(SceneRun):
                     "question": question,
                     "target": self.scenes.classes[target - 1],
                     "present": bool((annotation.labels == target).any()),
-                    "without": self._search(glances, target, None),
-                    "with": None if prior is None else self._search(glances, target, prior),
+                    "without": self._search(source, target, None),
+                    "with": None if prior is None else self._search(source, target, prior),
                 }
             )
         watch.lap("search")
         return records, watch.seconds
 
-    def _search(self, glances: Glances, target: int, prior: float | None) -> ResultRecord:
+    def _search(self, source: WindowLooks, target: int, prior: float | None) -> ResultRecord:
         """Search the photograph for a class, and record the decision."""
         limits = EpisodeLimits(WindowEpisode.usual_passes)
         names = ("background", *self.scenes.classes)
-        path = WindowEpisode(names, self.evidence, target, limits=limits, prior=prior).open(glances).run()
+        path = WindowEpisode(names, self.evidence, target, limits=limits, prior=prior).open(source).run()
         decision = path.decision
         assert decision is not None
         return {"outcome": decision.outcome, "probability": decision.probability, "passes": path.passes}

@@ -24,7 +24,7 @@ from eval.bootstrap import Bootstrap
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Semantic
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, rollout
+from semfov.episode import EpisodeLook, Looks, Step, rollout
 from semfov.errors import DataError, check
 from semfov.eye import Eye
 from semfov.gaze.acquisition import TargetPosterior
@@ -115,14 +115,14 @@ class _CodeLooks(Looks):
 
         return look
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Look, and weigh."""
         crops = Detections.stack([self._crops(number) for number in cell.tolist()])
         rows = crops.mask.unflatten(0, (len(cell), -1))
         self.cell, self.empty = cell, ~rows.any(-1).all(-1)
         boxes, scores = (each.unflatten(0, rows.shape[:2]).flatten(1, 2) for each in (crops.boxes, crops.scores))
         detections = Detections(boxes, scores, rows.flatten(1))
-        return Sight(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
+        return EpisodeLook(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
 
 
 class _Inhibited(Greedy):

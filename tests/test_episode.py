@@ -9,7 +9,7 @@ import torch
 
 from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, Selection, TargetEvidence
 from semfov.belief.observers import Semantic, Target
-from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
+from semfov.episode import STAGES, EpisodeLook, LiveLooks, Looks, StoredLooks, rollout
 from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from
@@ -340,7 +340,7 @@ class Smooth(Looks):
 
     def see(self, observer, episodes, cell, fixation):
         seen = self.seen(fixation)
-        return Sight(observer.weigh(seen, fixation, self.grid), lambda: seen, {})
+        return EpisodeLook(observer.weigh(seen, fixation, self.grid), lambda: seen, {})
 
 
 class Biased(AcquisitionFunction):

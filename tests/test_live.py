@@ -229,7 +229,7 @@ def test_a_film_gives_the_same_beliefs_in_any_container(tmp_path, how):
             if how == "fovea":
                 torch.testing.assert_close(moment.probability, expected.probability, atol=1e-6, rtol=0)
             else:
-                assert [look.window for look in moment.glances] == [look.window for look in expected.glances]
+                assert [look.window for look in moment.window_looks] == [look.window for look in expected.window_looks]
                 torch.testing.assert_close(moment.objects.scores, expected.objects.scores, atol=1e-6, rtol=0)
 
 

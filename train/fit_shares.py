@@ -23,10 +23,10 @@ from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import track
 from semfov.runs.setup import make_detector, make_scenes
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Window
+from semfov.zoom.looks import Window
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def _whole_looks(eye: WindowEye, scenes: Scenes) -> tuple[Tensor, Tensor]:
     """The highest scores of looks at whole photographs, and the classes that these hold, `(P, K)`."""
     scores, held = [], torch.zeros(len(scenes), len(scenes.classes), dtype=torch.bool)
     for index in track(range(len(scenes)), "looking at photographs", "photograph"):
-        glances = StoredGlances(eye, scenes, index, None)
-        scores.append(glances.see([Window.overview(glances.lattice)])[0].show)
+        source = StoredWindowLooks(eye, scenes, index, None)
+        scores.append(source.see([Window.overview(source.lattice)])[0].show)
         held[index, scenes.annotation(index).labels - 1] = True
     return torch.stack(scores), held
 

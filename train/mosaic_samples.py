@@ -16,7 +16,7 @@ from semfov.runs.looks import one_thread
 from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
-from semfov.runs.zoom_store import GlanceStore
+from semfov.runs.zoom_store import WindowLookStore
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 from train.samples import Sampler
@@ -36,7 +36,7 @@ class MosaicSampler(Sampler):
     of photographs that no other mosaic shows.
     """
 
-    sources = (*GlanceStore.sources, "semfov.data.mosaics", __name__)
+    sources = (*WindowLookStore.sources, "semfov.data.mosaics", __name__)
     coordinates = 3
 
     def make(self) -> tuple[WindowEye, Scenes]:

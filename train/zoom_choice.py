@@ -11,7 +11,7 @@ from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from train.zoom_slices import look_for_slice
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
@@ -36,8 +36,8 @@ def choose_foresight(model: GlimpseEvidence, fit: MosaicFit, kinds: Sequence[str
             for looks, annotations, mosaics in zip(opened, objects, chosen, strict=True)
         ]
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
-        for glances in chain.from_iterable(opened):
-            glances.save()
+        for source in chain.from_iterable(opened):
+            source.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
     share = {value: sum(r / m for r, m in zip(by_kind, most, strict=True)) for value, by_kind in recalls.items()}
     model.survey.foresight = max(share, key=share.__getitem__)
@@ -56,25 +56,25 @@ def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
     for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value
         passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.least)
-        for glances in opened:
-            glances.save()
+        for source in opened:
+            source.save()
     model.patience = min(passes, key=passes.__getitem__)
     return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
 
 
 def _mean_recall(
-    model: GlimpseEvidence, glances: Sequence[Glances], objects: Sequence[Annotation], passes: int
+    model: GlimpseEvidence, sources: Sequence[WindowLooks], objects: Sequence[Annotation], passes: int
 ) -> float:
     """Compute the mean recall over passes of an exploration that looks for all objects."""
     total = 0
-    for looks, annotation in zip(glances, objects, strict=True):
-        history: list[Glance] = []
+    for looks, annotation in zip(sources, objects, strict=True):
+        history: list[WindowLook] = []
         path = find_everything(looks, model)
         count = 0
         for _ in range(passes):
-            turn = next(path, None)
-            if turn is not None:
-                history.append(turn.glance)
+            step = next(path, None)
+            if step is not None:
+                history.append(step.look)
                 count = int(found_in(history, annotation).sum())
             # When no window is left, the number of found objects stays the same for the remaining passes.
             total += count
@@ -82,12 +82,12 @@ def _mean_recall(
 
 
 def _mean_passes(
-    model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]], least: float
+    model: GlimpseEvidence, sources: Sequence[WindowLooks], slots: Sequence[Sequence[Window]], least: float
 ) -> float:
     """Compute the mean number of passes until a look at a photograph that shows the target."""
     counts = []
-    for looks, photographs in zip(glances, slots, strict=True):
-        presence = torch.stack([glance.show for glance in looks.see(photographs)]) >= least
+    for looks, photographs in zip(sources, slots, strict=True):
+        presence = torch.stack([look.show for look in looks.see(photographs)]) >= least
         for target in (presence.any(0).nonzero()[:, 0] + 1).tolist():
             path = look_for_slice(looks, model, target, photographs, least)
             counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))

@@ -8,17 +8,17 @@ from torch import Tensor
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
-from semfov.zoom.glances import Glance, Glances, Window
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_hit
 
 
 def look_for_slice(
-    glances: Glances, evidence: GlimpseEvidence, target: int, slices: Sequence[Window] | None, confirm: float = 0.3
+    source: WindowLooks, evidence: GlimpseEvidence, target: int, slices: Sequence[Window] | None, confirm: float = 0.3
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class until a slice shows it, or a window of the largest magnification without slices.
 
     Args:
-        glances: the looks at the picture.
+        source: the looks at the picture.
         evidence: predicts from a look what closer looks will find.
         target: class 1..K.
         slices: windows that can confirm the class; None for those of the largest magnification.
@@ -27,20 +27,20 @@ def look_for_slice(
     Yields:
         The looks.
     """
-    belief = ZoomBelief(glances.lattice, evidence, target, glances.blank)
+    belief = ZoomBelief(source.lattice, evidence, target, source.blank)
     allowed = None if slices is None else set(slices)
     known: dict[int, dict[Window, float]] = {}  # log odds of slices, by the number of looks that they follow from
 
-    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
+    def best(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
         odds = known.setdefault(len(belief.gists), {})
         choice = best_hit(belief, done, closest=True) if slices is None else _best_slice(belief, slices, done, odds)
         return [] if choice is None else [choice]
 
-    for turn in look_by_look(glances, best, belief):
-        yield turn
-        window = turn.glance.window
-        confirms = window.level == glances.lattice.levels - 1 if allowed is None else window in allowed
-        if confirms and float(turn.glance.show[target - 1]) >= confirm:
+    for step in look_by_look(source, best, belief):
+        yield step
+        window = step.look.window
+        confirms = window.level == source.lattice.levels - 1 if allowed is None else window in allowed
+        if confirms and float(step.look.show[target - 1]) >= confirm:
             return
 
 

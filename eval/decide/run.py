@@ -42,11 +42,11 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glances
+from semfov.zoom.looks import WindowLooks
 
 _Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
@@ -180,7 +180,7 @@ class DecisionRun(ComparedLooking):
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
         )
 
-    def _by_windows(self, glances: Glances, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
+    def _by_windows(self, source: WindowLooks, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
         """What the agent that looks at windows makes of a search."""
         config, target = self.config, search.target
         assert self.windows is not None
@@ -194,7 +194,7 @@ class DecisionRun(ComparedLooking):
                 give_up=config.give_up,
                 closer=None if config.closer else 0,
             )
-            .open(glances)
+            .open(source)
             .run()
         )
         decision = path.decision
@@ -243,7 +243,7 @@ class DecisionRun(ComparedLooking):
         remembered: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
-        glances = StoredGlances(self.by_windows, self.scenes, index, None)
+        source = StoredWindowLooks(self.by_windows, self.scenes, index, None)
         for search in searches:
             target, goal = search.target, search.goal
             common = {
@@ -257,7 +257,7 @@ class DecisionRun(ComparedLooking):
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
             if self.windows is not None:
-                records.append({"policy": WINDOWS, **common, **self._by_windows(glances, search, grid, annotation)})
+                records.append({"policy": WINDOWS, **common, **self._by_windows(source, search, grid, annotation)})
             looks: Looks = CellLooks(remembered, grid, grid.centres, target)
             if everywhere is not None:
                 looks = StoredLooks(everywhere, grid, torch.tensor([target]))

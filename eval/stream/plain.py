@@ -14,7 +14,7 @@ from semfov.detection.selection import Selection, suppress
 from semfov.motion import CameraMotion, Motion
 from semfov.zoom.carrying import inside_frame
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import LiveGlances, Window
+from semfov.zoom.looks import LiveWindowLooks, Window
 
 _CELL, _CELLS = 52, 160  # side of a cell of the scene in pixels of the first frame, and cells in a row and a column
 _PLACES = 8, 5  # columns and rows of the places of a window in a frame
@@ -54,31 +54,31 @@ class PlainRule(Way):
             self._begin()
         else:
             self.pose = self.pose.then(motion)
-        glances = self.glances(frame)
+        source = self.looks_at(frame)
         if (self.number - self.began) % _WHOLE == 0:
-            self._look_at_all(glances)
+            self._look_at_all(source)
         else:
-            self._look_closely(glances)
+            self._look_closely(source)
         boxes = self.pose.boxes(self.boxes)
         kept = suppress(boxes, self.scores, torch.zeros(len(boxes)), _RIVALS)
         self.boxes, self.scores = self.boxes[kept], self.scores[kept]
         number = torch.zeros(len(kept), dtype=torch.long)
         objects = Objects(boxes[kept], self.scores, torch.full_like(number, self.target), number)
-        return {"plain rule": objects[inside_frame(objects.boxes, glances.lattice.size)]}
+        return {"plain rule": objects[inside_frame(objects.boxes, source.lattice.size)]}
 
-    def _look_at_all(self, glances: LiveGlances) -> None:
+    def _look_at_all(self, source: LiveWindowLooks) -> None:
         """Look at the whole frame: what it shows is expected around its place."""
-        boxes, scores = self._see(glances, Window.overview(glances.lattice))
+        boxes, scores = self._see(source, Window.overview(source.lattice))
         for (row, column), score in zip(self._cells(centres(boxes)), scores.tolist(), strict=True):
             around = self.expected[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
             around[:] = np.maximum(around, min(0.5, _EXPECTED + score))
         self._remember(boxes, scores)
 
-    def _look_closely(self, glances: LiveGlances) -> None:
+    def _look_closely(self, source: LiveWindowLooks) -> None:
         """Look at the window that promises most, in place of what is known there."""
-        side = float(min(glances.lattice.canvas))
-        x, y = self._best_place(glances.lattice.size, side)
-        boxes, scores = self._see(glances, Window.around(glances.lattice, (x, y, x + side, y + side)))
+        side = float(min(source.lattice.canvas))
+        x, y = self._best_place(source.lattice.size, side)
+        boxes, scores = self._see(source, Window.around(source.lattice, (x, y, x + side, y + side)))
         rows, columns = self._cells(_points(x, y, side)).T
         self.seen[rows, columns] = self.number
         self.expected[rows, columns] = _LOOKED_AT
@@ -101,9 +101,9 @@ class PlainRule(Way):
 
         return max(places, key=value)
 
-    def _see(self, glances: LiveGlances, window: Window) -> tuple[Tensor, Tensor]:
+    def _see(self, source: LiveWindowLooks, window: Window) -> tuple[Tensor, Tensor]:
         """Boxes `(N, 4)` in the frame that no border of a window cuts, and their scores `(N,)`."""
-        (look,) = glances.see([window], hints=False)
+        (look,) = source.see([window], hints=False)
         scores = look.detections.class_scores[0, :, self.target - 1]
         kept = ~look.cut & (scores > _FAINTEST)
         return look.detections.boxes[0, kept].float(), scores[kept].float()

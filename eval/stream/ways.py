@@ -12,8 +12,8 @@ from semfov.motion import CameraMotion, CameraStep
 from semfov.zoom.carrying import inside_frame
 from semfov.zoom.episode import KeptLook
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import slices
 
 LIVE, CANDIDATES = "live", "live, all candidates"
@@ -35,9 +35,9 @@ class Way(ABC):
     def step(self, frame: Frame) -> Mapping[str, Objects]:
         """Look at the next frame, and tell the objects that are known then, by the name of the row in tables."""
 
-    def glances(self, frame: Frame) -> LiveGlances:
+    def looks_at(self, frame: Frame) -> LiveWindowLooks:
         """Open a frame."""
-        return LiveGlances(self.eye, self.eye.open(frame.pixels))
+        return LiveWindowLooks(self.eye, self.eye.open(frame.pixels))
 
 
 class WholeFrame(Way):
@@ -46,8 +46,8 @@ class WholeFrame(Way):
     remembers = False
 
     def step(self, frame: Frame) -> Mapping[str, Objects]:
-        glances = self.glances(frame)
-        looks = glances.see([Window.overview(glances.lattice)], hints=False)
+        source = self.looks_at(frame)
+        looks = source.see([Window.overview(source.lattice)], hints=False)
         return {"whole frame": suppressed(looks, self.target).objects}
 
 
@@ -57,10 +57,10 @@ class AllSlices(Way):
     remembers = False
 
     def step(self, frame: Frame) -> Mapping[str, Objects]:
-        glances = self.glances(frame)
-        windows = whole_and_slices(glances.lattice)
+        source = self.looks_at(frame)
+        windows = whole_and_slices(source.lattice)
         self.passes = len(windows)
-        looks = [look for window in windows for look in glances.see([window], hints=False)]
+        looks = [look for window in windows for look in source.see([window], hints=False)]
         return {f"whole frame and {self.passes - 1} slices": suppressed(looks, self.target).objects}
 
 
@@ -74,16 +74,16 @@ class RoundRobin(Way):
         self.kept: list[KeptLook] = []
 
     def step(self, frame: Frame) -> Mapping[str, Objects]:
-        glances = self.glances(frame)
+        source = self.looks_at(frame)
         if self.camera is not None:
-            self._carry(self.camera.step(frame.pixels), glances.lattice)
+            self._carry(self.camera.step(frame.pixels), source.lattice)
         if not self.kept:
-            self.windows = cycle(windows := whole_and_slices(glances.lattice))
+            self.windows = cycle(windows := whole_and_slices(source.lattice))
             self.round = len(windows)
-        (look,) = glances.see([next(self.windows)], hints=False)
+        (look,) = source.see([next(self.windows)], hints=False)
         self.kept = [*self.kept, KeptLook(look, 0, 0.0)][-self.round :]
-        objects = suppressed([kept.glance for kept in self.kept], self.target).objects
-        return {self.name: objects[inside_frame(objects.boxes, glances.lattice.size)]}
+        objects = suppressed([kept.current for kept in self.kept], self.target).objects
+        return {self.name: objects[inside_frame(objects.boxes, source.lattice.size)]}
 
     def _carry(self, camera: CameraStep, lattice: Lattice) -> None:
         if camera.motion is None:

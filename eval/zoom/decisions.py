@@ -17,14 +17,14 @@ from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glances, Window
+from semfov.zoom.looks import Window, WindowLooks
 
 OURS, UNVERIFIED = "semfov", "semfov, without closer looks"
 """Names of searches with closer looks at places that seem to hold the target, and of searches without them."""
 
 
 def decide_all(
-    glances: Glances,
+    source: WindowLooks,
     evidence: GlimpseEvidence,
     classes: tuple[str, ...],
     targets: Sequence[int],
@@ -37,7 +37,7 @@ def decide_all(
     """Search a picture until a decision, for each target, with closer looks and without them.
 
     Args:
-        glances: the looks at the picture.
+        source: the looks at the picture.
         evidence: learned evidence by magnification.
         classes: names of the classes, background first.
         targets: classes to search for, 1..K.
@@ -50,16 +50,16 @@ def decide_all(
         Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
         the overview and all slices. Evidence without fitted verification makes no closer looks.
     """
-    slice_scores = torch.stack([glance.show for glance in glances.see(slices)])
+    slice_scores = torch.stack([look.show for look in source.see(slices)])
     records: list[ResultRecord] = []
     ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
         episode = WindowEpisode(classes, evidence, target, limits=EpisodeLimits(passes), closer=most)
-        path = episode.open(glances).run()
+        path = episode.open(source).run()
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]
-        first = float(path.glances[0].show[target - 1])
+        first = float(path.window_looks[0].show[target - 1])
         records.append(
             {
                 "measure": "decision",

@@ -21,7 +21,7 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
 from semfov.zoom.certainty import SPREAD, number_of
-from semfov.zoom.glances import Glance
+from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
 
 AFTER = (1, 2, 4, 8, 12, 16, 24)
@@ -41,13 +41,13 @@ class Returned(NamedTuple):
     given: bool = False
 
 
-def merged(looks: Sequence[Glance], target: int | None) -> Returned:
+def merged(looks: Sequence[WindowLook], target: int | None) -> Returned:
     """The objects of looks by the scores of the detector (`semfov.zoom.objects.merge`)."""
     objects = merge(looks, target)
     return Returned(objects, objects.above(LIKELY))
 
 
-def suppressed(looks: Sequence[Glance], target: int | None) -> Returned:
+def suppressed(looks: Sequence[WindowLook], target: int | None) -> Returned:
     """The objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
     boxes, scores = (
         torch.cat([each[0, ~look.cut] for look, each in zip(looks, column, strict=True)])

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
-from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice
 from semfov.zoom.slices import raw, slices
 
@@ -48,7 +48,7 @@ def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> O
     """
     chosen: list[Window] | None = None
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
+    def order(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
         nonlocal chosen
         if chosen is None:
             chosen = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
@@ -78,7 +78,7 @@ def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
     # Quarters at the right and bottom borders are moved inside the picture, where two of them may coincide.
     queued = set[Window]()
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
+    def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
         new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in queued]
         queued.update(window for _, window in new)
         frontier.extend(new)
@@ -88,12 +88,12 @@ def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
     return order
 
 
-def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) -> list[tuple[float, Window]]:
-    level = glance.window.level + 1
+def _quarters(lattice: Lattice, look: WindowLook, target: int | None, most: bool) -> list[tuple[float, Window]]:
+    level = look.window.level + 1
     if level >= lattice.levels:
         return []
     span, (across, down) = lattice.span(level), lattice.places(level)
-    left, top = glance.window.cells[:2]
+    left, top = look.window.cells[:2]
     places = sorted(
         {
             (min(top + dy, down - 1), min(left + dx, across - 1))
@@ -103,14 +103,14 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
         }
     )
     windows = [Window.on(lattice, (level, column, row)) for row, column in places]
-    return [(raw(glance, window, [] if target is None else [target], most=most), window) for window in windows]
+    return [(raw(look, window, [] if target is None else [target], most=most), window) for window in windows]
 
 
-def oracle(glances: Glances, windows: Sequence[Window], finds: Callable[[Glance], Tensor], most: int) -> Order:
+def oracle(source: WindowLooks, windows: Sequence[Window], finds: Callable[[WindowLook], Tensor], most: int) -> Order:
     """Repeatedly the window that shows most of the objects not seen before.
 
     Args:
-        glances: the looks at the picture.
+        source: the looks at the picture.
         windows: windows to look at.
         finds: which objects a look finds, `(M,)`.
         most: largest number of looks, the overview included.
@@ -118,10 +118,10 @@ def oracle(glances: Glances, windows: Sequence[Window], finds: Callable[[Glance]
     Returns:
         The order.
     """
-    by_window = torch.stack([finds(glance) for glance in glances.see(windows)])
+    by_window = torch.stack([finds(look) for look in source.see(windows)])
     seen: list[Tensor] = []
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
+    def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
         if len(looks) >= min(most, len(windows)):
             return []
         if len(looks) == 1:

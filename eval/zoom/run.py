@@ -38,9 +38,9 @@ from semfov.runs.window_looking import (
 )
 from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
-from semfov.zoom.glances import Glance, Glances, Window, half_steps
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook, WindowLooks, half_steps
 from semfov.zoom.objects import merge
 from semfov.zoom.slices import ranked, slices, usual_slices
 from train.zoom_slices import look_for_slice
@@ -124,29 +124,29 @@ class ZoomRun(WindowLooking, SceneRun):
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Measure all ways of looking at a scene; returns records, and the seconds that each stage took."""
         watch = Stopwatch()
-        glances = self.glances(index)
+        source = self.looks_at(index)
         records: list[ResultRecord] = []
         measures = self.config.measures
         if {"objects", "recall"} & {*measures}:
-            records += self._finding(index, glances)
+            records += self._finding(index, source)
         watch.lap("recall")
         if self.config.mosaics and "hit" in measures:
-            records += self._first_hits(index, glances)
+            records += self._first_hits(index, source)
         watch.lap("first hit")
         if "decision" in measures:
-            records += self._decisions(index, glances)
+            records += self._decisions(index, source)
         watch.lap("decision")
-        glances.save()
+        source.save()
         return records, watch.seconds
 
-    def _finding(self, index: int, glances: Glances) -> Iterator[ResultRecord]:
+    def _finding(self, index: int, source: WindowLooks) -> Iterator[ResultRecord]:
         """Look for all objects in every way; compare the objects of slices and of the agent, and the recall of all."""
-        cut, lattice = self.slices(index, glances.lattice), glances.lattice
+        cut, lattice = self.slices(index, source.lattice), source.lattice
         annotation, target, config = self.annotation(index), self.target, self.config
         targets = () if target is None else (target,)
 
-        def looked(turns: Iterator[WindowStep[Any]]) -> list[Glance]:
-            return [turn.glance for turn in islice(turns, config.passes)]
+        def looked(steps: Iterator[WindowStep[Any]]) -> list[WindowLook]:
+            return [step.look for step in islice(steps, config.passes)]
 
         orders = {RASTER: in_order(cut), "slices, ranked by the overview": ranked(cut, targets)}
         if lattice.levels > 1:
@@ -155,33 +155,33 @@ class ZoomRun(WindowLooking, SceneRun):
                 "slices as in ASAHI": in_order(adaptive_slices(lattice)),
                 "quad-tree, best first": quad_tree(lattice, target, most=False),
             }
-        seen = {name: looked(look_by_look(glances, order, None)) for name, order in orders.items()}
+        seen = {name: looked(look_by_look(source, order, None)) for name, order in orders.items()}
         episode = WindowEpisode(("background", *self.scenes.classes), self.evidence, None, targets, worth=0.0)
-        episode.open(glances)
+        episode.open(source)
         paths: dict[int, ZoomPath] = {}
         while episode.passes < config.passes and episode.look() is not None:
             if episode.passes in self.numbers:
                 paths[episode.passes] = episode.record()
-        seen[SEMFOV] = episode.glances
+        seen[SEMFOV] = episode.window_looks
         if "objects" in config.measures:
             paths = {number: paths.get(number) or episode.record() for number in self.numbers}
             yield from self._objects(index, seen, paths)
         if "recall" not in config.measures:
             return
-        seen["slices, random"] = looked(look_by_look(glances, shuffled(cut, [config.seed, index]), None))
-        seen["semfov, four at a time"] = looked(find_everything(glances, self.evidence, target, batch=4))
+        seen["slices, random"] = looked(look_by_look(source, shuffled(cut, [config.seed, index]), None))
+        seen["semfov, four at a time"] = looked(find_everything(source, self.evidence, target, batch=4))
         if self.observation is not None:
             observed = ObservedRates(self.observation, lattice, foresight=self.evidence.foresight)
-            seen["by the observation model"] = looked(find_everything(glances, observed, target))
-        finds: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
+            seen["by the observation model"] = looked(find_everything(source, observed, target))
+        finds: Callable[[WindowLook], Tensor] = lambda look: found_in([look], annotation, target)  # noqa: E731
         every = [*half_steps(lattice)][1:]
-        seen["oracle"] = looked(look_by_look(glances, oracle(glances, [*every, *cut], finds, config.passes), None))
+        seen["oracle"] = looked(look_by_look(source, oracle(source, [*every, *cut], finds, config.passes), None))
         for name, looks in seen.items():
             yield self._recall(name, index, looks)
             if name in (RASTER, SEMFOV):
                 yield self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)])
 
-    def _decisions(self, index: int, glances: Glances) -> list[ResultRecord]:
+    def _decisions(self, index: int, source: WindowLooks) -> list[ResultRecord]:
         """Search for classes that are present and for classes that are absent."""
         config, annotation = self.config, self.scenes.annotation(index)
         targets = (
@@ -190,9 +190,9 @@ class ZoomRun(WindowLooking, SceneRun):
             else [self.target]
         )
         names = "background", *self.scenes.classes
-        cut = self.slices(index, glances.lattice)
+        cut = self.slices(index, source.lattice)
         limits = {"passes": config.passes, "closer": config.closer}
-        records = decide_all(glances, self.evidence, names, targets, annotation, cut, **limits)
+        records = decide_all(source, self.evidence, names, targets, annotation, cut, **limits)
         frequencies = self.frequencies[index]
         return [
             record | {"scene": self.scenes.ids[index], "frequency": float(frequencies[names.index(record["target"])])}
@@ -215,7 +215,7 @@ class ZoomRun(WindowLooking, SceneRun):
         )
 
     def _objects(
-        self, index: int, seen: Mapping[str, list[Glance]], paths: Mapping[int, ZoomPath]
+        self, index: int, seen: Mapping[str, list[WindowLook]], paths: Mapping[int, ZoomPath]
     ) -> Iterator[ResultRecord]:
         """Compare the objects of slices and of the agent with the annotated ones, and with those of a plain pass."""
         annotation = self.annotation(index)
@@ -238,7 +238,7 @@ class ZoomRun(WindowLooking, SceneRun):
         for way, returned in ways.items():
             yield object_record(way, returned, annotation, plain) | {"scene": self.scenes.ids[index]}
 
-    def _recall(self, name: str, index: int, looks: list[Glance]) -> ResultRecord:
+    def _recall(self, name: str, index: int, looks: list[WindowLook]) -> ResultRecord:
         annotation = self.annotation(index)
         counts = [int(found_in(looks[: n + 1], annotation, self.target).sum()) for n in range(len(looks))]
         objects = merge(looks, self.target, score=DETECTION_SCORE)
@@ -250,13 +250,13 @@ class ZoomRun(WindowLooking, SceneRun):
             "found": counts,
             "boxes": len(objects),
             "right": int((right_boxes(objects, annotation) > 0).sum()),
-            "windows": [list(glance.window.fixation) for glance in looks],
+            "windows": [list(look.window.fixation) for look in looks],
         }
 
-    def _first_hits(self, index: int, glances: Glances) -> list[ResultRecord]:
+    def _first_hits(self, index: int, source: WindowLooks) -> list[ResultRecord]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
-        cut = self.slices(index, glances.lattice)
-        presence = torch.stack([glance.show for glance in glances.see(cut)]) >= LEAST
+        cut = self.slices(index, source.lattice)
+        presence = torch.stack([look.show for look in source.see(cut)]) >= LEAST
         closest = min(window.level for window in cut)
         limit = len(cut) + 1
         records: list[ResultRecord] = []
@@ -265,18 +265,18 @@ class ZoomRun(WindowLooking, SceneRun):
                 "slices, raster": in_order(cut),
                 "slices, random": shuffled(cut, [self.config.seed, index, target]),
                 "slices, ranked by the overview": ranked(cut, [target], most=True),
-                "quad-tree, best first": quad_tree(glances.lattice, target, most=True),
+                "quad-tree, best first": quad_tree(source.lattice, target, most=True),
             }
             ways: dict[str, Iterator[WindowStep[Any]]] = {
-                **{name: look_by_look(glances, order, None) for name, order in orders.items()},
-                "semfov": look_for_slice(glances, self.evidence, target, cut),
-                "semfov, free windows": look_for_slice(glances, self.evidence, target, None),
+                **{name: look_by_look(source, order, None) for name, order in orders.items()},
+                "semfov": look_for_slice(source, self.evidence, target, cut),
+                "semfov, free windows": look_for_slice(source, self.evidence, target, None),
             }
-            for name, turns in ways.items():
+            for name, steps in ways.items():
                 passes, hit = 0, False
-                for glance in (turn.glance for turn in islice(turns, limit)):
+                for look in (step.look for step in islice(steps, limit)):
                     passes += 1
-                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= LEAST
+                    hit = look.window.level >= closest and float(look.show[target - 1]) >= LEAST
                     if hit:
                         break
                 records.append(
@@ -292,7 +292,7 @@ class ZoomRun(WindowLooking, SceneRun):
         return records
 
 
-def without_cut(glance: Glance) -> Glance:
+def without_cut(look: WindowLook) -> WindowLook:
     """A look without the boxes that are cut by the border of its window."""
-    whole = ~glance.cut
-    return replace(glance, detections=glance.detections.take(whole), cut=glance.cut[whole])
+    whole = ~look.cut
+    return replace(look, detections=look.detections.take(whole), cut=look.cut[whole])

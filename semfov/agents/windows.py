@@ -33,8 +33,8 @@ from semfov.zoom.decision import WindowDecisions
 from semfov.zoom.episode import KeptLook, WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye, WindowView
-from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 from semfov.zoom.objects import merge, probable_objects
 from semfov.zoom.slices import ranked, usual_slices
 
@@ -145,7 +145,7 @@ class ZoomAgent(nn.Module):
             limits=EpisodeLimits(WindowEpisode.usual_passes if passes is None else passes, seconds, on_look),
             confirm=confirm, give_up=give_up, closer=closer, prior=prior,
         )  # fmt: skip
-        return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
+        return episode.open(LiveWindowLooks(self.eye, self.eye.open(picture))).run()
 
     def find_all(
         self,
@@ -190,7 +190,7 @@ class ZoomAgent(nn.Module):
         if least is not None:
             check_number(least, "least", 0, 1)
         episode = self.episode(None, targets, limits=limits, batch=batch, worth=worth, least=least)
-        return episode.open(LiveGlances(self.eye, self.eye.open(picture))).run()
+        return episode.open(LiveWindowLooks(self.eye, self.eye.open(picture))).run()
 
     def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
         """Find all objects of all classes.
@@ -274,7 +274,7 @@ class WindowEpisode(Episode[ZoomPath]):
         elif self.searches:
             Prior.of(prior, None, 0)  # without evidence there is no probability
             self.criterion = f"a detection scores {self._confirm:g}"
-        self._glances: Glances | None = None
+        self._source: WindowLooks | None = None
         self._last: WindowStep[Any] | None = None
         self._newest: KeptLook | None = None
         self._closer_looks: list[KeptLook] = []
@@ -284,39 +284,39 @@ class WindowEpisode(Episode[ZoomPath]):
         self._concluded: Decision | None = None
         self._began = perf_counter()
 
-    def open(self, glances: Glances, *, told: bool = False) -> Self:
+    def open(self, source: WindowLooks, *, told: bool = False) -> Self:
         """Begin with a picture, or with the first frame of a stream."""
-        self.certainty = None if self.evidence is None else self.evidence.certainty_in(glances.lattice)
+        self.certainty = None if self.evidence is None else self.evidence.certainty_in(source.lattice)
         # From this probability, or score, on objects count. Without evidence and in photographs slices are looked at.
         usual = LEAST if self.certainty is None else LIKELY
         self.least = usual if self._least is None else self._least
-        self._slicing = self.evidence is None or glances.lattice.levels == 1
-        self._glances, sought = glances, self.targets or (() if self.target is None else (self.target,))
-        self._turns: Iterator[WindowStep[Any]]
+        self._slicing = self.evidence is None or source.lattice.levels == 1
+        self._source, sought = source, self.targets or (() if self.target is None else (self.target,))
+        self._steps: Iterator[WindowStep[Any]]
         still = self.forgetting is None or self.forgetting.rate == 0
-        if isinstance(glances, LiveGlances) and still and not told and glances.lattice.levels > 1:
-            glances.blank = cache(partial(blank_cells, glances.view.picture, glances.lattice))
+        if isinstance(source, LiveWindowLooks) and still and not told and source.lattice.levels > 1:
+            source.blank = cache(partial(blank_cells, source.view.picture, source.lattice))
         if self.forgetting is None and not told:
             # The choice after the overview asks for the first, and the record at the end for the second.
-            glances.meanwhile = lambda: (glances.blank(), self._photograph)
+            source.meanwhile = lambda: (source.blank(), self._photograph)
         if told:
             self.searches, self._decisions = False, None
-            belief = None if self.evidence is None else ZoomBelief(glances.lattice, self.evidence, self.target or 0)
-            self._turns = look_by_look(glances, lambda looks, windows: [(self._window, 0.0)], belief)
+            belief = None if self.evidence is None else ZoomBelief(source.lattice, self.evidence, self.target or 0)
+            self._steps = look_by_look(source, lambda looks, windows: [(self._window, 0.0)], belief)
         elif self.evidence is None or (self._slicing and not self.searches):
-            order = ranked(usual_slices(glances.lattice, glances.blank()), sought)
-            self._turns = look_by_look(
-                glances,
+            order = ranked(usual_slices(source.lattice, source.blank()), sought)
+            self._steps = look_by_look(
+                source,
                 order,
                 None,
                 forgetting=self.forgetting,
                 guess=lambda looks, done, _: next(iter(order(looks, done)), None),
             )
         elif self.searches and self.target is not None:
-            self._turns = look_for(glances, self.evidence, self.target, forgetting=self.forgetting)
+            self._steps = look_for(source, self.evidence, self.target, forgetting=self.forgetting)
         else:
-            self._turns = find_everything(
-                glances, self.evidence, self.target, batch=self.batch, worth=self.worth, forgetting=self.forgetting
+            self._steps = find_everything(
+                source, self.evidence, self.target, batch=self.batch, worth=self.worth, forgetting=self.forgetting
             )
         return self
 
@@ -327,19 +327,19 @@ class WindowEpisode(Episode[ZoomPath]):
                 assert self.eye is not None
                 view = self.eye.open(open_large(frame, color=self.color))
                 self._check_size(view.picture.size)
-                if self._glances is None:
-                    self.open(LiveGlances(self.eye, view))
+                if self._source is None:
+                    self.open(LiveWindowLooks(self.eye, view))
                 self._follow(view)
                 if self._decisions is not None:
                     self._decisions.wait(self.passed)
-            assert self._glances is not None
+            assert self._source is not None
             if window is not None:
                 self._window = window
             candidate = None if self._decisions is None else self._decisions.candidate
             if self._decisions is not None and candidate is not None:
                 self._decisions.look()
                 self._closer_looks[-1].value = candidate.probability
-            elif not self._turn():
+            elif not self._step():
                 return None
             if self.forgetting is None:
                 if self._decisions is not None and self._decisions.outcome and self._decisions.candidate is None:
@@ -347,7 +347,7 @@ class WindowEpisode(Episode[ZoomPath]):
                 elif self.searches and self.evidence is None and self.decision is not None:
                     self.ending = "detection" if self.decision.outcome == "found" else None
             assert self._newest is not None
-            seen, lattice = self._newest, self._glances.lattice
+            seen, lattice = self._newest, self._source.lattice
             return RecordedLook(
                 seen.number,
                 seen.taken.window.centre(lattice),
@@ -359,12 +359,12 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def _follow(self, view: WindowView) -> None:
         """Take the next frame of a stream, and carry what is known along with the camera."""
-        assert isinstance(self._glances, LiveGlances)
+        assert isinstance(self._source, LiveWindowLooks)
         camera = self._camera_step(view)
         if camera is None or self._newest is None:
-            self._glances.show(view, self.passed)
+            self._source.show(view, self.passed)
             return
-        self._glances.show(view, self.passed, camera)
+        self._source.show(view, self.passed, camera)
         self._lost = camera.motion is None and camera.recovered is None
         if camera.is_still:
             return
@@ -372,7 +372,7 @@ class WindowEpisode(Episode[ZoomPath]):
             self._closer_looks = []
         else:
             for look in self._closer_looks:
-                look.carry(camera.motion, self._glances.lattice)
+                look.carry(camera.motion, self._source.lattice)
         if self._decisions is not None:
             self._decisions.follow(camera.motion)
 
@@ -390,27 +390,27 @@ class WindowEpisode(Episode[ZoomPath]):
         width, height = view.picture.size
         return self._camera.step(view.picture.pixels((0, 0, width, height)))
 
-    def _turn(self) -> bool:
+    def _step(self) -> bool:
         """Make the next look of the search or the exploration; returns whether one was left."""
-        assert self._glances is not None
-        turn = next(self._turns, None)
-        if turn is None:
+        assert self._source is not None
+        step = next(self._steps, None)
+        if step is None:
             return False
-        self._last = turn
-        self._number(turn.look)
+        self._last = step
+        self._number(step.newest)
         if self.forgetting is not None:
-            oldest = self._glances.time - self.forgetting.span
+            oldest = self._source.time - self.forgetting.span
             self._closer_looks = [look for look in self._closer_looks if look.time >= oldest]
         if self._decisions is not None:
-            last = turn.ahead == 0 or self.limits.room(self.passes) <= 1
-            self._decisions.see(turn, self.passes, last=last)
+            last = step.ahead == 0 or self.limits.room(self.passes) <= 1
+            self._decisions.see(step, self.passes, last=last)
             self.criterion = self._decisions.criterion
         return True
 
     def _close_up(self, box: Tensor) -> Detections:
         """Spend a pass on a closer look at a box."""
-        assert self._glances is not None
-        look = KeptLook(look_closely(self._glances, box, self._closer), self._glances.time, 0.0)
+        assert self._source is not None
+        look = KeptLook(look_closely(self._source, box, self._closer), self._source.time, 0.0)
         self._number(look)
         self._closer_looks.append(look)
         return look.taken.candidates
@@ -442,7 +442,7 @@ class WindowEpisode(Episode[ZoomPath]):
         if not self.searches or self.target is None:
             return None
         best, box = 0.0, None
-        for detections in (glance.detections for glance in self.glances):
+        for detections in (look.detections for look in self.window_looks):
             scores = detections.class_scores[0, :, self.target - 1]
             if len(scores) and float(scores.max()) > best:
                 best, box = float(scores.max()), detections.boxes[0, scores.argmax()]
@@ -454,9 +454,9 @@ class WindowEpisode(Episode[ZoomPath]):
         return None if self._last is None else self._last.belief
 
     @property
-    def glances(self) -> list[Glance]:
+    def window_looks(self) -> list[WindowLook]:
         """The looks that count, in their order, where they lie in the present frame."""
-        return [look.glance for look in self._looks]
+        return [look.current for look in self._looks]
 
     @property
     def _looks(self) -> list[KeptLook]:
@@ -465,7 +465,7 @@ class WindowEpisode(Episode[ZoomPath]):
         return sorted([*chosen, *self._closer_looks], key=lambda look: look.number)
 
     def record(self) -> ZoomPath:
-        picture = self._glances.view.picture if isinstance(self._glances, LiveGlances) else None
+        picture = self._source.view.picture if isinstance(self._source, LiveWindowLooks) else None
         path = None if picture is None else picture.path
         return ZoomPath(
             **self._recorded(),
@@ -477,27 +477,27 @@ class WindowEpisode(Episode[ZoomPath]):
 
     def moment(self) -> WindowMoment:
         assert self._last is not None
-        assert isinstance(self._glances, LiveGlances)
+        assert isinstance(self._source, LiveWindowLooks)
         candidate = None if self._decisions is None else self._decisions.candidate
         return WindowMoment(
             **self._recorded(),
-            photograph=reduced_copy(self._glances.view.picture),
+            photograph=reduced_copy(self._source.view.picture),
             number=self.passes - 1,
             lost=self._lost,
             next_window=self._last.choices[0][0]
             if candidate is None
-            else closer_window(self._glances.lattice, candidate.box, self._closer),
+            else closer_window(self._source.lattice, candidate.box, self._closer),
         )
 
     def _recorded(self) -> dict[str, Any]:
         """What the record of a picture and that of a frame share."""
-        assert self._glances is not None
-        lattice, looks = self._glances.lattice, self._looks
-        glances = [look.glance for look in looks]
+        assert self._source is not None
+        lattice, looks = self._source.lattice, self._looks
+        window_looks = [look.current for look in looks]
         fading = self.forgetting is not None and self.forgetting.rate > 0
         closer = () if self._decisions is None else self._decisions.looks
         places = {look.number: place for place, look in enumerate(looks)}
-        current = _without_replaced(glances, lattice) if fading else glances
+        current = _without_replaced(window_looks, lattice) if fading else window_looks
         sought, unseen = self.targets or self.target, None
         if self.certainty is None:
             objects = merge(current, sought)
@@ -518,7 +518,7 @@ class WindowEpisode(Episode[ZoomPath]):
             "target": self.target,
             "targets": self.targets,
             "decision": self.decision,
-            "glances": tuple(glances),
+            "window_looks": tuple(window_looks),
             "values": tuple(look.value for look in looks),
             "seconds": tuple(look.seconds for look in looks),
             "candidates": objects,
@@ -532,7 +532,7 @@ class WindowEpisode(Episode[ZoomPath]):
     @cached_property
     def _photograph(self) -> Tensor | None:
         """A reduced copy of the picture; None for stored looks."""
-        return reduced_copy(self._glances.view.picture) if isinstance(self._glances, LiveGlances) else None
+        return reduced_copy(self._source.view.picture) if isinstance(self._source, LiveWindowLooks) else None
 
 
 def _followed_camera() -> CameraMotion | None:
@@ -544,17 +544,17 @@ def _followed_camera() -> CameraMotion | None:
         return None
 
 
-def _without_replaced(glances: Sequence[Glance], lattice: Lattice) -> list[Glance]:
+def _without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[WindowLook]:
     """The looks at a stream, without detections whose place and surroundings a later look has shown as closely."""
     current = []
-    for number, glance in enumerate(glances):
-        detections, left = glance.detections, glance.detections.mask[0]
+    for number, look in enumerate(looks):
+        detections, left = look.detections, look.detections.mask[0]
         low, high = detections.boxes[0].split(2, -1)
         around = (high - low) / 2
         low, high = (low - around).clamp(min=0), (high + around).minimum(low.new_tensor(lattice.size))
-        for later in (each.window for each in glances[number + 1 :]):
-            if later.fixation[2] >= glance.window.fixation[2]:
+        for later in (each.window for each in looks[number + 1 :]):
+            if later.fixation[2] >= look.window.fixation[2]:
                 first, last = low.new_tensor(later.region(lattice)).split(2)
                 left = left & ~((low >= first) & (high <= last)).all(-1)
-        current.append(replace(glance, detections=detections.take(left), cut=glance.cut[left]))
+        current.append(replace(look, detections=detections.take(left), cut=look.cut[left]))
     return current

@@ -14,7 +14,7 @@ from semfov.detection.objects import LEAST, box_text
 from semfov.detection.onnx import OnnxDetector
 from semfov.detection.selection import suppress
 from semfov.observation.matching import box_iou
-from semfov.zoom.glances import Window
+from semfov.zoom.looks import Window
 
 _SAME = 0.5  # overlap from which on a box that is listed is one that the bare detector shows
 _MORE = 1.25  # factor of the sum of scores from which on the other order of the channels suits a detector better

@@ -14,7 +14,7 @@ from semfov.belief.observers import Look, Observer, Semantic
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import Scenery
-from semfov.episode import Looks, Sight, Step, StoredLooks
+from semfov.episode import EpisodeLook, Looks, Step, StoredLooks
 from semfov.episode.loop import attend
 from semfov.episode.memory import Memory
 from semfov.episode.stopwatch import Stopwatch
@@ -59,7 +59,7 @@ class _SceneLooks(Looks):
         self._row[episodes] = torch.tensor(rows)
         self._place[episodes] = torch.tensor([self._starts[scene][1] for scene in scenes])
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Read the looks at the cells from the table; the fixations are the centres of the cells."""
         watch = Stopwatch()
         if self._table is None:
@@ -68,7 +68,7 @@ class _SceneLooks(Looks):
         look = self._table[self._row[episodes] + cell]
         watch.lap("weigh")
         place = self._place[episodes] + cell
-        return Sight(look, lambda: self._detections()[place], watch.seconds)
+        return EpisodeLook(look, lambda: self._detections()[place], watch.seconds)
 
     def _detections(self) -> Detections:
         if self._every_look is None:
@@ -208,10 +208,10 @@ class CellGazes(Gazes):
         if not self.pictures:
             return
         detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
-        sight = Sight(None, lambda: detections, {})  # type: ignore[arg-type]
+        look = EpisodeLook(None, lambda: detections, {})  # type: ignore[arg-type]
         visited = self.memory.visited
         values = torch.zeros(visited.shape)
-        step = Step(len(self._steps), _FIRST, cell, point, sight, self.memory.belief, visited, values, cell, point, {})
+        step = Step(len(self._steps), _FIRST, cell, point, look, self.memory.belief, visited, values, cell, point, {})
         self._steps.append(step)
 
     def _view(self, row: int) -> Tensor:

@@ -268,7 +268,7 @@ class ZoomEnv(EpisodeEnv):
     def close(self) -> None:
         """Store the looks of an episode that is not over."""
         if self.gazes.done:
-            self.gazes.glances.save()
+            self.gazes.source.save()
 
 
 def _scenery_or_open(

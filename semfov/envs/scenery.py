@@ -36,8 +36,8 @@ from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.protocols import Trial, episodes_of, explorations_of
 from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge
 
 _Source = Scenes | str | Path | None  # scenes of any kind, or a folder of photographs; None for the embedded scenes
@@ -221,7 +221,7 @@ class ZoomScenery(_Surroundings):
         super().__init__(looking, passes - 1, targets, opened)
         self.evidence, self.annotated = looking.evidence, not isinstance(self.pictures, Pictures)
         # Looks are kept for as long as an environment uses this scenery.
-        self.glances = cache(looking.glances)
+        self.looks_at = cache(looking.looks_at)
         self.episodes = cache(self._list)
 
     @cached_property
@@ -243,8 +243,8 @@ class ZoomScenery(_Surroundings):
 
     def _list(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
-        glances = self.glances(scene)
-        first = glances.see([Window.overview(glances.lattice)])[0]
+        source = self.looks_at(scene)
+        first = source.see([Window.overview(source.lattice)])[0]
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
@@ -259,16 +259,16 @@ class ZoomScenery(_Surroundings):
             "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
         )
 
-    def found(self, looks: Sequence[Glance], scene: int, target: int) -> bool:
+    def found(self, looks: Sequence[WindowLook], scene: int, target: int) -> bool:
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
-            return any(float(glance.show[target - 1]) >= LEAST for glance in looks)
+            return any(float(look.show[target - 1]) >= LEAST for look in looks)
         every = self.pictures.annotation(scene)
         there = every.labels == target
         objects = Annotation(every.boxes[there], every.labels[there], every.crowd[there], every.size)
         return bool(found_in(looks, objects, target).any())
 
-    def share(self, looks: Sequence[Glance], scene: int) -> float:
+    def share(self, looks: Sequence[WindowLook], scene: int) -> float:
         if not self.annotated:
             return float(len(merge(looks, None, score=LEAST)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())

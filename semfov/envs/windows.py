@@ -17,8 +17,8 @@ from semfov.envs.scenery import ZoomScenery
 from semfov.errors import check, check_whole
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath
-from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window
 
 _PICTURE_SIDE = 1280  # longer side in pixels of rendered pictures
 
@@ -69,12 +69,12 @@ class WindowGaze(Gazes):
         """Look at another window; the looks are stored at the end of an episode."""
         reward, terminated, truncated = super().move(rows, actions)
         if terminated or truncated:
-            self.glances.save()
+            self.source.save()
         return reward, terminated, truncated
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """The probability that closer looks find an object, and how closely each place was looked at."""
-        lattice, belief = self.glances.lattice, self.looking.belief
+        lattice, belief = self.source.lattice, self.looking.belief
         assert belief is not None
         expected = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
@@ -88,11 +88,11 @@ class WindowGaze(Gazes):
         return torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()[None]
 
     def places(self, rows: Tensor) -> Tensor:
-        return torch.from_numpy(_action_of(self.glances.lattice, self.window))[None]
+        return torch.from_numpy(_action_of(self.source.lattice, self.window))[None]
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
         """Windows of the picture that were not looked at, padded to the largest number of windows of any picture."""
-        lattice = self.glances.lattice
+        lattice = self.source.lattice
         free = np.zeros((1, self.scenery.windows), dtype=bool)
         free[0, : len(lattice)] = True
         for window in self.done:
@@ -100,7 +100,7 @@ class WindowGaze(Gazes):
         return free
 
     def detections(self, rows: Tensor) -> Detections:
-        return next(glance for glance in self.looking.glances if glance.window == self.window).detections
+        return next(look for look in self.looking.window_looks if look.window == self.window).detections
 
     def draw(self) -> NDArray[np.uint8]:
         image = self.scenery.image(self.episodes[0].scene)[None]
@@ -113,14 +113,14 @@ class WindowGaze(Gazes):
         super().begin(rows, episodes)
         (episode,) = episodes
         self.targets[rows] = episode.target
-        self.glances = self.scenery.glances(episode.scene)
+        self.source = self.scenery.looks_at(episode.scene)
         self.looking = WindowEpisode(self.scenery.classes, self.scenery.evidence, episode.target or None)
-        self.looking.open(self.glances, told=True)
+        self.looking.open(self.source, told=True)
         self.done = set()
-        self._see(Window.overview(self.glances.lattice))
+        self._see(Window.overview(self.source.lattice))
 
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
-        self._see(_window_of(self.glances.lattice, actions[0].numpy()))
+        self._see(_window_of(self.source.lattice, actions[0].numpy()))
         return (self.result == 1) & self.searching
 
     def _see(self, window: Window) -> None:
@@ -129,7 +129,7 @@ class WindowGaze(Gazes):
         if window not in self.done:
             self.looking.look(window=window)
             self.done.add(window)
-        (scene, target), looks = self.episodes[0], self.looking.glances
+        (scene, target), looks = self.episodes[0], self.looking.window_looks
         result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
         self.result = torch.tensor([result], dtype=torch.float64)
 

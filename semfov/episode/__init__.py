@@ -1,16 +1,18 @@
 """Episodes: the loop of active perception, where its looks come from, and the state between two looks."""
 
-from semfov.episode.looks import LiveLooks, Looks, Sight, StoredLooks
+from semfov.episode.looks import EpisodeLook, LiveLooks, Looks, StoredLooks
 from semfov.episode.loop import Step, rollout
 from semfov.episode.memory import Forgetting
 from semfov.episode.stopwatch import STAGES
 
+Sight = EpisodeLook  # its name before "look" became the only word for a look
+
 __all__ = [
     "STAGES",
+    "EpisodeLook",
     "Forgetting",
     "LiveLooks",
     "Looks",
-    "Sight",
     "Step",
     "StoredLooks",
     "rollout",

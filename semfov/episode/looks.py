@@ -18,23 +18,23 @@ from semfov.eye import Eye, View
 
 
 @dataclass(frozen=True)
-class Sight:
+class EpisodeLook:
     """One look of each of A episodes.
 
     Attributes:
-        look: evidence of the looks, from `Observer.weigh`.
+        evidence: what the looks tell, from `Observer.weigh`.
         detections: function that returns the detections, a batch of A.
         seconds: time by stage.
         passed: seconds since the look before, in a stream.
 
     >>> from semfov.belief.observers.semantic import SemanticLook
-    >>> look = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
-    >>> sight = Sight(look, lambda: None, {"detect": 0.02})
-    >>> sight.seconds
+    >>> evidence = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
+    >>> look = EpisodeLook(evidence, lambda: None, {"detect": 0.02})
+    >>> look.seconds
     {'detect': 0.02}
     """
 
-    look: Look
+    evidence: Look
     detections: Callable[[], Detections]
     seconds: dict[str, float]
     passed: float = FRAME
@@ -52,14 +52,14 @@ class Looks(ABC):
         class Recorded(semfov.episode.Looks):
             def see(self, observer, episodes, cell, fixation):
                 detections = self.recorded[cell]  # a batch of A
-                return Sight(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
+                return EpisodeLook(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
     """
 
     grid: Grid
     like: Tensor
 
     @abstractmethod
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Make one look in each of A episodes.
 
         Args:
@@ -101,13 +101,13 @@ class LiveLooks(Looks):
         self.like = view.canvas.new_empty(0, device=device)
         self.passed = FRAME
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Foveate, detect and weigh."""
         watch = Stopwatch()
         detections = self.eye.look(self.view, fixation, watch.lap).to(self.like.device)
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")
-        return Sight(look, lambda: detections, watch.seconds, self.passed)
+        return EpisodeLook(look, lambda: detections, watch.seconds, self.passed)
 
 
 class StoredLooks(Looks):
@@ -124,8 +124,8 @@ class StoredLooks(Looks):
     >>> scores = torch.tensor([[[0.9, 0.1]], [[0.2, 0.8]]])  # of one detection from each of two cells
     >>> seen = Detections(torch.tensor([[[6.0, 0, 9, 9]]]).repeat(2, 1, 1), scores, torch.ones(2, 1).bool())
     >>> looks = StoredLooks(seen, Grid(2, 1, (10, 10)), torch.tensor([1]))
-    >>> sight = looks.see(Semantic(2), torch.tensor([0]), torch.tensor([1]), torch.tensor([[7.0, 4.5]]))
-    >>> sight.detections().scores[0]
+    >>> look = looks.see(Semantic(2), torch.tensor([0]), torch.tensor([1]), torch.tensor([[7.0, 4.5]]))
+    >>> look.detections().scores[0]
     tensor([[0.2000, 0.8000]])
     """
 
@@ -148,13 +148,13 @@ class StoredLooks(Looks):
         looks.targets = None if self.targets is None else self.targets[episodes]
         return looks
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Take the stored looks of the cells; the fixations must be their centres."""
         watch = Stopwatch()
         targets = None if self.targets is None else self.targets[episodes]
         look = self.weighed(observer)[self.first_row(observer, targets) + cell]
         watch.lap("weigh")
-        return Sight(look, lambda: self.detections[cell], watch.seconds)
+        return EpisodeLook(look, lambda: self.detections[cell], watch.seconds)
 
     def first_row(self, observer: Observer, targets: Tensor | None) -> Tensor:
         """Row of `weighed` with the look from cell 0, for each target.

@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
-from semfov.episode.looks import Looks, Sight
+from semfov.episode.looks import EpisodeLook, Looks
 from semfov.episode.memory import Forgetting, Memory
 from semfov.episode.stopwatch import Stopwatch
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -25,7 +25,7 @@ class Step:
         episodes: `(A,)`, numbers of the episodes, from 0 to B - 1.
         cell: `(A,)`, the fixated cell.
         fixation: `(A, 2)`, the fixated point as `(x, y)` in pixels.
-        sight: the looks.
+        look: the looks.
         belief: the belief after the looks.
         visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from, including this one.
         values: `(A, X·Y)`, values of the acquisition function.
@@ -43,7 +43,7 @@ class Step:
     episodes: Tensor
     cell: Tensor
     fixation: Tensor
-    sight: Sight
+    look: EpisodeLook
     belief: Belief
     visited: Tensor
     values: Tensor
@@ -54,7 +54,7 @@ class Step:
     @property
     def detections(self) -> Detections:
         """The detections, a batch of A."""
-        return self.sight.detections()
+        return self.look.detections()
 
 
 def attend(
@@ -65,21 +65,21 @@ def attend(
     cell: Tensor,
     fixation: Tensor,
     forgetting: Forgetting | None = None,
-) -> tuple[Sight, Memory]:
+) -> tuple[EpisodeLook, Memory]:
     """Make one look in each episode and update its state. `rollout` and the environments share this step."""
-    sight = looks.see(observer, episodes, cell, fixation)
-    watch = Stopwatch(sight.seconds)
+    look = looks.see(observer, episodes, cell, fixation)
+    watch = Stopwatch(look.seconds)
     belief, age = memory.belief, memory.age
     if forgetting is not None:
-        age = age + sight.passed
-        belief = observer.fade(belief, sight.look, forgetting.keep**sight.passed, forgetting.visited(age))
-    belief = observer.update(belief, sight.look)
+        age = age + look.passed
+        belief = observer.fade(belief, look.evidence, forgetting.keep**look.passed, forgetting.visited(age))
+    belief = observer.update(belief, look.evidence)
     watch.lap("update belief")
     visited = memory.visited.scatter(-1, cell[:, None], True)
     if forgetting is not None:
         age = age.scatter(-1, cell[:, None], 0)
         visited = forgetting.visited(age)
-    return replace(sight, seconds=watch.seconds), Memory(belief, visited, age)
+    return replace(look, seconds=watch.seconds), Memory(belief, visited, age)
 
 
 def rollout(
@@ -135,14 +135,14 @@ def rollout(
     episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
     memory = Memory.empty(looks, observer, len(start))
     for shift in range(most):
-        sight, memory = attend(looks, observer, memory, episodes, cell, fixation, forgetting)
+        look, memory = attend(looks, observer, memory, episodes, cell, fixation, forgetting)
         belief, visited = memory.belief, memory.visited
-        watch = Stopwatch(sight.seconds)
+        watch = Stopwatch(look.seconds)
         values = acquire(episodes, cell)(belief, visited)
         next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
         watch.lap("choose")
         step = Step(
-            shift, episodes, cell, fixation, sight, belief, visited, values, next_cell, next_fixation, watch.seconds
+            shift, episodes, cell, fixation, look, belief, visited, values, next_cell, next_fixation, watch.seconds
         )
         yield step
         over = visited.all(-1)

@@ -12,7 +12,7 @@ from semfov.belief.observers import Observer
 from semfov.belief.observers.base import own
 from semfov.belief.observers.gathering import EvidenceLook, Gatherer
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, Step, rollout
+from semfov.episode import EpisodeLook, Looks, Step, rollout
 from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.choice import Greedy
 
@@ -60,7 +60,7 @@ class _ExampleLooks(Looks):
         self.examples, self.grid = examples, grid
         self.like = examples.score
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Look up the looks from some cells, processed by the model in training."""
         examples, model = self.examples, own(observer, Gatherer, "observer").model  # type: ignore[type-abstract]
         look = examples.looks(
@@ -72,7 +72,7 @@ class _ExampleLooks(Looks):
             self.grid.columns,
             *(getattr(examples, name)[episodes] for name in examples.more),
         )
-        return Sight(look, _no_detections, {})
+        return EpisodeLook(look, _no_detections, {})
 
 
 def _no_detections() -> Detections:

@@ -16,12 +16,12 @@ from semfov.fit.windows_certainty import Exploration, fit_spread, left_out, logi
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes, numbers_drawn
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, WindowLook, look_closely
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, SearchLook, look_closely
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
-from semfov.zoom.glances import Glance, Glances, Window
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.slices import usual_slices
 
 _FOLDS = 5
@@ -38,7 +38,7 @@ _FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
 
 
-class _WholeSearch(TargetSearch[WindowLook]):
+class _WholeSearch(TargetSearch[SearchLook]):
     """A search of a photograph after the look at the whole; objects `(M, 4)`."""
 
     after = (1,)
@@ -48,23 +48,23 @@ class _WholeSearch(TargetSearch[WindowLook]):
         self,
         number: int,
         target: int,
-        glances: Glances,
-        whole: Glance,
+        source: WindowLooks,
+        whole: WindowLook,
         objects: Tensor,
         model: PhotographEvidence,
         *,
         spare: bool = False,
     ) -> None:
         self.picture, self.target, self.present, self.spare = number, target, len(objects) > 0, spare
-        self.candidates = partial(PhotographPlaces, target, glances.lattice, window=model.window)
-        self.close_up = lambda box: look_closely(glances, box, model.window).candidates
+        self.candidates = partial(PhotographPlaces, target, source.lattice, window=model.window)
+        self.close_up = lambda box: look_closely(source, box, model.window).candidates
         self.steps, self.objects, self.model = (whole,), objects, model
         self.best = float(whole.show[target - 1])  # highest score of the target
 
-    def look(self, index: int, number: int) -> WindowLook:
+    def look(self, index: int, number: int) -> SearchLook:
         """The look at the whole, with the probability after it."""
         presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return WindowLook(self.steps[0].candidates, number, float(presence), self.best, 0.0)
+        return SearchLook(self.steps[0].candidates, number, float(presence), self.best, 0.0)
 
     def right(self, box: Tensor) -> bool:
         """Whether the centre of a box `(4,)` lies in an annotated box of the class."""
@@ -97,17 +97,17 @@ def fit_photographs(
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
     for number, index in enumerate(track(looked, "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
-        glances = StoredGlances(eye, pictures, index, None)
+        source = StoredWindowLooks(eye, pictures, index, None)
         with torch.inference_mode():
-            looks = glances.see([Window.overview(glances.lattice), *usual_slices(glances.lattice)])
+            looks = source.see([Window.overview(source.lattice), *usual_slices(source.lattice)])
         shown.append(looks[0].show)
         usual = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
         more = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
         for place, target in enumerate(more):
             boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
-            searches.append(_WholeSearch(number, target, glances, looks[0], boxes, evidence, spare=spare))
-        explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, glances.lattice, annotation)
+            searches.append(_WholeSearch(number, target, source, looks[0], boxes, evidence, spare=spare))
+        explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, source.lattice, annotation)
     numbers = left_out(explored, _fit_objects, _CHECKED)
     told: list[str] = []
     evidence.certainty = certainty = _fit_objects([each for fold in explored.values() for each in fold])
@@ -171,7 +171,7 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
     return (usual - shift).sigmoid().clamp(1e-4, 1 - 1e-4).float()
 
 
-def _explored(looks: Sequence[Glance], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
+def _explored(looks: Sequence[WindowLook], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
     """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
     labels = annotation.labels
     for target in (None, *([int(labels.mode().values)] if len(labels) else [])):

@@ -36,14 +36,14 @@ from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker, run_tasks
-from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import CandidateBoxes, WindowLook, look_closely
+from semfov.zoom.closer import CandidateBoxes, SearchLook, look_closely
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import WindowStep, look_for
 from semfov.zoom.evidence import GlimpseEvidence, Survey
 from semfov.zoom.eye import WindowEye
-from semfov.zoom.glances import Glance
+from semfov.zoom.looks import WindowLook
 
 _JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
 
@@ -60,34 +60,34 @@ class _Searches(NamedTuple):
 
 @torch.inference_mode()
 def _searches_of(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
 ) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]]]:
     """Search every picture for some present classes and for as many absent ones, without decisions."""
     for index, looks in enumerate(track(opened, title, "picture")):
         annotation = pictures.annotation(index)
         for target in choose_classes(pictures, index, annotation, config.sought, 1.0, config.seed):
-            turns = islice(look_for(looks, model, target), config.passes)
-            yield index, annotation, target, _with_facts(turns)
+            steps = islice(look_for(looks, model, target), config.passes)
+            yield index, annotation, target, _with_facts(steps)
         looks.save()
 
 
-def _with_facts(turns: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]:
+def _with_facts(steps: Iterable[WindowStep[ZoomBelief]]) -> Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]:
     """The turns of a search, each with the facts about the search after it."""
     facts: SearchFacts | None = None
-    for turn in turns:
-        facts = facts or SearchFacts(turn.belief)
-        facts.add(turn.glance)
-        yield turn, facts
+    for step in steps:
+        facts = facts or SearchFacts(step.belief)
+        facts.add(step.look)
+        yield step, facts
 
 
 @torch.inference_mode()
 def _picture_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
 ) -> _Searches:
     """Run all searches of `_searches_of`, and collect them."""
     rows: list[list[Tensor]] = []
-    for _, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
-        steps = [(facts.best, facts.case(turn.ahead), facts.detected, turn.ahead) for turn, facts in turns]
+    for _, annotation, target, window_steps in _searches_of(model, pictures, opened, config, title):
+        steps = [(facts.best, facts.case(step.ahead), facts.detected, step.ahead) for step, facts in window_steps]
         steps += [(*steps[-1][:3], 0.0)] * (config.passes - len(steps))
         best, case, looked, left = zip(*steps, strict=True)
         there = torch.tensor(bool((annotation.labels == target).any()))
@@ -128,7 +128,7 @@ def _judge_searches(model: GlimpseEvidence, searches: _Searches, bounds: Any) ->
     return table(rows)
 
 
-class _MosaicSearch(TargetSearch[WindowLook]):
+class _MosaicSearch(TargetSearch[SearchLook]):
     """A search of a mosaic; objects `(M, 4)`, boxes `(4,)`."""
 
     after = (1, 3, 5, 8, 12, 16, 24)
@@ -136,25 +136,25 @@ class _MosaicSearch(TargetSearch[WindowLook]):
     def __init__(
         self,
         mosaic: int,
-        looks: StoredGlances,
+        looks: StoredWindowLooks,
         target: int,
         objects: Tensor,
         passes: int,
         likely: float,
-        turns: Iterable[tuple[WindowStep[ZoomBelief], SearchFacts]],
+        steps: Iterable[tuple[WindowStep[ZoomBelief], SearchFacts]],
     ) -> None:
         self.picture, self.target, self.present, self.passes = mosaic, target, len(objects) > 0, passes
         self.candidates = partial(CandidateBoxes, target, likely)
         self.close_up = lambda box: look_closely(looks, box).detections
-        self.looks, self.objects, self.steps = looks, objects, list[WindowLook]()
-        self.glances, self.boxes = list[Glance](), list[Tensor | None]()
-        for number, (turn, facts) in enumerate(turns, 1):
-            presence = facts.presence(turn.ahead)
-            self.steps.append(WindowLook(turn.glance.detections, number, presence, facts.best, turn.ahead))
-            self.glances.append(turn.glance)
+        self.looks, self.objects, self.steps = looks, objects, list[SearchLook]()
+        self.window_looks, self.boxes = list[WindowLook](), list[Tensor | None]()
+        for number, (step, facts) in enumerate(steps, 1):
+            presence = facts.presence(step.ahead)
+            self.steps.append(SearchLook(step.look.detections, number, presence, facts.best, step.ahead))
+            self.window_looks.append(step.look)
             self.boxes.append(facts.box if facts.detected else None)
 
-    def look(self, index: int, number: int) -> WindowLook:
+    def look(self, index: int, number: int) -> SearchLook:
         """Return a look with the number of looks up to it."""
         return self.steps[index]._replace(number=number)
 
@@ -175,18 +175,18 @@ class _MosaicSearch(TargetSearch[WindowLook]):
 
 @torch.inference_mode()
 def _mosaic_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredGlances], config: FitMosaicsConfig, title: str
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
 ) -> Iterator[_MosaicSearch]:
     """Search every picture, without closer looks (`_searches_of`)."""
     assert model.thresholds is not None
-    for index, annotation, target, turns in _searches_of(model, pictures, opened, config, title):
+    for index, annotation, target, steps in _searches_of(model, pictures, opened, config, title):
         objects = annotation.boxes[annotation.labels == target]
-        yield _MosaicSearch(index, opened[index], target, objects, config.passes, model.thresholds.confirm, turns)
+        yield _MosaicSearch(index, opened[index], target, objects, config.passes, model.thresholds.confirm, steps)
 
 
 def _fit_closer(
     model: GlimpseEvidence,
-    pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredGlances]]]],
+    pictures: Mapping[str, Sequence[tuple[Scenes, Sequence[StoredWindowLooks]]]],
     config: FitMosaicsConfig,
     prior: Verification | None = None,
 ) -> str:
@@ -235,9 +235,9 @@ def _look(fit: "MosaicFit", task: tuple[str, int]) -> bytes:
     """Look at all windows of a picture that are not in the store yet; returns what the store has of it."""
     kind, index = task
     pictures = fit.pictures[kind]
-    glances = StoredGlances(fit.eye, pictures, index, fit.store)
-    glances.see(ZoomExample.windows(pictures, index, glances.lattice))
-    glances.save()
+    source = StoredWindowLooks(fit.eye, pictures, index, fit.store)
+    source.see(ZoomExample.windows(pictures, index, source.lattice))
+    source.save()
     kept = fit.store.read(pictures.digest(index))
     return b"" if kept is None else pack_tensors(kept)
 
@@ -263,17 +263,17 @@ class MosaicFit:
             "crowded": self.mosaic(crowded(self.training, 1 / 3), 4, 4, config.crowded, 5),
         }
         self.pictures: dict[str, Scenes] = {**self.mosaics}
-        self.store = GlanceStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+        self.store = WindowLookStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
     def mosaic(self, scenes: Scenes, columns: int, rows: int, count: int, number: int) -> Mosaics:
         """Mosaics of photographs, with the seed of this number."""
         tile = self.config.tile, self.config.tile * 3 // 4
         return Mosaics(scenes, columns, rows, tile=tile, count=count, seed=self.config.seed + number)
 
-    def opened(self, kind: str) -> list[StoredGlances]:
+    def opened(self, kind: str) -> list[StoredWindowLooks]:
         """The stored looks at each picture of a kind."""
         pictures = self.pictures[kind]
-        return [StoredGlances(self.eye, pictures, index, self.store) for index in range(len(pictures))]
+        return [StoredWindowLooks(self.eye, pictures, index, self.store) for index in range(len(pictures))]
 
     def look(self, kinds: Sequence[str]) -> dict[str, list[ZoomExample]]:
         """Look at all pictures of some kinds; returns the looks by kind, of pictures with closer looks."""
@@ -360,7 +360,7 @@ class MosaicFit:
         prepare_worker()
         return certainty_again(model, *self.explored(), passes=self.config.passes)
 
-    def explored(self) -> list[dict[str, tuple[Scenes, list[StoredGlances]]]]:
+    def explored(self) -> list[dict[str, tuple[Scenes, list[StoredWindowLooks]]]]:
         """Pictures to fit the certainty on, and to evaluate it on, by kind, with their looks."""
         fitted, judged = self._searched().values()
         some = self.config.some_explored

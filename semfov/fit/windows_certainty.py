@@ -14,11 +14,11 @@ from semfov.metrics.calibration import BinarySums
 from semfov.runs.progress import track
 from semfov.runs.tables import table
 from semfov.runs.window_looking import right_boxes
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything
-from semfov.zoom.glances import Glance
+from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge_with_facts
 
 _AFTER = (3, 6, 12, 24)  # numbers of looks after which objects are taken
@@ -51,7 +51,7 @@ class Exploration(NamedTuple):
     def of(
         cls,
         target: int | None,
-        looks: Sequence[Glance],
+        looks: Sequence[WindowLook],
         numbers: Collection[int],
         lattice: Lattice,
         annotation: Annotation,
@@ -90,7 +90,7 @@ class Exploration(NamedTuple):
 
 @torch.inference_mode()
 def explorations_of_kinds(
-    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]], passes: int
+    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]], passes: int
 ) -> dict[str, list[Exploration]]:
     """Explore pictures by kind, for objects of all classes and for those of the most frequent class of each."""
     explored: dict[str, list[Exploration]] = {kind: [] for kind in some}
@@ -98,15 +98,15 @@ def explorations_of_kinds(
         for index, looks in enumerate(track(opened, f"exploring, {kind}", "picture")):
             annotation = pictures.annotation(index)
             for target in (None, int(annotation.labels.bincount().argmax())):
-                glances: list[Glance] = []
+                window_looks: list[WindowLook] = []
                 remaining, promised = [], [0.0]
-                for turn in islice(find_everything(looks, model, target), _FURTHER * passes):
-                    glances.append(turn.glance)
-                    remaining.append(turn.belief.remaining())
-                    promised.append(promised[-1] + (turn.worth if len(glances) > 1 else 0.0))
-                counts = {min(n, len(glances)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
+                for step in islice(find_everything(looks, model, target), _FURTHER * passes):
+                    window_looks.append(step.look)
+                    remaining.append(step.belief.remaining())
+                    promised.append(promised[-1] + (step.worth if len(window_looks) > 1 else 0.0))
+                counts = {min(n, len(window_looks)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
                 explored[kind].append(
-                    Exploration.of(target, glances, counts, looks.lattice, annotation, remaining, promised[1:])
+                    Exploration.of(target, window_looks, counts, looks.lattice, annotation, remaining, promised[1:])
                 )
             looks.save()
     return explored
@@ -255,8 +255,8 @@ def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Explora
 
 def certainty_again(
     model: GlimpseEvidence,
-    fitted: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]],
-    judged: Mapping[str, tuple[Scenes, Sequence[StoredGlances]]],
+    fitted: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]],
+    judged: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]],
     *,
     passes: int,
 ) -> list[str]:

@@ -18,9 +18,9 @@ from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, Survey, pool
-from semfov.zoom.glances import Glances, Window, half_steps
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLooks, half_steps
 
 
 class _WindowResult(NamedTuple):
@@ -48,16 +48,16 @@ class ZoomExample(NamedTuple):
         return [*half_steps(lattice), *(Window.around(lattice, slot) for slot in slots)]
 
     @classmethod
-    def of(cls, pictures: Scenes, index: int, glances: Glances, least: float = LEAST) -> "ZoomExample":
+    def of(cls, pictures: Scenes, index: int, source: WindowLooks, least: float = LEAST) -> "ZoomExample":
         """Look at all windows of a picture, and collect which objects are shown with a detection of their class."""
         annotation, looks = pictures.annotation(index), []
-        for glance in glances.see(cls.windows(pictures, index, glances.lattice)):
-            detections = glance.detections
+        for look in source.see(cls.windows(pictures, index, source.lattice)):
+            detections = look.detections
             sure = detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
             boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
             hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
-            looks.append(_WindowResult(glance.window, glance.gist, glance.show, hits.any(0)))
-        return cls(glances.lattice, annotation.labels, tuple(looks), least)
+            looks.append(_WindowResult(look.window, look.gist, look.show, hits.any(0)))
+        return cls(source.lattice, annotation.labels, tuple(looks), least)
 
 
 _Cells = tuple[int, int, int, int]  # first column and row, and those after the last

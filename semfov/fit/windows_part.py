@@ -21,10 +21,10 @@ from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes
 from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
-from semfov.zoom.glances import Glance
+from semfov.zoom.looks import WindowLook
 from semfov.zoom.slices import ranked, usual_slices
 
 _ENOUGH = 16  # smallest number of held-out photographs, with which a mosaic shows none of them twice
@@ -146,23 +146,25 @@ def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
 
 
 @torch.inference_mode()
-def _photograph_recalls(mosaics: Mosaics, opened: Sequence[StoredGlances], model: GlimpseEvidence | None) -> FloatArray:
+def _photograph_recalls(
+    mosaics: Mosaics, opened: Sequence[StoredWindowLooks], model: GlimpseEvidence | None
+) -> FloatArray:
     """Recall in each photograph of mosaics after each pass, `(P, 16)`; without a model by slices, as by an agent."""
     hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
-    for index, glances in enumerate(opened):
+    for index, source in enumerate(opened):
         tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
         photograph = np.repeat(
             [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.scene).boxes) for tile in tiles]
         )
         np.add.at(there, photograph, 1)
-        history: list[Glance] = []
-        turns: Iterator[WindowStep[Any]] = look_by_look(glances, ranked(usual_slices(glances.lattice)), None)
+        history: list[WindowLook] = []
+        steps: Iterator[WindowStep[Any]] = look_by_look(source, ranked(usual_slices(source.lattice)), None)
         if model is not None:
-            turns = find_everything(glances, model)
+            steps = find_everything(source, model)
         for number in range(_RECALL_PASSES[-1]):
-            turn = next(turns, None)
-            if turn is not None:
-                history.append(turn.glance)
+            step = next(steps, None)
+            if step is not None:
+                history.append(step.look)
             np.add.at(hits[:, number], photograph, found_in(history, annotation).numpy())
-        glances.save()
+        source.save()
     return hits[there > 0] / there[there > 0, None]

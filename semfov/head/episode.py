@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, rollout
+from semfov.episode import EpisodeLook, Looks, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -31,13 +31,13 @@ class _HeadLooks(Looks):
         self.views, self.detect, self.target = views, detect, target
         self.grid, self.like = views.grid, views.poses
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         watch = Stopwatch()
         detections = self.detect(int(cell))
         watch.lap("detect")
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")
-        return Sight(look, lambda: detections, watch.seconds)
+        return EpisodeLook(look, lambda: detections, watch.seconds)
 
 
 def live(eye: Eye, views: Views) -> Detect:

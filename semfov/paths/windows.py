@@ -18,8 +18,8 @@ from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.look import Box, RecordedLook
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
 from semfov.zoom.closer import PhotographPlaces
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge
 
 _WINDOW_VALUES = {
@@ -69,7 +69,7 @@ class ZoomPath(Record):
 
     Attributes:
         lattice: lattice of the picture.
-        glances: looks in their order, the overview first. In a path from a file they have no gist.
+        window_looks: looks in their order, the overview first. In a path from a file they have no gist.
         values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
             probability that the target is at the place.
         candidates: objects merged from all looks (`semfov.zoom.merge`). With a fitted certainty their scores are the
@@ -78,19 +78,19 @@ class ZoomPath(Record):
             suit the picture (`semfov.zoom.certainty`).
         detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
-        closer: closer looks of a search, in their order; they are among the `glances`, each with its `number`.
+        closer: closer looks of a search, in their order; they are among the `window_looks`, each with its `number`.
 
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> path = ZoomPath(
-    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(), values=(), candidates=nothing
+    ...     lattice=lattice, classes=("background", "cup"), target=1, window_looks=(), values=(), candidates=nothing
     ... )
     >>> path.describe()
     'No cup found. 0 looks'
     """
 
     lattice: Lattice
-    glances: tuple[Glance, ...]
+    window_looks: tuple[WindowLook, ...]
     values: tuple[float, ...]
     candidates: Objects = field()
     spread: float = SPREAD
@@ -118,7 +118,7 @@ class ZoomPath(Record):
 
     def __post_init__(self) -> None:
         """Derive what the looks and the decision tell."""
-        object.__setattr__(self, "detections", tuple(glance.detections for glance in self.glances))
+        object.__setattr__(self, "detections", tuple(look.detections for look in self.window_looks))
         some = bool(self._sought) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
@@ -167,7 +167,7 @@ class ZoomPath(Record):
         In 12 pictures of airports from above, of whose airplanes the detector shows next to nothing, at most three
         objects of any class have the score `_CLEAR`; in sheets of photographs and in frames of a street nine or more.
         """
-        return self.lattice.levels == 1 or len(merge(self.glances, score=_CLEAR)) >= SEVERAL
+        return self.lattice.levels == 1 or len(merge(self.window_looks, score=_CLEAR)) >= SEVERAL
 
     @property
     def size(self) -> tuple[int, int]:
@@ -195,7 +195,7 @@ class ZoomPath(Record):
         """
         target, least = self.target, PhotographPlaces.least
         decided = self.ending == "decision" and self.lattice.levels == 1 and not self.closer
-        if decided and target is not None and all(float(each.show[target - 1]) < least for each in self.glances):
+        if decided and target is not None and all(float(each.show[target - 1]) < least for each in self.window_looks):
             return self._sentences["unseen"]
         return super().why_it_ended()
 
@@ -237,12 +237,12 @@ class ZoomPath(Record):
         return low, max(low, round(mean + error))
 
     def _looks(self) -> Iterator[RecordedLook]:
-        clock = self.seconds or (None,) * len(self.glances)
-        for number, (glance, seconds, value) in enumerate(zip(self.glances, clock, self.values, strict=True)):
-            window, chosen = glance.window, value if math.isfinite(value) else None
+        clock = self.seconds or (None,) * len(self.window_looks)
+        for number, (look, seconds, value) in enumerate(zip(self.window_looks, clock, self.values, strict=True)):
+            window, chosen = look.window, value if math.isfinite(value) else None
             more = {"magnification": window.fixation[2], "level": window.level}
             point, region = window.centre(self.lattice), window.region(self.lattice)
-            yield RecordedLook(number, point, region, glance.detections, seconds, chosen, more)
+            yield RecordedLook(number, point, region, look.detections, seconds, chosen, more)
 
     @property
     def value_in_words(self) -> str:
@@ -257,7 +257,7 @@ class ZoomPath(Record):
     def sensor_in_words(self) -> str:
         """Describe the windows of the lattice and of the closer looks."""
         wide, high = self.lattice.canvas
-        looked = {*self.lattice.magnifications, *(glance.window.fixation[2] for glance in self.glances)}
+        looked = {*self.lattice.magnifications, *(look.window.fixation[2] for look in self.window_looks)}
         told = list(dict.fromkeys(f"{magnification:.2g}" for magnification in sorted(looked)))
         magnifications = ", ".join(told) if len(told) <= 6 else f"from {told[0]} to {told[-1]}"
         several = "s" if len(told) > 1 else ""
@@ -273,9 +273,9 @@ class ZoomPath(Record):
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
-        tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
-        tensors["show"] = torch.stack([glance.show for glance in self.glances])
-        windows = [{name: getattr(glance.window, name) for name in _WINDOW_VALUES} for glance in self.glances]
+        tensors["cut"] = torch.cat([look.cut for look in self.window_looks])
+        tensors["show"] = torch.stack([look.show for look in self.window_looks])
+        windows = [{name: getattr(look.window, name) for name in _WINDOW_VALUES} for look in self.window_looks]
         unseen = None if self.unseen is None else list(self.unseen)
         lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
         numbers = {"unseen": unseen, "spread": self.spread, "seconds": list(self.seconds)}
@@ -296,8 +296,8 @@ class ZoomPath(Record):
         cuts = tensors["cut"].split(record["lengths"])
         return {
             "lattice": lattice,
-            "glances": tuple(
-                Glance(window, detections, cut, show, None)
+            "window_looks": tuple(
+                WindowLook(window, detections, cut, show, None)
                 for window, detections, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
             ),
             "values": tuple(tensors["values"].tolist()),
@@ -345,7 +345,7 @@ class WindowMoment(ZoomPath, Moment):
     @property
     def window(self) -> Window:
         """The window that was looked at in this frame."""
-        return self.glances[-1].window
+        return self.window_looks[-1].window
 
     def describe(self) -> str:
         """Describe objects or decision at the frame in a few words."""

@@ -9,7 +9,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight
+from semfov.episode import EpisodeLook, Looks
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import LookingConfig
@@ -77,7 +77,7 @@ class CellLooks(Looks):
     def __init__(self, look: Callable[[int], Detections], grid: Grid, like: Tensor, target: int | None = None) -> None:
         self.look, self.grid, self.like, self.target = look, grid, like, target
 
-    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Look, and weigh; the fixations are the centres of the cells."""
         detections = Detections.stack([self.look(number) for number in cell.tolist()])
-        return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
+        return EpisodeLook(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})

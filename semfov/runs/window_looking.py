@@ -16,11 +16,11 @@ from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.settings import Range, Seed, Side, Whole
 from semfov.runs.setup import make_detector, make_scenes
-from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
-from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
+from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
 
 TileSize = Annotated[int, Range(16, 16_384)]  # side of a part of a picture in pixels
@@ -75,17 +75,17 @@ class WindowLooking:
                 photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
             )
         folder = store_folder(config.cache) / "glances"
-        self.store = GlanceStore(folder, self.eye.settings(), len(detector.classes))
+        self.store = WindowLookStore(folder, self.eye.settings(), len(detector.classes))
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
         """Open the photographs; a subclass may open others."""
         return make_scenes(self.config.data, classes)
 
-    def glances(self, index: int) -> StoredGlances:
-        return StoredGlances(self.eye, self.scenes, index, self.store if self.config.store else None)
+    def looks_at(self, index: int) -> StoredWindowLooks:
+        return StoredWindowLooks(self.eye, self.scenes, index, self.store if self.config.store else None)
 
 
-def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
+def found_in(looks: Sequence[WindowLook], annotation: Annotation, target: int | None = None) -> Tensor:
     """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
     objects = merge(looks, target, score=DETECTION_SCORE)
     hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)

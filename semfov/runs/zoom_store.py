@@ -12,16 +12,16 @@ from semfov.detection.load import load_detector
 from semfov.io.schema import Field
 from semfov.runs.store import DetectionStore, RememberedLooks
 from semfov.zoom import Lattice, WindowEye
-from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.hints import Gist
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 
 
-class GlanceStore(DetectionStore):
-    """Glances at pictures by window, on disk."""
+class WindowLookStore(DetectionStore):
+    """Looks at pictures by window, on disk."""
 
     width = 12
-    sources = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
-    """Modules that turn a large picture into glances; all modules that they import count, too."""
+    sources = (WindowLooks.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
+    """Modules that turn a large picture into looks; all modules that they import count, too."""
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
         self.classes = classes
@@ -46,9 +46,9 @@ class GlanceStore(DetectionStore):
         cells: Any = tuple(map(int, row[8:12]))
         return Window((row[0], row[1], row[2]), int(row[7]), cells, within)
 
-    def pack(self, looks: Sequence[Glance]) -> dict[str, Tensor]:
-        """Convert glances to tensors for a file, gists without empty cells; a look without a gist has a scale of 0."""
-        gists, kinds = [glance.gist for glance in looks], self.classes
+    def pack(self, looks: Sequence[WindowLook]) -> dict[str, Tensor]:
+        """Convert looks to tensors for a file, gists without empty cells; a look without a gist has a scale of 0."""
+        gists, kinds = [window_look.gist for window_look in looks], self.classes
         some = [look for look in gists if look is not None]
         frames = [[0, 0, 0] if look is None else [look.scale, *look.scores.shape[:2]] for look in gists]
         scores = torch.cat([torch.zeros(0, kinds), *(look.scores.flatten(0, 1) for look in some)])
@@ -56,9 +56,9 @@ class GlanceStore(DetectionStore):
         found = torch.cat([torch.zeros(0, kinds, dtype=torch.bool), *(look.found.flatten(0, 1) for look in some)])
         full = (scores > 0).any(-1)
         return {
-            **super().pack([glance.detections for glance in looks]),
-            "cut": torch.cat([glance.cut for glance in looks]),
-            "show": torch.stack([glance.show for glance in looks]),
+            **super().pack([window_look.detections for window_look in looks]),
+            "cut": torch.cat([window_look.cut for window_look in looks]),
+            "show": torch.stack([window_look.show for window_look in looks]),
             "gist.frames": torch.tensor(frames),
             "gist.cells": full.nonzero()[:, 0],
             "gist.scores": scores[full].float(),
@@ -66,8 +66,8 @@ class GlanceStore(DetectionStore):
             "gist.found": found.flatten().nonzero()[:, 0],
         }
 
-    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[Glance]:
-        """Convert the tensors of a file back to the glances at these windows."""
+    def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[WindowLook]:
+        """Convert the tensors of a file back to the looks at these windows."""
         frames, kinds = tensors["gist.frames"].tolist(), tensors["gist.scores"].shape[-1]
         counts = [rows * columns for _, rows, columns in frames]
         scores, size = torch.zeros(sum(counts), kinds), torch.zeros(sum(counts))
@@ -82,24 +82,24 @@ class GlanceStore(DetectionStore):
             for window, (scale, rows, columns), *three in zip(actions, frames, *parts, strict=True)
         ]
         seen, cut = super().unpack(tensors, actions), tensors["cut"].split(tensors["count"].tolist())
-        return [Glance(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
+        return [WindowLook(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
 
 
-class StoredGlances(Glances):
+class StoredWindowLooks(WindowLooks):
     """Looks at the windows of one picture, each computed once. They have all their hints."""
 
-    def __init__(self, eye: WindowEye, scenes: Scenes, index: int, store: GlanceStore | None) -> None:
+    def __init__(self, eye: WindowEye, scenes: Scenes, index: int, store: WindowLookStore | None) -> None:
         self.lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
 
-        def open_picture() -> Callable[[Window], Glance]:
-            glances = LiveGlances(eye, eye.open(scenes[index].image))
-            return lambda window: glances.see([window])[0]
+        def open_picture() -> Callable[[Window], WindowLook]:
+            source = LiveWindowLooks(eye, eye.open(scenes[index].image))
+            return lambda window: source.see([window])[0]
 
         # Files of looks have no hints of photographs.
         kept = store if self.lattice.levels > 1 else None
         self.looks = RememberedLooks(open_picture, kept, lambda: scenes.digest(index))
 
-    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
         """The looks at windows, read from the store or computed."""
         return [self.looks(window) for window in windows]
 

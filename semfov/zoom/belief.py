@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from semfov.data.scene import boxes_meet
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, PhotographEvidence, pool_spans
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 
 Cells = NDArray[np.float32]
 
@@ -291,11 +291,11 @@ class ZoomBelief:
             np.copyto(now, before)
             self._mark(_extent(differs))
 
-    def add(self, glance: Glance) -> None:
-        if glance.gist is None:
-            self.discount(glance.window)
+    def add(self, window_look: WindowLook) -> None:
+        if window_look.gist is None:
+            self.discount(window_look.window)
             return
-        look, source = glance.gist, self.source.numpy()
+        look, source = window_look.gist, self.source.numpy()
         self.gists.append(look)
         x1, y1, x2, y2 = box = self._box(look)
         np.maximum(source[y1:y2, x1:x2], look.level, out=source[y1:y2, x1:x2])

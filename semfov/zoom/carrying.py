@@ -14,16 +14,16 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.motion import Motion
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 
 
-def carried(glance: Glance, motion: Motion, lattice: Lattice) -> Glance:
+def carried(look: WindowLook, motion: Motion, lattice: Lattice) -> WindowLook:
     """Carry a look to another frame.
 
     Args:
-        glance: the look, as it was taken.
+        look: the look, as it was taken.
         motion: maps pixels of the frame in which it was taken to those of the other frame.
         lattice: lattice of the frames.
 
@@ -31,11 +31,11 @@ def carried(glance: Glance, motion: Motion, lattice: Lattice) -> Glance:
         The look in pixels of the other frame; its window and its boxes may lie beyond the frame. Its window is none of
         the lattice's any more.
     """
-    window = _carried_window(glance.window, motion, lattice)
-    detections = glance.detections
+    window = _carried_window(look.window, motion, lattice)
+    detections = look.detections
     boxes = Detections(motion.boxes(detections.boxes), detections.scores, detections.mask)
-    gist = None if glance.gist is None else _carried_gist(glance.gist, motion, lattice)
-    return replace(glance, window=window, detections=boxes, gist=gist)
+    gist = None if look.gist is None else _carried_gist(look.gist, motion, lattice)
+    return replace(look, window=window, detections=boxes, gist=gist)
 
 
 def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:

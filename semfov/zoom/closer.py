@@ -16,9 +16,9 @@ from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
-from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 
 _CONTEXT = 3.0  # side of the window of a closer look, in longer sides of the examined box
 
@@ -42,12 +42,12 @@ def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = U
     return Window.around(lattice, (x1, y1, x2, y2))
 
 
-def look_closely(glances: Glances, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Glance:
+def look_closely(source: WindowLooks, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> WindowLook:
     """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
-    return glances.see([closer_window(glances.lattice, box, window)], hints=glances.lattice.levels == 1)[0]
+    return source.see([closer_window(source.lattice, box, window)], hints=source.lattice.levels == 1)[0]
 
 
-class WindowLook(NamedTuple):
+class SearchLook(NamedTuple):
     """One look of a search, and what is known of the target after it, by the prior of the fit."""
 
     detections: Detections
@@ -57,7 +57,7 @@ class WindowLook(NamedTuple):
     left: float
 
 
-class CandidateBoxes(CandidatePlaces[WindowLook]):
+class CandidateBoxes(CandidatePlaces[SearchLook]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
 
     .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
@@ -77,9 +77,9 @@ class CandidateBoxes(CandidatePlaces[WindowLook]):
         self.target, self.likely = target, likely
         self._next = 0
 
-    _look: WindowLook
+    _look: SearchLook
 
-    def see(self, look: WindowLook) -> None:
+    def see(self, look: SearchLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._look, self._next = look, look.number
         self._left = self.prior.place(look.left, look.presence)
@@ -153,7 +153,7 @@ class PhotographPlaces(CandidateBoxes):
         self._lattice, self._window = lattice, window
         self._shown = dict[Window, tuple[int, Detections]]()  # by window, the number of the look and what it shows
 
-    def see(self, look: WindowLook) -> None:
+    def see(self, look: SearchLook) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
         self._shown[Window.overview(self._lattice)] = look.number - 1, look.detections

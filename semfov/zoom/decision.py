@@ -14,12 +14,12 @@ from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, WindowLook
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence, features
-from semfov.zoom.glances import Glance
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
+from semfov.zoom.looks import WindowLook
 
 
 class _LookFacts(NamedTuple):
@@ -43,17 +43,17 @@ class SearchFacts:
         self.belief = belief
         self.looks: list[_LookFacts] = []
 
-    def see(self, looks: Sequence[Glance]) -> None:
+    def see(self, looks: Sequence[WindowLook]) -> None:
         """Take the looks that count after another look; those of earlier ones that are missing were forgotten."""
         if len(looks) != len(self.looks) + 1:
             self.looks = []
-        for glance in looks[len(self.looks) :]:
-            self.add(glance)
+        for look in looks[len(self.looks) :]:
+            self.add(look)
 
-    def add(self, glance: Glance) -> None:
-        target, detections = self.belief.target, glance.detections
-        score, named, found, box = float(glance.show[target - 1]), 0.0, 0.0, None
-        closest = score if glance.window.level == self.belief.lattice.levels - 1 else 0.0
+    def add(self, window_look: WindowLook) -> None:
+        target, detections = self.belief.target, window_look.detections
+        score, named, found, box = float(window_look.show[target - 1]), 0.0, 0.0, None
+        closest = score if window_look.window.level == self.belief.lattice.levels - 1 else 0.0
         scores = detections.scores[0, :, target].detach().float().numpy()
         if len(scores):
             named = float(scores[detections.labels[0].numpy() == target].max(initial=0))
@@ -93,7 +93,7 @@ _DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has 
 
 
 class WindowDecisions:
-    """Decides one search by windows, turn by turn, with closer looks where the evidence has fitted verification."""
+    """Decides one search by windows, look by look, with closer looks where the evidence has fitted verification."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class WindowDecisions:
         self.evidence, self.target, self._close_up = evidence, target, close_up
         self._given, self._most, self._forgetting = (confirm, give_up), closer, forgetting
         self.thresholds = _DEFAULTS
-        self.verifier: Verifier[WindowLook] | None = None
+        self.verifier: Verifier[SearchLook] | None = None
         self.criterion: str | None = None
         """What the decision `found` needs, in words, after the first look."""
         self.outcome = 0
@@ -163,13 +163,13 @@ class WindowDecisions:
         if self.verifier is not None:
             self.verifier.follow(motion)
 
-    def see(self, turn: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
+    def see(self, step: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
         """Take in a look, and choose the place that is to be looked at closely."""
-        self._facts = self._facts or self._begin(turn.belief)
-        self._facts.see(turn.looks)
-        self._ahead, self._presence = turn.ahead, None
+        self._facts = self._facts or self._begin(step.belief)
+        self._facts.see(step.looks)
+        self._ahead, self._presence = step.ahead, None
         facts, self.outcome = self._facts, 0
-        large = turn.belief.photograph is None
+        large = step.belief.photograph is None
         if large and not facts.detected and not self.looks and self._left() >= self.thresholds.give_up:
             return  # no probability ends the search
         presence = self._fitted_presence()
@@ -177,7 +177,7 @@ class WindowDecisions:
             there, looked = torch.tensor([self.prior(presence)]), torch.tensor([facts.detected])
             self.outcome = int(settle(there, looked, torch.tensor([self._left()]), self.thresholds))
             return
-        look = WindowLook(turn.glance.candidates, number, presence, facts.best, self._ahead)
+        look = SearchLook(step.look.candidates, number, presence, facts.best, self._ahead)
         self.verifier.see(look, last=last)
         self._settle(self.verifier)
 
@@ -210,7 +210,7 @@ class WindowDecisions:
         self._settle(self.verifier)
         return look
 
-    def _settle(self, verifier: Verifier[WindowLook]) -> None:
+    def _settle(self, verifier: Verifier[SearchLook]) -> None:
         """Examine the places that need no pass, and decide."""
         while verifier.candidate is not None and verifier.places.seen(verifier.candidate):
             verifier.look()

@@ -9,17 +9,17 @@ from semfov.motion import CameraStep, Motion
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.carrying import carried, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.glances import Glance, Glances, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
 
-Order = Callable[[Sequence[Glance], set[Window]], Sequence[WindowChoice]]
+Order = Callable[[Sequence[WindowLook], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
 none ends the episode."""
 
-_Guess = Callable[[Sequence[Glance], set[Window], Window | None], WindowChoice | None]
+_Guess = Callable[[Sequence[WindowLook], set[Window], Window | None], WindowChoice | None]
 """Guesses the window to look at after one that is being looked at, which is among the windows; the last argument names
 it if it is not in the belief yet."""
 
@@ -33,15 +33,15 @@ class KeptLook:
 
     Attributes:
         taken: the look, in pixels of the frame in which it was taken.
-        glance: the look in pixels of the present frame.
+        current: the look in pixels of the present frame.
         time: seconds of the stream at which it was taken.
         value: the value that it was chosen for.
         number: number of its pass of the detector.
         seconds: time at its end, on the clock of the episode.
     """
 
-    def __init__(self, taken: Glance, time: float, value: float) -> None:
-        self.taken, self.glance = taken, taken
+    def __init__(self, taken: WindowLook, time: float, value: float) -> None:
+        self.taken, self.current = taken, taken
         self.time, self.value = time, value
         self.number, self.seconds = 0, 0.0
         self._since: Motion | None = None
@@ -49,7 +49,7 @@ class KeptLook:
     def carry(self, motion: Motion, lattice: Lattice) -> None:
         """Carry the look along with the camera, to the next frame."""
         self._since = motion if self._since is None else self._since.then(motion)
-        self.glance = carried(self.taken, self._since, lattice)
+        self.current = carried(self.taken, self._since, lattice)
 
 
 class WindowStep(Generic[_Belief]):
@@ -57,28 +57,28 @@ class WindowStep(Generic[_Belief]):
 
     def __init__(
         self,
-        look: KeptLook,
+        newest: KeptLook,
         belief: _Belief,
         kept: Sequence[KeptLook],
         choose: Callable[[], Sequence[WindowChoice]],
     ) -> None:
-        self.look, self.kept, self._choose = look, kept, choose
+        self.newest, self.kept, self._choose = newest, kept, choose
         self.belief: _Belief = belief
 
     @property
-    def glance(self) -> Glance:
+    def look(self) -> WindowLook:
         """The look, as it was taken."""
-        return self.look.taken
+        return self.newest.taken
 
     @property
     def worth(self) -> float:
         """The value that the look was chosen for."""
-        return self.look.value
+        return self.newest.value
 
     @property
-    def looks(self) -> list[Glance]:
+    def looks(self) -> list[WindowLook]:
         """The looks that count, where they lie in the present frame."""
-        return [look.glance for look in self.kept]
+        return [look.current for look in self.kept]
 
     @cached_property
     def choices(self) -> Sequence[WindowChoice]:
@@ -98,27 +98,27 @@ class _Recent(Generic[_Belief]):
     the looks of a scene that the camera has lost and may find again.
     """
 
-    def __init__(self, belief: _Belief, glances: Glances, forgetting: Forgetting | None) -> None:
-        self.belief, self.glances, self.forgetting = belief, glances, forgetting
+    def __init__(self, belief: _Belief, source: WindowLooks, forgetting: Forgetting | None) -> None:
+        self.belief, self.source, self.forgetting = belief, source, forgetting
         self.kept: list[KeptLook] = []
         self.aside: list[KeptLook] = []
         self.windows: set[Window] = set()
         self.renewed = False
 
     @property
-    def looks(self) -> list[Glance]:
-        return [look.glance for look in self.kept]
+    def looks(self) -> list[WindowLook]:
+        return [look.current for look in self.kept]
 
-    def add(self, glance: Glance, value: float) -> KeptLook:
+    def add(self, window_look: WindowLook, value: float) -> KeptLook:
         """Add a look at the present frame, and forget those that it replaces and those that are too old."""
-        look = KeptLook(glance, self.glances.time, value)
+        look = KeptLook(window_look, self.source.time, value)
         self.kept.append(look)
         if self.forgetting is not None and self._forget(self.forgetting.span):
             self._believe_anew()
         else:
-            self.windows.add(glance.window)
+            self.windows.add(window_look.window)
             if self.belief is not None:
-                self.belief.add(glance)
+                self.belief.add(window_look)
         return look
 
     def follow(self, camera: CameraStep) -> None:
@@ -137,14 +137,14 @@ class _Recent(Generic[_Belief]):
 
     def _carry(self, looks: Sequence[KeptLook], motion: Motion) -> None:
         for look in looks:
-            look.carry(motion, self.glances.lattice)
+            look.carry(motion, self.source.lattice)
 
     def _believe_anew(self) -> None:
-        self.windows = {look.glance.window for look in self.kept}
+        self.windows = {look.current.window for look in self.kept}
         if self.belief is not None:
             self.belief.clear()
             for look in self.kept:
-                self.belief.add(look.glance)
+                self.belief.add(look.current)
 
     def _forget(self, span: float) -> bool:
         """Forget looks that the newest one replaces, and those older than a span; returns whether there were any."""
@@ -157,16 +157,16 @@ class _Recent(Generic[_Belief]):
             look
             for look in self.kept
             if look in (first, newest)
-            or (newest.time - look.time <= span and look.glance.window != newest.glance.window)
+            or (newest.time - look.time <= span and look.current.window != newest.current.window)
         ]
-        at_next_frame = newest.time + self.glances.passed
+        at_next_frame = newest.time + self.source.passed
         is_old = at_next_frame - first.time > span
-        self.renewed = is_old or share_shown(first.glance.window, self.glances.lattice) < _LEAST_SHOWN
+        self.renewed = is_old or share_shown(first.current.window, self.source.lattice) < _LEAST_SHOWN
         return len(self.kept) < count
 
 
 def look_by_look(
-    glances: Glances,
+    source: WindowLooks,
     order: Order,
     belief: _Belief,
     *,
@@ -176,11 +176,11 @@ def look_by_look(
 ) -> Iterator[WindowStep[_Belief]]:
     """Look at the whole picture, and then at the windows of an order, until it has none left.
 
-    The next windows are chosen after a turn was taken; the guessed one is resampled by a second thread during the look
+    The next windows are chosen after a step was taken; the guessed one is resampled by a second thread during the look
     before. In a stream a look counts for the time in which half of its evidence would fade, or until the next look at
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
-    recent, first = _Recent(belief, glances, forgetting), Window.overview(glances.lattice)
+    recent, first = _Recent(belief, source, forgetting), Window.overview(source.lattice)
 
     def choose() -> Sequence[WindowChoice]:
         if not recent.kept:
@@ -194,37 +194,37 @@ def look_by_look(
     def prepare(window: Window) -> None:
         assert guess is not None
         beside: Window | None = window
-        if belief is not None and not window.points_closer(glances.lattice):
+        if belief is not None and not window.points_closer(source.lattice):
             # Whatever the look shows, the belief about where to look next is known.
             belief.discount(window)
             beside = None
         if likely := guess(recent.looks, recent.windows | {window}, beside):
-            glances.prepare(likely[0])
+            source.prepare(likely[0])
 
     choices = choose()
     while choices:
         if guess is not None and forgetting is None and len(choices) == 1 and recent.kept:
-            glances.meanwhile = partial(prepare, choices[0][0])
-        looks = glances.see([window for window, _ in choices], hints=hints)
-        for glance, (_, value) in zip(looks, choices, strict=True):
-            look = recent.add(glance, value)
-            turn = WindowStep(look, belief, tuple(recent.kept), choose)
-            yield turn
-        camera = glances.camera_step()
+            source.meanwhile = partial(prepare, choices[0][0])
+        looks = source.see([window for window, _ in choices], hints=hints)
+        for window_look, (_, value) in zip(looks, choices, strict=True):
+            look = recent.add(window_look, value)
+            step = WindowStep(look, belief, tuple(recent.kept), choose)
+            yield step
+        camera = source.camera_step()
         if camera is None or camera.is_still:
-            choices = turn.choices
+            choices = step.choices
         else:
             recent.follow(camera)
             choices = choose()
 
 
 def look_for(
-    glances: Glances, evidence: GlimpseEvidence, target: int, *, forgetting: Forgetting | None = None
+    source: WindowLooks, evidence: GlimpseEvidence, target: int, *, forgetting: Forgetting | None = None
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class, look by look, until nothing is left to look at."""
-    belief = ZoomBelief(glances.lattice, evidence, target, glances.blank)
+    belief = ZoomBelief(source.lattice, evidence, target, source.blank)
     return look_by_look(
-        glances,
+        source,
         lambda _, done: jointly(partial(best_hit, belief), belief, done, 1),
         belief,
         forgetting=forgetting,
@@ -233,7 +233,7 @@ def look_for(
 
 
 def find_everything(
-    glances: Glances,
+    source: WindowLooks,
     evidence: Rates,
     target: int | None = None,
     *,
@@ -242,14 +242,14 @@ def find_everything(
     forgetting: Forgetting | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough."""
-    belief = ZoomBelief(glances.lattice, evidence, target or 0, glances.blank)
+    belief = ZoomBelief(source.lattice, evidence, target or 0, source.blank)
 
-    def best(looks: Sequence[Glance], done: set[Window]) -> Sequence[WindowChoice]:
+    def best(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
     return look_by_look(
-        glances,
+        source,
         best,
         belief,
         hints=False,

@@ -49,7 +49,7 @@ class WindowView:
     lattice: Lattice
 
 
-class WindowLooks(NamedTuple):
+class WindowDetections(NamedTuple):
     """The result of several looks; cut `(F, L)`."""
 
     detections: Detections
@@ -126,7 +126,7 @@ class WindowEye(nn.Module):
         hints: bool = True,
         resampled: Resampled | None = None,
         meanwhile: Callable[[], object] | None = None,
-    ) -> WindowLooks:
+    ) -> WindowDetections:
         """Look at a picture and return hints too.
 
         Args:
@@ -157,13 +157,13 @@ class WindowEye(nn.Module):
         detections = replace(selected, boxes=boxes).to(here)
         detections, cut = self._treat(detections, place.cut(selected).to(here))
         if not hints:
-            return WindowLooks(detections, cut, None)
+            return WindowDetections(detections, cut, None)
         faint = [_hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
         placed = [
             Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
             for number, each in enumerate(faint)
         ]
-        return WindowLooks(detections, cut, tuple(placed))
+        return WindowDetections(detections, cut, tuple(placed))
 
     def glimpse(
         self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None

@@ -12,8 +12,8 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, intersection, merge_looks, neighbours, unlike
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import WindowLook
 
 _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
@@ -26,7 +26,7 @@ _EDGE = 2.0  # canvas pixels from the border of a window within which it may cut
 
 
 def merge(
-    glances: Sequence[Glance],
+    looks: Sequence[WindowLook],
     target: int | Sequence[int] | None = None,
     *,
     score: float = FAINTEST,
@@ -39,7 +39,7 @@ def merge(
     one. The score of an object is the highest that any look shows it with, as where slices are merged by suppression.
 
     Args:
-        glances: looks at one picture.
+        looks: looks at one picture.
         target: class 1..K, whose score counts for every box; of several classes, the best one for each box. None, or
             no class, takes the best class of each box. Scores are the detector's own (`Detections.class_scores`).
         score: boxes with a lower score are left out.
@@ -49,17 +49,17 @@ def merge(
     Returns:
         Objects, most confident first.
 
-    >>> from semfov.zoom.glances import Glance, Window
+    >>> from semfov.zoom.looks import Window, WindowLook
     >>> def look(magnification, box):
     ...     found = Detections(torch.tensor([[box]]), torch.tensor([[[0.3, 0.7]]]), torch.tensor([[True]]))
     ...     window = Window((100.0, 100.0, magnification), 0, (0, 0, 8, 8))
-    ...     return Glance(window, found, torch.tensor([False]), torch.zeros(1), None)
+    ...     return WindowLook(window, found, torch.tensor([False]), torch.zeros(1), None)
     >>> merge([look(0.2, [10.0, 10, 50, 50]), look(0.8, [11.0, 12, 51, 50])]).boxes
     tensor([[11., 12., 51., 50.]])
     """
-    if not glances:
+    if not looks:
         return Objects.none()
-    every = _detected(glances, target, shares=False)
+    every = _detected(looks, target, shares=False)
     objects = merge_looks(*every, score=score, iou=iou, inside=inside)
     boxes, scores, labels, *_ = every
     highest = _highest_scores(objects, boxes, scores, labels, iou)
@@ -81,18 +81,22 @@ def _highest_scores(objects: Objects, boxes: Tensor, scores: Tensor, labels: Ten
 
 
 def merge_with_facts(
-    glances: Sequence[Glance], lattice: Lattice, target: int | Sequence[int] | None = None, *, latest: bool = False
+    window_looks: Sequence[WindowLook],
+    lattice: Lattice,
+    target: int | Sequence[int] | None = None,
+    *,
+    latest: bool = False,
 ) -> tuple[Objects, Tensor]:
     """Merge detections as `merge` does, with mean boxes (`_fused`) in still pictures, and list facts of the objects."""
-    if not glances:
+    if not window_looks:
         return Objects.none(), torch.zeros(0, len(FACTS))
-    every = _detected(glances, target, shares=True)
+    every = _detected(window_looks, target, shares=True)
     # Fainter boxes say nothing that the absence of a box does not.
     enough = every[1] >= FAINTEST
     boxes, scores, labels, looks, cut, sharpness = every = tuple(each[enough] for each in every)
     index = unlike(*every, inside=_INSIDE)
-    windows = torch.tensor([glance.window.region(lattice) for glance in glances])
-    scale = torch.tensor([glance.window.fixation[2] for glance in glances])
+    windows = torch.tensor([look.window.region(lattice) for look in window_looks])
+    scale = torch.tensor([look.window.fixation[2] for look in window_looks])
     facts = _object_facts(index, every, windows, scale, lattice.size, lattice.magnifications[-1], latest=latest)
     own = boxes[index] if latest else _fused(index, boxes, scores, labels, cut, sharpness)
     return Objects(own, scores[index], labels[index], looks[index]), facts
@@ -121,7 +125,7 @@ def _fused(index: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor, cut: Te
 
 
 def probable_objects(
-    glances: Sequence[Glance],
+    looks: Sequence[WindowLook],
     lattice: Lattice,
     target: int | Sequence[int] | None,
     certainty: Certainty,
@@ -131,10 +135,10 @@ def probable_objects(
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float]]:
     """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown."""
-    objects = _probable(*merge_with_facts(glances, lattice, target, latest=latest), certainty)
+    objects = _probable(*merge_with_facts(looks, lattice, target, latest=latest), certainty)
     if not any(remaining):
         return objects, (0.0, 0.0)
-    before = _probable(*merge_with_facts(glances[:1], lattice, target), certainty)
+    before = _probable(*merge_with_facts(looks[:1], lattice, target), certainty)
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
 
@@ -145,12 +149,14 @@ def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
     return replace(objects, scores=chances)[chances.argsort(descending=True, stable=True)]
 
 
-def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None, *, shares: bool) -> tuple[Tensor, ...]:
+def _detected(
+    window_looks: Sequence[WindowLook], target: int | Sequence[int] | None, *, shares: bool
+) -> tuple[Tensor, ...]:
     """Boxes, scores and classes of all detections, the numbers of their looks, which are cut, and magnifications.
 
     Scores are those of the vectors, on which a certainty is fitted (`shares`), or the detector's own.
     """
-    looks = [glance.detections for glance in glances]
+    looks = [window_look.detections for window_look in window_looks]
     columns = zip(*((look.boxes, look.scores, look.mask, look.confidence) for look in looks), strict=True)
     detections = Detections(*(torch.cat(column, 1) for column in columns))
     scores = detections.scores[0, :, 1:] if shares else detections.class_scores[0]
@@ -159,8 +165,15 @@ def _detected(glances: Sequence[Glance], target: int | Sequence[int] | None, *, 
     label = torch.tensor(classes)[best]
     counts = torch.tensor([look.mask.shape[1] for look in looks])
     number = torch.arange(len(looks)).repeat_interleave(counts)
-    closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]
-    return detections.boxes[0], value, label, number, torch.cat([glance.cut for glance in glances]), closer
+    closer = torch.tensor([window_look.window.fixation[2] for window_look in window_looks]).to(value)[number]
+    return (
+        detections.boxes[0],
+        value,
+        label,
+        number,
+        torch.cat([window_look.cut for window_look in window_looks]),
+        closer,
+    )
 
 
 def _object_facts(

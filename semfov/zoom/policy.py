@@ -6,8 +6,8 @@ from functools import reduce
 import numpy as np
 
 from semfov.zoom.belief import Cells, ZoomBelief
-from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window
 
 WindowChoice = tuple[Window, float]  # a window and the value of a look at it
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.policy import WindowChoice
 
 
@@ -35,9 +35,9 @@ def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
 def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:
     """The windows in descending order of the overview's raw scores in them."""
     ranking: list[WindowChoice] = []
-    ranked_by: Glance | None = None
+    ranked_by: WindowLook | None = None
 
-    def order(looks: Sequence[Glance], done: set[Window]) -> list[WindowChoice]:
+    def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
         nonlocal ranked_by
         if looks[0] is not ranked_by:
             ranked_by = looks[0]
@@ -49,14 +49,17 @@ def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool
     return order
 
 
-def raw(glance: Glance, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
+def raw(window_look: WindowLook, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
     """Value of a window by the raw scores of a coarser look: their sum, or the highest, over its cells."""
-    if glance.hints is not None:
-        boxes, within = glance.hints.boxes, glance.hints.boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
+    if window_look.hints is not None:
+        boxes, within = (
+            window_look.hints.boxes,
+            window_look.hints.boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9)),
+        )
         centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-        part = glance.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)]
+        part = window_look.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)]
     else:
-        look = glance.gist
+        look = window_look.gist
         assert look is not None
         x1, y1, x2, y2 = window.cells
         left, top = look.first

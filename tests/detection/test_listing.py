@@ -16,7 +16,7 @@ from semfov.detection.onnx_heads import HEADS
 from semfov.paths import Record
 from semfov.paths.look import detections_in_words
 from semfov.zoom import WindowEye
-from semfov.zoom.glances import Window
+from semfov.zoom.looks import Window
 from tests.detection.test_conformance import ADAPTERS, photographs
 from tests.detection.test_load import Cells
 from tests.detection.test_transformers import MODELS as TRANSFORMERS

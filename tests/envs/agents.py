@@ -10,7 +10,7 @@ from semfov.envs.windows import _action_of
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.protocols import Trial
 from semfov.runs.seeds import noise_for
-from semfov.zoom.glances import Window
+from semfov.zoom.looks import Window
 from semfov.zoom.policy import best_find, best_hit
 
 
@@ -59,7 +59,7 @@ class WindowAgent:
         self.gaze = env.gazes
 
     def __call__(self):
-        gaze, belief, lattice = self.gaze, self.gaze.looking.belief, self.gaze.glances.lattice
+        gaze, belief, lattice = self.gaze, self.gaze.looking.belief, self.gaze.source.lattice
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
         return _action_of(lattice, Window.overview(lattice) if choice is None else choice[0])

@@ -18,8 +18,8 @@ from semfov.envs import ZoomEnv, open_zoom_scenery
 from semfov.envs.registration import _IDS
 from semfov.envs.windows import _window_of
 from semfov.zoom.episode import find_everything, look_for
-from semfov.zoom.glances import Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window
 from tests.envs.agents import WindowAgent
 from tests.refusals import refused
 
@@ -71,11 +71,11 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
         while not over:
             _, reward, terminated, truncated, info = env.step(agent())
             over = terminated or truncated
-        seen = [glance.window for glance in env.gazes.looking.glances]
-        steps = look_for(zoom_scenery.glances(0), zoom_scenery.evidence, target)
-        assert seen == [turn.glance.window for turn, _ in zip(steps, seen, strict=False)]
-        assert terminated == zoom_scenery.found(env.gazes.looking.glances, 0, target)
-        assert not zoom_scenery.found(env.gazes.looking.glances[:-1], 0, target)
+        seen = [look.window for look in env.gazes.looking.window_looks]
+        steps = look_for(zoom_scenery.looks_at(0), zoom_scenery.evidence, target)
+        assert seen == [step.look.window for step, _ in zip(steps, seen, strict=False)]
+        assert terminated == zoom_scenery.found(env.gazes.looking.window_looks, 0, target)
+        assert not zoom_scenery.found(env.gazes.looking.window_looks[:-1], 0, target)
         assert reward == pytest.approx(terminated - 0.05)
         assert info["passes"] == len(seen)
         lengths.add(len(seen))
@@ -92,10 +92,10 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
     while not truncated:
         _, reward, _, truncated, info = env.step(agent())
         total += reward
-    assert len(env.gazes.looking.glances) == info["passes"] == 6
-    steps = find_everything(zoom_scenery.glances(0), zoom_scenery.evidence)
-    expected = [turn.glance.window for turn, _ in zip(steps, range(6), strict=False)]
-    assert [glance.window for glance in env.gazes.looking.glances] == expected
+    assert len(env.gazes.looking.window_looks) == info["passes"] == 6
+    steps = find_everything(zoom_scenery.looks_at(0), zoom_scenery.evidence)
+    expected = [step.look.window for step, _ in zip(steps, range(6), strict=False)]
+    assert [look.window for look in env.gazes.looking.window_looks] == expected
     assert total == pytest.approx(10 * (info["result"] - before) - 0.5 * 5)
     assert info["result"] > before
 
@@ -104,7 +104,7 @@ def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scene
 def test_observations_and_infos_follow_the_windows(zoom_scenery):
     env = ZoomEnv("exploration", zoom_scenery, **EVERYTHING)
     observation, info = env.reset(seed=0)
-    lattice = env.gazes.glances.lattice
+    lattice = env.gazes.source.lattice
     assert lattice.levels >= 3
     assert info["action_mask"].sum() == len(lattice) - 1
     closest = np.array([0.0, 0.0, 1.0], np.float32)
@@ -139,7 +139,7 @@ def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, 
         while not over:
             _, _, terminated, truncated, _ = env.step(env.action_space.sample())
             over = terminated or truncated
-        shown = [float(glance.show[env.gazes.episodes[0].target - 1]) for glance in env.gazes.looking.glances]
+        shown = [float(look.show[env.gazes.episodes[0].target - 1]) for look in env.gazes.looking.window_looks]
         assert max(shown[:-1], default=0) < 0.3
         assert terminated == (shown[-1] >= 0.3)
     explore = ZoomEnv("exploration", scenery)
@@ -168,8 +168,8 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
         raise AssertionError("the detector was called")
 
     monkeypatch.setattr(again.eye, "glance", refuse)
-    kept = again.glances(0).see([Window.overview(again.glances(0).lattice)])[0]
-    assert torch.equal(kept.show, env.gazes.looking.glances[0].show)
+    kept = again.looks_at(0).see([Window.overview(again.looks_at(0).lattice)])[0]
+    assert torch.equal(kept.show, env.gazes.looking.window_looks[0].show)
 
 
 def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_scenery):

@@ -7,9 +7,9 @@ import torch
 from eval.zoom.observed import ObservedRates
 from eval.zoom.orders import sparse
 from semfov import FovealObservationModel, InputError, WindowEye
-from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import usual_slices
 from tests.small import Coloured
 
@@ -21,11 +21,11 @@ def test_sparse_slices_are_those_in_which_the_overview_shows_enough():
     pixels = np.full((900, 1200, 3), 100, np.uint8)
     pixels[600:690, 900:990], pixels[100:160, 100:160] = (25, 230, 25), (230, 25, 25)
     eye = WindowEye(Coloured())
-    glances = LiveGlances(eye, eye.open(pixels))
-    windows = usual_slices(glances.lattice)
-    (look,) = glances.see([Window.overview(glances.lattice)])
-    (hints,) = eye.glance(glances.view, torch.tensor([look.window.fixation])).hints
-    wide, high = glances.lattice.pitch
+    source = LiveWindowLooks(eye, eye.open(pixels))
+    windows = usual_slices(source.lattice)
+    (look,) = source.see([Window.overview(source.lattice)])
+    (hints,) = eye.glance(source.view, torch.tensor([look.window.fixation])).hints
+    wide, high = source.lattice.pitch
     for targets in ([], [1], [2]):
         for least in (0.05, 0.5):
             order, done, chosen = sparse(windows, targets, least), set(), []

@@ -33,11 +33,11 @@ from semfov.runs.config import DataConfig
 from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
 from semfov.runs.window_looking import found_in, right_boxes
-from semfov.runs.zoom_store import GlanceStore, StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
-from semfov.zoom.glances import LiveGlances, Window
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import ranked, usual_slices
 from tests.colours import COLOURS, write_home
 from tests.small import Coloured, RedBoxes, Tiles
@@ -108,13 +108,13 @@ def tables_of_choices(report):
 def test_examples_do_not_depend_on_the_store(tmp_path):
     eye = WindowEye(Tiles(name="bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "dog", "boat"), count=3), 2, 2, tile=(96, 72), count=1)
-    store = GlanceStore(tmp_path, eye.settings(), 3)
-    glances = StoredGlances(eye, mosaics, 0, store)
-    example = ZoomExample.of(mosaics, 0, glances)
-    glances.save()
+    store = WindowLookStore(tmp_path, eye.settings(), 3)
+    source = StoredWindowLooks(eye, mosaics, 0, store)
+    example = ZoomExample.of(mosaics, 0, source)
+    source.save()
     assert sum(look.window.within is not None for look in example.looks) == 4
     eye.detector.propose = None  # any new look would fail
-    same = ZoomExample.of(mosaics, 0, StoredGlances(eye, mosaics, 0, store))
+    same = ZoomExample.of(mosaics, 0, StoredWindowLooks(eye, mosaics, 0, store))
     assert torch.equal(same.labels, example.labels)
     for one, other in zip(example.looks, same.looks, strict=True):
         assert one.window == other.window
@@ -186,7 +186,7 @@ class Drawn:
 @pytest.mark.slow
 def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     eye, scenes = WindowEye(Coloured(("red", "green", "blue"), (64, 64), fill=0.0)), Drawn()
-    opened = [StoredGlances(eye, scenes, n, None) for n in range(len(scenes))]
+    opened = [StoredWindowLooks(eye, scenes, n, None) for n in range(len(scenes))]
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
     config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
@@ -198,7 +198,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
         path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
         found, count = _unverified(sought, model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
-        assert [glance.window for glance in sought.glances[:count]] == [each.window for each in path.glances]
+        assert [look.window for look in sought.window_looks[:count]] == [each.window for each in path.window_looks]
         if found is not None:
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
@@ -321,11 +321,11 @@ def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, set
 def test_recall_is_that_of_the_objects_of_each_photograph():
     eye, scenes = WindowEye(Tiles(name="bright", pure=True)), RedBoxes()
     mosaics = Mosaics(scenes, 2, 2, tile=(96, 72), count=3)
-    opened = [StoredGlances(eye, mosaics, index, None) for index in range(3)]
+    opened = [StoredWindowLooks(eye, mosaics, index, None) for index in range(3)]
     shares = {}
-    for index, glances in enumerate(opened):
+    for index, source in enumerate(opened):
         tiles = mosaics.tiles(index)
-        looks = [turn.glance for turn in look_by_look(glances, ranked(usual_slices(glances.lattice)), None)]
+        looks = [step.look for step in look_by_look(source, ranked(usual_slices(source.lattice)), None)]
         found = torch.stack([found_in(looks[:n], mosaics.annotation(index)) for n in range(1, len(looks) + 1)], -1)
         # When all slices were looked at, recall stays the same.
         assert len(looks) < _RECALL_PASSES[-1]
@@ -462,6 +462,6 @@ def test_the_spread_is_that_of_photographs_that_were_left_out(fitted):
 def test_a_photograph_without_objects_has_no_most_frequent_class():
     empty = Annotation(torch.zeros(0, 4), torch.zeros(0).long(), torch.zeros(0).bool(), SIZE)
     eye = WindowEye(Squares().eval())
-    glances = LiveGlances(eye, eye.open(Photographs()[0].image))
-    told = [*_explored(glances.see([Window.overview(glances.lattice)]), glances.lattice, empty)]
+    source = LiveWindowLooks(eye, eye.open(Photographs()[0].image))
+    told = [*_explored(source.see([Window.overview(source.lattice)]), source.lattice, empty)]
     assert [(each.target, each.held) for each in told] == [(None, 0)]

@@ -35,7 +35,7 @@ from semfov.runs.config import DataConfig
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
-from semfov.zoom.glances import Glance
+from semfov.zoom.looks import WindowLook
 from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles, cells_of
 
@@ -269,7 +269,7 @@ def test_plain_suppression_equals_that_of_torchvision():
     boxes = torch.cat([corners, corners + 5 + 20 * torch.rand(2, 1, 40, 2, generator=generator)], -1)
     scores, cut = torch.rand(2, 1, 40, 3, generator=generator), torch.rand(2, 40, generator=generator) < 0.3
     looks = [
-        Glance(None, Detections(*each[:2], torch.ones(1, 40).bool()), each[2], None, None)
+        WindowLook(None, Detections(*each[:2], torch.ones(1, 40).bool()), each[2], None, None)
         for each in zip(boxes, scores, cut, strict=True)
     ]
     whole, value = boxes.flatten(0, 2)[~cut.flatten()], scores.flatten(0, 2)[~cut.flatten()]
@@ -381,14 +381,14 @@ def test_recall_and_precision_are_shares_of_all_objects_and_boxes():
 
 def test_orders_look_at_every_slice_once(zooming):
     run = ZoomRun(zooming)
-    glances = run.glances(0)
-    cut = run.slices(0, glances.lattice)
+    source = run.looks_at(0)
+    cut = run.slices(0, source.lattice)
     for order in (in_order(cut), shuffled(cut, [1]), ranked(cut)):
-        windows = [turn.glance.window for turn in look_by_look(glances, order, None)]
+        windows = [step.look.window for step in look_by_look(source, order, None)]
         assert windows[0].level == 0
         assert set(windows[1:]) == set(cut)
         assert len(windows) == len(cut) + 1
-    tree = [turn.glance.window for turn in look_by_look(glances, quad_tree(glances.lattice, 1, most=True), None)]
+    tree = [step.look.window for step in look_by_look(source, quad_tree(source.lattice, 1, most=True), None)]
     assert len(tree) == len(set(tree))
 
 

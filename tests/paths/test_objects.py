@@ -16,7 +16,7 @@ from semfov.paths.look import detections_in_words
 from semfov.report.episode import episode_data
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, Window
+from semfov.zoom.looks import Window, WindowLook
 from tests import small
 
 CLASSES = ("background", "cup", "cat")
@@ -164,7 +164,7 @@ def test_the_number_in_all_starts_with_the_objects_that_are_listed(chances, unse
     """Unless fewer are expected. Where the detector shows faint candidates alone, a large picture has no number."""
     count = len(chances)
     found = Objects(torch.rand(count, 4), torch.tensor(chances), torch.ones(count).long(), torch.zeros(count).long())
-    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"glances": (), "values": (), "least": 0.5}
+    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"window_looks": (), "values": (), "least": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
     assert path.describe() == f"{words}. 0 looks"
     values = path.to_dict()
@@ -178,7 +178,7 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     lattice, empty = Lattice.over((640, 480), (416, 416)), torch.zeros(0).long()
     assert lattice.levels == 1
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), empty, empty)
-    parts = {"glances": (), "values": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
+    parts = {"window_looks": (), "values": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
     path = ZoomPath(lattice=lattice, target=None, targets=(1, 2), candidates=nothing, **parts)
     assert path.expected == {"cup": 0, "cat": 0}
     assert path.expected_error == {"cup": 1, "cat": 1}
@@ -196,10 +196,10 @@ def test_a_large_picture_in_which_others_are_clear_has_a_number_too(clear, given
     """Of cups nothing is seen, among cats that are seen clearly; satellite pictures show next to nothing clearly."""
     lattice = Lattice.over((2560, 1920), (416, 416))
     cats = look(*((shifted(LEFT, 100 * number), 2, 0.75) for number in range(clear)))
-    glance = Glance(Window.overview(lattice), cats, torch.zeros(clear).bool(), torch.zeros(2), None)
+    window_look = WindowLook(Window.overview(lattice), cats, torch.zeros(clear).bool(), torch.zeros(2), None)
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
     parts = {"classes": CLASSES, "values": (0.0,), "unseen": (0.0, 0.0), "least": 0.5, "target": 1}
-    path = ZoomPath(lattice=lattice, glances=(glance,), candidates=nothing, **parts)
+    path = ZoomPath(lattice=lattice, window_looks=(window_look,), candidates=nothing, **parts)
     assert path.describe() == "No cup found. 1 look"
     number = path.expected["cup"], path.expected_error["cup"]
     assert number == (0, 1) if given else all(map(isnan, number))
@@ -210,7 +210,7 @@ def test_a_number_is_claimed_class_by_class():
     chances, labels = torch.tensor([0.9, 0.8, 0.3, 0.3, 0.2]), torch.tensor([1, 1, 2, 2, 2])
     found = Objects(torch.rand(5, 4), chances, labels, torch.zeros(5).long())
     lattice = Lattice.over((2560, 1920), (416, 416))
-    parts = {"glances": (), "values": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
+    parts = {"window_looks": (), "values": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
     path = ZoomPath(lattice=lattice, classes=CLASSES, candidates=found, **parts)
     share = 1.7 / 2.5
     assert path.expected["cup"] == pytest.approx(1.7 + 0.5 * share)

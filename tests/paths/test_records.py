@@ -25,7 +25,7 @@ from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.viz import plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, Window
+from semfov.zoom.looks import Window, WindowLook
 from tests.refusals import refused, unusable
 
 CLASSES = ("background", "cup", "cat")
@@ -72,8 +72,8 @@ def zoom_path():
         Window.on(lattice, (1, 16, 8)),
         Window.around(lattice, (10.0, 20.5, 60.0, 80.0)),
     ]
-    glances = tuple(
-        Glance(window, seen, torch.arange(seen.mask.shape[1]) % 2 == 1, torch.tensor([0.3, 0.1 * number]), None)
+    window_looks = tuple(
+        WindowLook(window, seen, torch.arange(seen.mask.shape[1]) % 2 == 1, torch.tensor([0.3, 0.1 * number]), None)
         for number, (window, seen) in enumerate(zip(windows, looks(3), strict=True))
     )
     objects = Objects(BOX[None] * 2, torch.tensor([0.7]), torch.tensor([1]), torch.tensor([2]))
@@ -81,7 +81,7 @@ def zoom_path():
         lattice=lattice,
         classes=CLASSES,
         target=1,
-        glances=glances,
+        window_looks=window_looks,
         values=(float("inf"), 0.1 + 0.2, 0.75),
         candidates=objects,
         decision=Decision("found", 0.9, None, BOX, 0.8),
@@ -129,7 +129,7 @@ def moment():
 def window_moment():
     path = zoom_path()
     made = {each.name: getattr(path, each.name) for each in dataclasses.fields(path) if each.init}
-    return WindowMoment(**{**made, "number": 7, "ending": None, "next_window": path.glances[1].window})
+    return WindowMoment(**{**made, "number": 7, "ending": None, "next_window": path.window_looks[1].window})
 
 
 RECORDS = [scanpath, zoom_path, head_path, moment, window_moment]

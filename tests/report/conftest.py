@@ -17,7 +17,7 @@ from semfov.report import write_page
 from semfov.report.zoom import zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
 from semfov.zoom import Lattice
-from semfov.zoom.glances import Glance, Window
+from semfov.zoom.looks import Window, WindowLook
 from tests import small
 
 
@@ -92,8 +92,8 @@ def zoom_path(hostile: str) -> ZoomPath:
     lattice = Lattice.over((400, 300), (100, 100))
     boxes = torch.tensor([[[20.0, 20, 60, 50]], [[30.0, 24, 61, 52]], [[250.0, 110, 280, 160]]])
     scores = torch.tensor([[0.3, 0.1, 0.5, 0.1], [0.1, 0.04, 0.8, 0.06], [0.1, 0.6, 0.2, 0.1]])
-    glances = tuple(
-        Glance(
+    looks = tuple(
+        WindowLook(
             Window.on(lattice, action),
             Detections(boxes[None, number], scores[None, number, None], torch.ones(1, 1, dtype=torch.bool)),
             torch.zeros(1, dtype=torch.bool),
@@ -109,7 +109,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         lattice=lattice,
         classes=classes,
         target=2,
-        glances=glances,
+        looks=looks,
         values=(float("inf"), 0.5, 0.25),
         candidates=objects,
         decision=decision,

@@ -48,10 +48,10 @@ def test_each_look_shows_the_pixels_of_its_window(zoom_path, large_picture):
 
 def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, hostile):
     shifted = zoom_data(zoom_path, large_picture, name="field")["looks"]
-    for look, glance in zip(shifted, zoom_path.glances, strict=True):
+    for look, window_look in zip(shifted, zoom_path.window_looks, strict=True):
         x1, y1 = look["box"][:2]
         (seen,) = look["detections"]
-        boxes = glance.detections.boxes[0, 0].tolist()
+        boxes = window_look.detections.boxes[0, 0].tolist()
         assert [n + low for n, low in zip(seen["box"], (x1, y1, x1, y1), strict=True)] == pytest.approx(boxes, abs=0.1)
     # The last detection is of a cat, but the score of the target counts where it is large enough.
     assert [look["detections"][0]["label"] for look in shifted] == [hostile] * 3
@@ -119,10 +119,10 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     assert "It is a closer look: the target is there with a probability of 0.88." in data["looks"][2]["status"]
     texts = " ".join(Elements(page_html("field", [data])).texts)
     assert texts.count("Closer look probability 0.88 that the target is there") == 1
-    last = path.glances[2]
+    last = path.window_looks[2]
     near = [replace(last, window=replace(last.window, fixation=(0, 0, 1.5 + more))) for more in range(4)]
-    for glances, told in ((near[:1], "magnifications 0.25, 0.5, 1, 1.5"), (near, "magnifications from 0.25 to 4.5")):
-        assert replace(path, glances=(*path.glances[:2], *glances)).sensor_in_words().endswith(told)
+    for looks, told in ((near[:1], "magnifications 0.25, 0.5, 1, 1.5"), (near, "magnifications from 0.25 to 4.5")):
+        assert replace(path, window_looks=(*path.window_looks[:2], *looks)).sensor_in_words().endswith(told)
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
@@ -131,7 +131,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
     scores = torch.linspace(0.9, 0.3, many)
     place = torch.tensor([[10.0, 10, 20, 20]]).expand(many, 4)
     objects = Objects(place, scores, torch.full((many,), 2), torch.zeros(many).long())
-    first = zoom_path.glances[0]
+    first = zoom_path.window_looks[0]
     seen = replace(
         first.detections,
         boxes=place[None],
@@ -139,9 +139,9 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
         mask=torch.ones(1, many, dtype=torch.bool),
         confidence=first.detections.confidence.expand(1, many),
     )
-    glances = (replace(first, detections=seen), *zoom_path.glances[1:])
+    looks = (replace(first, detections=seen), *zoom_path.window_looks[1:])
     data = zoom_data(
-        replace(zoom_path, candidates=objects, decision=None, glances=glances), large_picture, name="crowd"
+        replace(zoom_path, candidates=objects, decision=None, window_looks=looks), large_picture, name="crowd"
     )
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
@@ -233,4 +233,4 @@ def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_pic
     with pytest.raises(InputError, match="picture: expected the picture of the record, 400 × 300 px"):
         zoom_data(zoom_path, large_picture[:, :200], name="other")
     with pytest.raises(InputError, match="at least one look"):
-        zoom_data(replace(zoom_path, glances=()), large_picture, name="other")
+        zoom_data(replace(zoom_path, window_looks=()), large_picture, name="other")

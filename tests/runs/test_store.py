@@ -9,10 +9,10 @@ from semfov.detection import Detections
 from semfov.runs import store as store_module
 from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.store import DetectionStore, RememberedLooks, cell_store
-from semfov.runs.zoom_store import GlanceStore
-from semfov.zoom.glances import Glance, Window
+from semfov.runs.zoom_store import WindowLookStore
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 
 DIGEST = "a" * 64
 LATTICE = Lattice.over((640, 480), (128, 128))
@@ -24,7 +24,7 @@ def detections(seed, count):
     return Detections(boxes, torch.rand(1, count, 4, generator=generator).softmax(-1), torch.ones(1, count).bool())
 
 
-def glance(number, window):
+def look(number, window):
     seen = detections(number, 1 + number % 3)
     cut = torch.rand(len(seen.boxes[0]), generator=torch.Generator().manual_seed(number)) > 0.5
     summary = None
@@ -32,7 +32,7 @@ def glance(number, window):
         scores = torch.zeros(4, 4, 3)
         scores[1, 2, 0] = 0.25
         summary = Gist(window.level, window.cells[:2], 2, scores, scores.amax(-1) * 8, scores > 0.1)
-    return Glance(window, seen, cut, torch.tensor([0.25, 0.0, 0.5]), summary)
+    return WindowLook(window, seen, cut, torch.tensor([0.25, 0.0, 0.5]), summary)
 
 
 def cells(folder, **settings):
@@ -44,7 +44,7 @@ def poses(folder, **settings):
 
 
 def windows(folder, **settings):
-    return GlanceStore(folder, {"detector": "toy", **settings}, 3)
+    return WindowLookStore(folder, {"detector": "toy", **settings}, 3)
 
 
 NUMBERED = {5: detections(5, 2), 0: detections(0, 0), 3: detections(3, 1)}
@@ -54,7 +54,7 @@ WINDOWS = [
     Window.on(LATTICE, (1, 2, 1)),
     Window.around(LATTICE, (10.0, 20.0, 110.5, 120.0)),
 ]
-GLANCES = {window: glance(number, window) for number, window in enumerate(WINDOWS)}
+GLANCES = {window: look(number, window) for number, window in enumerate(WINDOWS)}
 
 KINDS = {
     "cells": (cells, NUMBERED),
@@ -83,7 +83,7 @@ def assert_equal(found, expected):
     for action, look in expected.items():
         for one, other in zip(tensors_of(found[action]), tensors_of(look), strict=True):
             assert torch.equal(one, other)
-        if isinstance(look, Glance):
+        if isinstance(look, WindowLook):
             assert found[action].window == look.window
             assert (found[action].gist is None) == (look.gist is None)
             if look.gist is not None:

@@ -7,8 +7,8 @@ import torch
 
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.evidence import STEPS, pool
-from semfov.zoom.glances import Glance
 from semfov.zoom.hints import Gist
+from semfov.zoom.looks import WindowLook
 
 
 def cells_shown(lattice: Lattice, look: Gist) -> tuple[slice, slice]:
@@ -17,28 +17,28 @@ def cells_shown(lattice: Lattice, look: Gist) -> tuple[slice, slice]:
     return slice(y, y + rows * look.scale), slice(x, x + columns * look.scale)
 
 
-def left(lattice: Lattice, glances: Sequence[Glance]) -> np.ndarray:
+def left(lattice: Lattice, looks: Sequence[WindowLook]) -> np.ndarray:
     """u(x), 0 in the windows that were looked at as closely as possible and 1 elsewhere, `(rows, columns)`."""
     cells = np.ones((lattice.rows, lattice.columns))
-    for glance in glances:
-        if glance.gist is None:
-            x1, y1, x2, y2 = glance.window.cells
+    for look in looks:
+        if look.gist is None:
+            x1, y1, x2, y2 = look.window.cells
             cells[max(y1, 0) : y2, max(x1, 0) : x2] = 0
     return cells
 
 
-def closest(lattice: Lattice, glances: Sequence[Glance]) -> np.ndarray:
+def closest(lattice: Lattice, looks: Sequence[WindowLook]) -> np.ndarray:
     """s(x), the level of the closest look that has closer ones at each cell, `(rows, columns)`."""
     cells = np.full((lattice.rows, lattice.columns), -1)
-    for glance in glances:
-        if glance.gist is not None:
-            at = cells_shown(lattice, glance.gist)
-            cells[at] = np.maximum(cells[at], glance.gist.level)
+    for look in looks:
+        if look.gist is not None:
+            at = cells_shown(lattice, look.gist)
+            cells[at] = np.maximum(cells[at], look.gist.level)
     return cells
 
 
 def expected(
-    lattice: Lattice, evidence: GlimpseEvidence, target: int, glances: Sequence[Glance]
+    lattice: Lattice, evidence: GlimpseEvidence, target: int, looks: Sequence[WindowLook]
 ) -> dict[int, np.ndarray]:
     r"""Objects that looks of each level find in each cell, :math:`n_k(x) = u(x) \, \lambda_{k - s(x)}(x)`.
 
@@ -46,8 +46,8 @@ def expected(
     """
     source = np.full((lattice.rows, lattice.columns), -1)
     rates = np.zeros((STEPS, lattice.rows, lattice.columns))
-    for glance in glances:
-        look = glance.gist
+    for window_look in looks:
+        look = window_look.gist
         if look is None:
             continue
         at = cells_shown(lattice, look)
@@ -70,7 +70,7 @@ def expected(
         for (row, column), seen in np.ndenumerate(source):
             if 1 <= level - seen <= STEPS and seen >= 0:
                 cells[row, column] = rates[level - seen - 1, row, column]
-        cells *= left(lattice, glances)
+        cells *= left(lattice, looks)
     return levels
 
 
@@ -84,15 +84,19 @@ def sums(lattice: Lattice, cells: np.ndarray, level: int, weight: np.ndarray) ->
     return found
 
 
-def odds(lattice: Lattice, evidence: GlimpseEvidence, target: int, glances: Sequence[Glance], level: int) -> np.ndarray:
+def odds(
+    lattice: Lattice, evidence: GlimpseEvidence, target: int, window_looks: Sequence[WindowLook], level: int
+) -> np.ndarray:
     """Log odds that a look at each window of a level shows the class, `(down, across)`.
 
     From the coarsest look to the closest: a look that holds a window replaces what coarser ones predicted for it, and
     takes this as an input. Hints count for the share of their cell that is left to see.
     """
-    (across, down), span, share = lattice.places(level), lattice.span(level), left(lattice, glances)
+    (across, down), span, share = lattice.places(level), lattice.span(level), left(lattice, window_looks)
     found = np.full((down, across), -np.inf)
-    looks = sorted((glance.gist for glance in glances if glance.gist is not None), key=lambda look: look.level)
+    looks = sorted(
+        (window_look.gist for window_look in window_looks if window_look.gist is not None), key=lambda look: look.level
+    )
     for look in looks:
         side = span // look.scale
         if not 1 <= level - look.level <= STEPS or not side:

@@ -9,17 +9,17 @@ from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief, _WindowSums
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import pool, pool_spans
-from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.lattice import CELLS
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.policy import best_find, best_hit, jointly
 from tests.zoom import plain
 from train.zoom_slices import odds_of
 
 
 @pytest.fixture
-def glances(detector, picture):
+def looks_at(detector, picture):
     eye = WindowEye(detector)
-    return LiveGlances(eye, eye.open(picture))
+    return LiveWindowLooks(eye, eye.open(picture))
 
 
 @pytest.fixture
@@ -29,9 +29,9 @@ def evidence():
 
 
 @pytest.fixture
-def belief(glances, evidence):
-    known = ZoomBelief(glances.lattice, evidence, 1)
-    known.add(glances.see([Window.on(glances.lattice, (0, 0, 0))])[0])
+def belief(source, evidence):
+    known = ZoomBelief(source.lattice, evidence, 1)
+    known.add(source.see([Window.on(source.lattice, (0, 0, 0))])[0])
     return known
 
 
@@ -79,15 +79,15 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
     """After every look of an episode of looks of all levels in any order, with plans that were dropped in between."""
     generator = torch.Generator().manual_seed(seed)
     eye = WindowEye(detector)
-    glances = LiveGlances(eye, eye.open(torch.rand(3, 300, 560, generator=generator) * 0.7))
-    lattice, target = glances.lattice, 1 + seed
+    source = LiveWindowLooks(eye, eye.open(torch.rand(3, 300, 560, generator=generator) * 0.7))
+    lattice, target = source.lattice, 1 + seed
     belief, seen = ZoomBelief(lattice, evidence, target), []
     actions = [[0, 0, 0], *lattice.actions[torch.randint(len(lattice), (7,), generator=generator)].tolist()]
-    for turn, action in enumerate(actions):
-        seen += glances.see([Window.on(lattice, tuple(action))])
+    for step, action in enumerate(actions):
+        seen += source.see([Window.on(lattice, tuple(action))])
         belief.add(seen[-1])
-        jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + turn % 3)
-        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + turn % 2)
+        jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + step % 3)
+        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + step % 2)
         left, closest = plain.left(lattice, seen), plain.closest(lattice, seen)
         expected = plain.expected(lattice, evidence, target, seen)
         np.testing.assert_array_equal(belief.left, left)
@@ -144,12 +144,12 @@ def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
-def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(glances, evidence, target):
-    lattice = glances.lattice
+def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(source, evidence, target):
+    lattice = source.lattice
     closest = np.full((lattice.rows, lattice.columns), -1)
     count = 0
-    for turn in look_for(glances, evidence, target):
-        window = turn.glance.window
+    for step in look_for(source, evidence, target):
+        window = step.look.window
         x1, y1, x2, y2 = window.cells
         shown = closest[y1:y2, x1:x2]
         assert (shown < window.level).any()
@@ -179,15 +179,15 @@ def test_batches_are_chosen_jointly(belief):
     assert values == sorted(values, reverse=True)
 
 
-def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
+def test_rates_are_the_same_whenever_they_are_asked_for(source, evidence):
     """They are predicted at once for all looks since the last question."""
-    asked, waiting = (ZoomBelief(glances.lattice, evidence, 1) for _ in range(2))
-    looks = [(0, 0, 0), (1, 0, 0), (glances.lattice.levels - 1, 1, 1), (1, 1, 0)]
-    levels = range(1, glances.lattice.levels)
+    asked, waiting = (ZoomBelief(source.lattice, evidence, 1) for _ in range(2))
+    looks = [(0, 0, 0), (1, 0, 0), (source.lattice.levels - 1, 1, 1), (1, 1, 0)]
+    levels = range(1, source.lattice.levels)
     for action in looks:
-        (glance,) = glances.see([Window.on(glances.lattice, action)])
+        (look,) = source.see([Window.on(source.lattice, action)])
         for belief in (asked, waiting):
-            belief.add(glance)
+            belief.add(look)
         for level in levels:
             asked.value(level, 0.0)
     for level in levels:

@@ -13,16 +13,16 @@ from semfov.detection.scores import Candidates
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.zoom.carrying import carried, inside_frame, share_shown
-from semfov.zoom.glances import Glance, Window
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import Window, WindowLook
 from tests.motion.test_camera import scene
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
 RED = 1
 
 
-def glance(action, boxes=((300.0, 200.0, 340.0, 260.0),)):
+def look_at(action, boxes=((300.0, 200.0, 340.0, 260.0),)):
     """A look with random hints."""
     window, span = Window.on(LATTICE, action), LATTICE.span(action[0])
     columns, rows = min(span, LATTICE.columns - action[1]), min(span, LATTICE.rows - action[2])
@@ -30,12 +30,12 @@ def glance(action, boxes=((300.0, 200.0, 340.0, 260.0),)):
     gist = Gist(action[0], action[1:], 1, hints, hints[..., 0] * 5, hints > 0.5)
     count = len(boxes)
     detections = Detections(torch.tensor([boxes]), torch.full((1, count, 4), 0.25), torch.ones(1, count).bool())
-    return Glance(window, detections, torch.zeros(count).bool(), torch.ones(3), gist)
+    return WindowLook(window, detections, torch.zeros(count).bool(), torch.ones(3), gist)
 
 
 def test_a_shift_by_whole_cells_shifts_the_hints():
     wide, high = LATTICE.pitch
-    look = glance((1, 8, 4))
+    look = look_at((1, 8, 4))
     moved = carried(look, Motion.similarity(shift=(3 * wide, -2 * high)), LATTICE)
     assert moved.gist.first == (11, 2)
     rows, columns = moved.gist.scores.shape[:2]
@@ -47,7 +47,7 @@ def test_a_shift_by_whole_cells_shifts_the_hints():
 
 
 def test_hints_of_the_whole_fill_the_frame_with_those_of_the_border():
-    look = glance((0, 0, 0))
+    look = look_at((0, 0, 0))
     moved = carried(look, Motion.similarity(shift=(5 * LATTICE.pitch[0], 0)), LATTICE)
     assert moved.gist.scores.shape == look.gist.scores.shape
     assert torch.equal(moved.gist.scores[:, 5:], look.gist.scores[:, :-5])
@@ -57,7 +57,7 @@ def test_hints_of_the_whole_fill_the_frame_with_those_of_the_border():
 def test_a_turn_by_a_right_angle_turns_the_hints():
     square = Lattice.over((1024, 1024), (128, 128))
     hints = torch.rand(square.rows, square.columns, 3, generator=torch.Generator().manual_seed(0))
-    look = replace(glance((0, 0, 0)), gist=Gist(0, (0, 0), 1, hints, hints[..., 0], hints > 0.5))
+    look = replace(look_at((0, 0, 0)), gist=Gist(0, (0, 0), 1, hints, hints[..., 0], hints > 0.5))
     middle = square.size[0] / 2
     about = Motion.similarity(shift=(-middle, -middle)).then(Motion.similarity(turn=90))
     moved = carried(look, about.then(Motion.similarity(shift=(middle, middle))), square)
@@ -65,14 +65,14 @@ def test_a_turn_by_a_right_angle_turns_the_hints():
 
 
 def test_magnification_falls_as_the_picture_grows():
-    look = glance((2, 4, 4))
+    look = look_at((2, 4, 4))
     moved = carried(look, Motion.similarity(scale=2.0), LATTICE)
     assert moved.window.fixation[2] == pytest.approx(look.window.fixation[2] / 2)
     torch.testing.assert_close(moved.detections.boxes, look.detections.boxes + torch.tensor([300.0, 200, 340, 260]))
 
 
 def test_a_look_that_has_left_the_frame_has_no_hints():
-    moved = carried(glance((1, 0, 0)), Motion.similarity(shift=(5000, 0)), LATTICE)
+    moved = carried(look_at((1, 0, 0)), Motion.similarity(shift=(5000, 0)), LATTICE)
     assert moved.gist is None
     assert share_shown(moved.window, LATTICE) == 0
     assert not inside_frame(moved.detections.boxes, LATTICE.size).any()
@@ -81,7 +81,7 @@ def test_a_look_that_has_left_the_frame_has_no_hints():
 def test_shares_of_the_frame():
     whole = Window.overview(LATTICE)
     assert share_shown(whole, LATTICE) == 1
-    half = carried(glance((0, 0, 0)), Motion.similarity(shift=(512, 0)), LATTICE).window
+    half = carried(look_at((0, 0, 0)), Motion.similarity(shift=(512, 0)), LATTICE).window
     assert share_shown(half, LATTICE) == pytest.approx(0.5)
 
 

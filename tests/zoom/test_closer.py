@@ -16,9 +16,9 @@ from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, WindowLook, closer_window, look_closely
+from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, SearchLook, closer_window, look_closely
 from semfov.zoom.evidence import PhotographEvidence
-from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.refusals import refused, unusable
 from tests.zoom.conftest import Squares
@@ -59,10 +59,10 @@ def seen(boxes, scores):
     """A look with some detections of class 1 of 2."""
     vectors = torch.tensor([[1 - score, score, 0.0] for score in scores])[None]
     found = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
-    return Glance(Window.on(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
+    return WindowLook(Window.on(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
 
 
-class Scripted(Glances):
+class Scripted(WindowLooks):
     """Closer looks that show class 1 with given scores at the middle of their window, in the size asked for."""
 
     lattice = LATTICE
@@ -97,17 +97,17 @@ def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(
 
 
 def test_the_strongest_detection_is_examined_first_and_each_place_once():
-    glances = Scripted([0.9, 0.1, 0.5], side=27.0)  # the boxes of closer looks overlap the others by less than half
+    source = Scripted([0.9, 0.1, 0.5], side=27.0)  # boxes of closer looks overlap the others by less than half
     candidates, closely = CandidateBoxes(1, 0.0), []
     looks = [
         seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]),
         seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
     ]
     for number, look in enumerate(looks, 1):
-        candidates.see(WindowLook(look.detections, number, 0.9, 0.95, 0.5))
+        candidates.see(SearchLook(look.detections, number, 0.9, 0.95, 0.5))
 
     def close_up(box):
-        closely.append(look_closely(glances, box).detections)
+        closely.append(look_closely(source, box).detections)
         return closely[-1]
 
     examined = []
@@ -121,20 +121,20 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
         examined.append((candidate.evidence, *candidate.box[:2].tolist()))
     # The others overlap examined places by half, or have a score below 0.1.
     assert [tuple(round(n, 4) for n in each) for each in examined] == [(0.8, 500, 500), (0.6, 100, 100)]
-    assert glances.windows == [
+    assert source.windows == [
         closer_window(LATTICE, torch.tensor(b)) for b in ([500.0, 500, 540, 540], [100.0, 100, 140, 140])
     ]
 
 
 def verifier(model, scores, most=2):
     """A verifier of the target in class 1."""
-    glances = Scripted(scores)
-    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(glances, box).detections, AT, most)
+    looks = Scripted(scores)
+    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(looks, box).detections, AT, most)
 
 
 def look(number, presence, left, *boxes):
     """A look of a search that shows the target in some boxes with a score of 0.8."""
-    return WindowLook(seen(list(boxes), [0.8] * len(boxes)).detections, number, presence, 0.8, left)
+    return SearchLook(seen(list(boxes), [0.8] * len(boxes)).detections, number, presence, 0.8, left)
 
 
 ONE, OTHER = [100.0, 100, 140, 140], [500.0, 500, 540, 540]
@@ -195,7 +195,7 @@ def test_a_search_looks_closely_before_it_finds(detector, picture):
     assert (look.number, path.decision.place) == (path.passes - 1, look.place)
     assert path.decision.probability == pytest.approx(max(look.place, look.presence))
     # The look is a window around the box that the search without it would have found.
-    assert path.glances[look.number].window == closer_window(path.lattice, plain.decision.box)
+    assert path.window_looks[look.number].window == closer_window(path.lattice, plain.decision.box)
     assert path.decision.box.tolist() == look.box.tolist()
     x1, y1, x2, y2 = path.decision.box.tolist()
     assert max(x1, 640) < min(x2, 672)
@@ -247,7 +247,7 @@ def test_evidence_without_verification_decides_as_before(detector, picture):
         path = ZoomAgent(WindowEye(detector), other).search(picture, "red")
         assert path.closer == ()
         assert path.decision.probability == expected.decision.probability
-        assert [glance.window for glance in path.glances] == [glance.window for glance in expected.glances]
+        assert [look.window for look in path.window_looks] == [look.window for look in expected.window_looks]
 
 
 def test_the_verification_is_saved_with_the_evidence(tmp_path):
@@ -340,9 +340,9 @@ def test_slices_of_a_photograph_show_all_of_it_enlarged(size):
 
 
 def test_slices_are_ranked_by_the_hints_whose_centre_they_show(detector, photograph):
-    glances = LiveGlances(eye := WindowEye(detector), eye.open(photograph))
-    (whole,) = glances.see([Window.overview(glances.lattice)])
-    windows = usual_slices(glances.lattice)
+    source = LiveWindowLooks(eye := WindowEye(detector), eye.open(photograph))
+    (whole,) = source.see([Window.overview(source.lattice)])
+    windows = usual_slices(source.lattice)
     values = []
     for window in windows:
         x1, y1, x2, y2 = window.within
@@ -363,7 +363,7 @@ def test_a_closer_look_is_due_when_it_is_worth_a_pass():
     boxes = torch.tensor([[[10.0, 10, 30, 30], [60.0, 60, 80, 80], [120.0, 100, 140, 120]]])
     scores = torch.tensor([[[0, 0.5, 0], [0, 0.02, 0], [0, 0.001, 0]]])
     places = PhotographPlaces(1, OVER)
-    places.see(WindowLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.8, 0.5, 0.0))
+    places.see(SearchLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.8, 0.5, 0.0))
 
     def odds(p):
         return math.log(p / (1 - p))
@@ -389,7 +389,7 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]])
     places, looked = PhotographPlaces(1, OVER), []
     whole = Detections(boxes, scores, torch.ones(1, 2).bool())
-    places.see(WindowLook(whole, 1, 0.8, 0.5, 0.0))
+    places.see(SearchLook(whole, 1, 0.8, 0.5, 0.0))
 
     def close_up(box):
         looked.append(box)
@@ -418,7 +418,7 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
         return closely
 
     judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), close_up, AT, most=9)
-    judge.see(WindowLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
+    judge.see(SearchLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
     judge.look()
     # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
     assert judge.places.seen(judge.candidate)
@@ -438,7 +438,7 @@ def test_a_closer_look_is_not_at_an_object_that_was_examined():
     boxes = torch.tensor([[[10.0, 10, 30, 30], [18.0, 10, 38, 30]]])  # they overlap by 0.43
     places = PhotographPlaces(1, OVER)
     whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
-    places.see(WindowLook(whole, 1, 0.8, 0.5, 0.0))
+    places.see(SearchLook(whole, 1, 0.8, 0.5, 0.0))
     one = Detections(boxes[:, :1] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
     _, box = places.examine(places.due(0.1, last=True), lambda box: one)
     assert torch.equal(box, one.boxes[0, 0])
@@ -466,7 +466,7 @@ def test_evidence_says_how_large_the_window_of_a_closer_look_is(detector, photog
     model = own_evidence()
     model.photograph.window = window
     path = ZoomAgent(WindowEye(detector), model).search(photograph, "red", closer=1)
-    whole, closer = path.glances
+    whole, closer = path.window_looks
     box = whole.detections.boxes[0, whole.detections.scores[0, :, 1].argmax()]
     side = float((box[2:] - box[:2]).max())
     x1, _, x2, _ = closer.window.within
@@ -474,8 +474,8 @@ def test_evidence_says_how_large_the_window_of_a_closer_look_is(detector, photog
 
 
 def test_hints_below_the_threshold_of_detections_are_places(detector, photograph):
-    glances = LiveGlances(eye := WindowEye(detector), eye.open(photograph / 20))
-    (whole,) = glances.see([Window.overview(glances.lattice)])
+    source = LiveWindowLooks(eye := WindowEye(detector), eye.open(photograph / 20))
+    (whole,) = source.see([Window.overview(source.lattice)])
     assert not len(whole.detections.boxes[0])
     places = whole.candidates
     assert len(places.boxes[0]) == len(whole.hints.boxes) > 0
@@ -496,13 +496,15 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert nothing.passes == 1
     assert "frequency and low score" in nothing.why_it_ended()
     seen = torch.tensor([0.0, 0.0, PhotographPlaces.least + 1e-6])
-    shown = replace(nothing, glances=tuple(replace(glance, show=seen) for glance in nothing.glances))
+    shown = replace(
+        nothing, window_looks=tuple(replace(window_look, show=seen) for window_look in nothing.window_looks)
+    )
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
     made = [agent.search(photograph, "red", confirm=least, give_up=0.0) for least in (0.01, 0.9)]
     assert len(made[0].closer) == len(made[1].closer) > max(len(path.closer), 2)
     for each in made:
-        assert len({glance.window for glance in each.glances}) == each.passes < 1 + len(each.closer)
+        assert len({window_look.window for window_look in each.window_looks}) == each.passes < 1 + len(each.closer)
         assert {look.number for look in each.closer} == set(range(1, each.passes))
         rows = [row["closer"] for row in each.rows()]
         best = [max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes)]
@@ -585,7 +587,7 @@ def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph
 def test_all_objects_of_a_photograph_are_those_of_the_whole_and_of_slices(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
     one, all_ = (agent.find_all(photograph, "red", passes=passes) for passes in (1, 5))
-    assert [look.window for look in all_.glances[:1]] == [look.window for look in one.glances]
-    assert {look.window for look in all_.glances[1:]} == set(usual_slices(all_.lattice))
+    assert [look.window for look in all_.window_looks[:1]] == [look.window for look in one.window_looks]
+    assert {look.window for look in all_.window_looks[1:]} == set(usual_slices(all_.lattice))
     assert len(all_.objects) >= len(one.objects)
     assert all_.ending == "windows" or all_.passes == 5

@@ -29,14 +29,14 @@ from semfov.fit.windows_certainty import (
 from semfov.metrics.calibration import calibration_error
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
-from semfov.runs.zoom_store import StoredGlances
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import CASE, features
-from semfov.zoom.glances import Glance, LiveGlances, Window
 from semfov.zoom.lattice import CELLS
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.objects import _object_facts, merge, merge_with_facts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
@@ -61,25 +61,25 @@ def eye(detector):
     return WindowEye(detector)
 
 
-def turns(eye, picture, target, most=6):
+def steps(eye, picture, target, most=6):
     torch.manual_seed(0)
-    glances = LiveGlances(eye, eye.open(picture))
-    steps = look_for(glances, GlimpseEvidence(3, 8).eval(), target)
+    source = LiveWindowLooks(eye, eye.open(picture))
+    steps = look_for(source, GlimpseEvidence(3, 8).eval(), target)
     with torch.inference_mode():
-        return [turn for turn, _ in zip(steps, range(most), strict=False)]
+        return [step for step, _ in zip(steps, range(most), strict=False)]
 
 
 def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     """Every feature, computed in another way from the looks."""
-    target, seen = 1, turns(eye, picture, 1)
+    target, seen = 1, steps(eye, picture, 1)
     facts = SearchFacts(seen[0].belief)
-    for turn in seen:
-        facts.add(turn.glance)
-    scores = [float(turn.glance.show[target - 1]) for turn in seen]
-    closest = [s for s, turn in zip(scores, seen, strict=True) if turn.glance.gist is None]
+    for step in seen:
+        facts.add(step.look)
+    scores = [float(step.look.show[target - 1]) for step in seen]
+    closest = [s for s, step in zip(scores, seen, strict=True) if step.look.gist is None]
     named = [
         float(d.scores[0, n, target])
-        for d in (turn.glance.detections for turn in seen)
+        for d in (step.look.detections for step in seen)
         for n in range(d.scores.shape[1])
         if int(d.scores[0, n].argmax()) == target
     ]
@@ -95,17 +95,17 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     assert case[8] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
     assert case[9] == pytest.approx(math.log(len(seen)) / 2)
     assert case.shape == (CASE,)
-    boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
-    confidence = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
+    boxes = torch.cat([step.look.detections.boxes[0] for step in seen])
+    confidence = torch.cat([step.look.detections.scores[0, :, target] for step in seen])
     assert facts.box.tolist() == boxes[confidence.argmax()].tolist()
 
 
 def test_before_fitting_the_probability_is_the_best_score(eye, picture):
-    seen = turns(eye, picture, 1)
+    seen = steps(eye, picture, 1)
     facts = SearchFacts(seen[0].belief)
-    for turn in seen:
-        facts.add(turn.glance)
-        assert facts.presence(turn.ahead) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
+    for step in seen:
+        facts.add(step.look)
+        assert facts.presence(step.ahead) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
 
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
@@ -140,14 +140,14 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
     """A search computes the probability only where it can matter; here it is computed after every look."""
     most, thresholds = 6, Thresholds(confirm, give_up)
     torch.manual_seed(0)
-    evidence, glances = GlimpseEvidence(3, 8).eval(), LiveGlances(eye, eye.open(picture))
+    evidence, source = GlimpseEvidence(3, 8).eval(), LiveWindowLooks(eye, eye.open(picture))
     facts, passes, ended = None, 0, 0
     with torch.inference_mode():
-        for turn in look_for(glances, evidence, target):
-            facts = facts or SearchFacts(turn.belief)
-            facts.add(turn.glance)
-            presence, passes = facts.presence(turn.ahead), passes + 1
-            state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([turn.ahead])
+        for step in look_for(source, evidence, target):
+            facts = facts or SearchFacts(step.belief)
+            facts.add(step.look)
+            presence, passes = facts.presence(step.ahead), passes + 1
+            state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([step.ahead])
             ended = int(settle(*state, thresholds))
             if ended or passes == most:
                 break
@@ -269,7 +269,7 @@ def test_objects_have_the_facts_of_their_looks():
     def look(level, box, score):
         vectors = torch.tensor([[[1 - score, score, 0.0]]])
         seen = Detections(torch.tensor([[box]]), vectors, torch.ones(1, 1, dtype=torch.bool))
-        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
+        return WindowLook(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([False]), torch.zeros(2), None)
 
     near, far = look(3, [20.0, 20, 90, 90], 0.9), look(1, [22.0, 20, 92, 91], 0.6)
     faint = look(2, [21.0, 20, 90, 92], 0.04)
@@ -294,7 +294,7 @@ def test_a_cut_box_is_the_same_object_from_half_of_its_area_on(x, count):
 
     def look(level, box, cut):
         seen = Detections(torch.tensor([[box]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1, dtype=torch.bool))
-        return Glance(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
+        return WindowLook(Window.on(lattice, (level, 0, 0)), seen, torch.tensor([cut]), torch.zeros(1), None)
 
     whole = look(1, [100.0, 20, 300, 90], False)
     objects, _ = merge_with_facts([whole, look(3, [x, 20.0, 160, 90], True)], lattice)
@@ -345,10 +345,10 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
     certainty = Certainty(2.0, (1.0, *[0.0] * (len(FACTS) - 1)), scale=0.5, strength=2.0)
     torch.manual_seed(0)
     evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()
-    glances = StoredGlances(eye, mosaics, 0, None)
-    _, sought = explorations_of_kinds(evidence, {"mosaics": (mosaics, [glances])}, 4)["mosaics"]
-    looked = [turn.glance for turn in islice(find_everything(glances, evidence, sought.target), 8)]
-    right = right_boxes(merge_with_facts(looked, glances.lattice, sought.target)[0], mosaics.annotation(0))
+    source = StoredWindowLooks(eye, mosaics, 0, None)
+    _, sought = explorations_of_kinds(evidence, {"mosaics": (mosaics, [source])}, 4)["mosaics"]
+    looked = [step.look for step in islice(find_everything(source, evidence, sought.target), 8)]
+    right = right_boxes(merge_with_facts(looked, source.lattice, sought.target)[0], mosaics.annotation(0))
     annotation = mosaics.annotation(0)
     assert sought.held == int((annotation.labels[~annotation.crowd] == sought.target).sum())
     assert torch.equal(sought.objects[sought.looks][1], right)

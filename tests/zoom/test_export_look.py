@@ -14,7 +14,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import pool_spans
-from semfov.zoom.glances import LiveGlances, Window
+from semfov.zoom.looks import LiveWindowLooks, Window
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript", reason="torch exports ONNX with it")
@@ -76,14 +76,14 @@ def run(path, picture, fixation):
 def compare(found, eye, picture, fixation, pixels, score):
     """Compare box by box; boxes with equal scores may be in any order."""
     view, at = eye.open(picture), torch.tensor([fixation])
-    glance = eye.glance(view, at)
-    seen = glance.detections
+    look = eye.glance(view, at)
+    seen = look.detections
     assert len(found["boxes"]) == int(seen.mask.sum()) > 0
     match = box_iou(found["boxes"], seen.boxes[0]).argmax(-1)
     assert sorted(match.tolist()) == list(range(len(match)))
     torch.testing.assert_close(found["boxes"], seen.boxes[0, match], rtol=0, atol=pixels)
     torch.testing.assert_close(found["scores"], seen.scores[0, match], rtol=0, atol=score)
-    assert torch.equal(found["cut"], glance.cut[0, match])
+    assert torch.equal(found["cut"], look.cut[0, match])
     assert torch.equal(found["window"].double(), eye.glimpse(view, at)[1][0, :4].double())
     best = found["scores"][:, 1:].amax(-1)
     assert torch.equal(best, best.sort(descending=True).values)
@@ -139,7 +139,7 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path):
         # Around the red square.
         column, row = (int(middle / pitch) - 13 for middle, pitch in zip((656, 336), lattice.pitch, strict=True))
         window = Window.on(lattice, (level, column, max(row, 0)))
-        gist = LiveGlances(eye, view).see([window])[0].gist
+        gist = LiveWindowLooks(eye, view).see([window])[0].gist
         pixels = view.picture.pixels((0, 0, *view.picture.size))
         found = run(tmp_path / "look.onnx", pixels, window.fixation)
         assert gist.scores.shape[:2] == (32, 32)

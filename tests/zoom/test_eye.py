@@ -22,9 +22,9 @@ from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
 from semfov.zoom.eye import BORDER, _hints_of
-from semfov.zoom.glances import LiveGlances, Window
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
+from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.data.test_large import pixels
 from tests.refusals import refused
@@ -203,9 +203,9 @@ def test_adaptive_slices_are_as_many_as_the_size_asks_and_cover_the_picture(size
 
 def test_windows_come_in_the_order_of_the_summed_scores(agent):
     """By a loop over the cells of the overview's hints."""
-    glances = LiveGlances(agent.eye, agent.eye.open(picture((900, 600, 90, "green"), (100, 100, 60, "red"))))
-    windows = usual_slices(glances.lattice)
-    (overview,) = glances.see([path.window for path in agent.find_all(picture(), passes=1).glances])
+    source = LiveWindowLooks(agent.eye, agent.eye.open(picture((900, 600, 90, "green"), (100, 100, 60, "red"))))
+    windows = usual_slices(source.lattice)
+    (overview,) = source.see([path.window for path in agent.find_all(picture(), passes=1).window_looks])
     hints = overview.gist
     for targets in ([], [1], [2], [1, 2]):
         sums = []
@@ -320,8 +320,8 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, faint,
     assert column < lattice.places(level)[0]
     assert row < lattice.places(level)[1]
     window = Window.on(lattice, (level, column, row))
-    glance = LiveGlances(eye, view).see([window])[0]
-    look = glance.gist
+    window_look = LiveWindowLooks(eye, view).see([window])[0]
+    look = window_look.gist
     rows, columns, _ = look.scores.shape
     x, y, magnification = window.fixation
     left, top = x + 0.5 - 64 / magnification, y + 0.5 - 64 / magnification
@@ -347,8 +347,8 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, faint,
     assert 0 < hints < len(detector.boxes)
     torch.testing.assert_close(look.scores, strongest, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(look.size, size, rtol=0, atol=1e-4)
-    torch.testing.assert_close(glance.show, strongest.amax((0, 1)), rtol=1e-5, atol=1e-7)
-    found = glance.detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
+    torch.testing.assert_close(window_look.show, strongest.amax((0, 1)), rtol=1e-5, atol=1e-7)
+    found = window_look.detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
     assert 0 < int(look.found.sum()) <= int(found.sum()) <= 20
 
 
@@ -380,7 +380,7 @@ def test_a_look_without_hints_shows_its_detections():
     view = eye.open(torch.zeros(3, 384, 512))
     last = view.lattice.levels - 1
     window = Window.on(view.lattice, (last, 3, 3))
-    plain, hinted = (LiveGlances(eye, view).see([window], hints=hints)[0] for hints in (False, True))
+    plain, hinted = (LiveWindowLooks(eye, view).see([window], hints=hints)[0] for hints in (False, True))
     assert plain.gist is None
     assert hinted.gist is None
     assert torch.equal(plain.show, plain.detections.scores[0, :, 1:].amax(0))

@@ -13,7 +13,7 @@ from semfov.agents.picture import OpenedPicture
 from semfov.agents.windows import _without_replaced
 from semfov.data.large import open_large
 from semfov.zoom import GlimpseEvidence, Lattice, merge
-from semfov.zoom.glances import Glance, LiveGlances, Window
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from tests.refusals import refused
 from tests.zoom.test_closer import Fickle, evidence
 
@@ -25,7 +25,7 @@ def test_search_finds_a_target_in_the_picture_and_ends_without_one(agent, pictur
     x1, y1, x2, y2 = path.decision.box.tolist()
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
-    assert path.passes == len(path.glances)
+    assert path.passes == len(path.window_looks)
     path = agent.search(picture, "green", passes=7)
     assert path.decision.outcome in ("absent", "undecided")
     assert path.passes <= 7
@@ -127,17 +127,17 @@ def test_invalid_arguments_are_refused(agent, picture, detector):
         refused(message, GlimpseEvidence, **wrong)
 
 
-def make_glance(level, column, row, boxes, scores, cut):
+def make_look(level, column, row, boxes, scores, cut):
     lattice = Lattice.over((1024, 768), (128, 128))
     vectors = torch.zeros(1, len(boxes), 3)
     vectors[0, :, 1] = torch.tensor(scores)
     vectors[0, :, 0] = 1 - vectors[0, :, 1]
     detections = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
-    return Glance(Window.on(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
+    return WindowLook(Window.on(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
 
 
 def test_merging_keeps_small_objects_in_front_of_large_ones():
-    look = make_glance(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
+    look = make_look(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
     assert len(merge([look])) == 2
     assert len(merge([look], score=0.85)) == 1
     assert len(merge([])) == 0
@@ -149,7 +149,7 @@ def test_the_score_of_an_object_is_the_highest_of_its_looks():
     def look(magnification, box, score):
         vector = torch.tensor([[[1 - score, score, 0.0]]])
         seen = Detections(torch.tensor([[box]]), vector, torch.ones(1, 1).bool())
-        return Glance(
+        return WindowLook(
             Window((50.0, 50.0, magnification), 0, (0, 0, 8, 8)), seen, torch.zeros(1).bool(), torch.zeros(2), None
         )
 
@@ -160,14 +160,14 @@ def test_the_score_of_an_object_is_the_highest_of_its_looks():
     assert objects.boxes.tolist() == [[11.0, 12, 51, 50], [70.0, 10, 90, 50]]
 
 
-def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
+def test_looks_treat_cut_boxes_as_their_eye_does(detector, picture):
     found = {}
     for cut in ("keep", "drop", "background"):
         eye = WindowEye(detector, cut=cut)
         view = eye.open(picture)
         window = Window.on(view.lattice, (view.lattice.levels - 1, 33, 15))  # its border lies in the red square
         other = Window.on(view.lattice, (view.lattice.levels - 1, 34, 15))
-        found[cut], whole = LiveGlances(eye, view).see([window, other])
+        found[cut], whole = LiveWindowLooks(eye, view).see([window, other])
         assert whole.detections.mask.shape == (1, len(whole.cut))
     keep, drop, background = found.values()
     assert bool(keep.cut.any())
@@ -181,20 +181,22 @@ def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
 def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, monkeypatch, learned):
     """The next windows are guessed and resampled while the detector works; records and files are those of one."""
     agent = agent if learned else ZoomAgent(agent.eye).eval()
-    prepared, prepare = [], LiveGlances.prepare
-    monkeypatch.setattr(LiveGlances, "prepare", lambda self, window: (prepared.append(window), prepare(self, window)))
+    prepared, prepare = [], LiveWindowLooks.prepare
+    monkeypatch.setattr(
+        LiveWindowLooks, "prepare", lambda self, window: (prepared.append(window), prepare(self, window))
+    )
     paths = {}
     for cores in (torch.get_num_threads(), torch.get_num_threads() + 1):
         monkeypatch.setattr("semfov.threads.available_cores", lambda cores=cores: cores)
         assert not prepared
         paths[cores] = agent.search(picture, "green", passes=6), agent.explore(picture, passes=6, worth=0.0)
     for alone, helped in zip(*paths.values(), strict=True):
-        assert [look.window for look in alone.glances] == [look.window for look in helped.glances]
+        assert [look.window for look in alone.window_looks] == [look.window for look in helped.window_looks]
         assert alone.values == helped.values
         assert torch.equal(alone.photograph, helped.photograph)
         for name in ("boxes", "scores", "labels", "passes"):
             assert torch.equal(getattr(alone.candidates, name), getattr(helped.candidates, name))
-    looked = {look.window for path in paths[cores] for look in path.glances}
+    looked = {look.window for path in paths[cores] for look in path.window_looks}
     assert looked & set(prepared)
 
 
@@ -203,10 +205,10 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
 )
 def test_a_second_thread_knows_the_window_after_a_look_of_the_last_level(agent, picture, monkeypatch, task, settings):
     small, prepared = picture[:, :400, 300:800], []
-    monkeypatch.setattr(LiveGlances, "prepare", lambda self, window: prepared.append(window))
+    monkeypatch.setattr(LiveWindowLooks, "prepare", lambda self, window: prepared.append(window))
     monkeypatch.setattr("semfov.threads.available_cores", lambda: torch.get_num_threads() + 1)
     path = getattr(agent, task)(small, "green", passes=16, **settings)
-    windows, last = [look.window for look in path.glances], path.lattice.levels - 1
+    windows, last = [look.window for look in path.window_looks], path.lattice.levels - 1
     # Nothing is prepared during the overview.
     known = [window == prepared[n] for n, window in enumerate(windows[2:]) if windows[n + 1].level == last]
     assert known
@@ -216,12 +218,12 @@ def test_a_second_thread_knows_the_window_after_a_look_of_the_last_level(agent, 
 def same_looks(moments, path):
     """Whether moments hold the looks of a path, to the bit."""
     last = moments[-1]
-    assert [moment.window for moment in moments] == [glance.window for glance in path.glances]
+    assert [moment.window for moment in moments] == [window_look.window for window_look in path.window_looks]
     assert [moment.next_window for moment in moments[:-1]] == [moment.window for moment in moments[1:]]
     assert last.values == path.values
-    for look, glance in zip(last.glances, path.glances, strict=True):
-        assert torch.equal(look.detections.boxes, glance.detections.boxes)
-        assert torch.equal(look.detections.scores, glance.detections.scores)
+    for look, window_look in zip(last.window_looks, path.window_looks, strict=True):
+        assert torch.equal(look.detections.boxes, window_look.detections.boxes)
+        assert torch.equal(look.detections.scores, window_look.detections.scores)
     assert torch.equal(last.candidates.boxes, path.candidates.boxes)
     assert last.object_rows() == path.object_rows()
 
@@ -231,7 +233,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, p
     path = agent.find_all(picture, target, passes=9)
     targets = {None: (), 3: (3,)}.get(target) if not isinstance(target, list) else tuple(target)
     live = agent.episode(None, targets, rate=0)
-    moments = [live.step(picture) for _ in path.glances]
+    moments = [live.step(picture) for _ in path.window_looks]
     same_looks(moments, path)
     assert moments[-1].decision is None
     assert (moments[-1].target, moments[-1].targets) == (path.target, path.targets)
@@ -245,7 +247,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, pict
     agent = ZoomAgent(WindowEye(detector), model).eval()
     path = agent.search(picture, "red")
     live = agent.episode(1, rate=0)
-    moments = [live.step(picture) for _ in path.glances]
+    moments = [live.step(picture) for _ in path.window_looks]
     same_looks(moments, path)
     last = moments[-1]
     assert last.decision.outcome == path.decision.outcome == "found"
@@ -264,7 +266,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     path = agent.search(image, "red", closer=2)
     live = agent.episode(1, rate=0, closer=2)
-    moments = [live.step(image) for _ in path.glances]
+    moments = [live.step(image) for _ in path.window_looks]
     same_looks(moments, path)
     assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
     assert len(path.closer) == len(moments[-1].closer) == 2
@@ -278,7 +280,7 @@ def test_looks_are_forgotten_by_the_seconds_that_passed(agent, picture):
         now += passed
         dates[moment.window] = now
         expected = {window for window, date in dates.items() if window.level == 0 or now - date <= 4.5}
-        assert {look.window for look in moment.glances} == expected
+        assert {look.window for look in moment.window_looks} == expected
         due = now + passed - next(date for window, date in dates.items() if window.level == 0) > 4.5
         assert due == (moment.next_window.level == 0)
     assert len(dates) > len(expected)
@@ -321,29 +323,29 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
     """Brute force over every pair of a box and a later window."""
     lattice, generator = Lattice.over((1024, 768), (128, 128)), torch.Generator().manual_seed(0)
     windows = [(0, 0, 0), (1, 4, 4), (2, 8, 8), (1, 0, 0), (2, 20, 20), (0, 0, 0), (2, 10, 9)]
-    glances = []
+    looks = []
     for action in windows:
         low = torch.rand(6, 2, generator=generator) * 700
         boxes = torch.cat([low, low + 40], -1)[None]
         detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
-        glances.append(Glance(Window.on(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
-    kept = _without_replaced(glances, lattice)
-    for number, (glance, left) in enumerate(zip(glances, kept, strict=True)):
+        looks.append(WindowLook(Window.on(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
+    kept = _without_replaced(looks, lattice)
+    for number, (window_look, left) in enumerate(zip(looks, kept, strict=True)):
         expected = []
-        for place, (x1, y1, x2, y2) in enumerate(glance.detections.boxes[0].tolist()):
+        for place, (x1, y1, x2, y2) in enumerate(window_look.detections.boxes[0].tolist()):
             hidden = False
-            for later in glances[number + 1 :]:
+            for later in looks[number + 1 :]:
                 a, b, c, d = later.window.region(lattice)
                 w, h = (x2 - x1) / 2, (y2 - y1) / 2
                 inside = (
                     a <= max(x1 - w, 0) and b <= max(y1 - h, 0) and min(x2 + w, 1024) <= c and min(y2 + h, 768) <= d
                 )
-                hidden |= inside and later.window.level >= glance.window.level
+                hidden |= inside and later.window.level >= window_look.window.level
             if not hidden:
                 expected.append(place)
-        assert torch.equal(left.detections.boxes[0], glance.detections.boxes[0, expected])
-        assert torch.equal(left.cut, glance.cut[expected])
-    assert sum(len(look.cut) for look in kept) < sum(len(look.cut) for look in glances)
+        assert torch.equal(left.detections.boxes[0], window_look.detections.boxes[0, expected])
+        assert torch.equal(left.cut, window_look.cut[expected])
+    assert sum(len(look.cut) for look in kept) < sum(len(look.cut) for look in looks)
 
 
 @pytest.fixture

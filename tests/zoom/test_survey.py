@@ -12,8 +12,8 @@ from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts,
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import Survey, _neighbourhood_mean, _through, features
-from semfov.zoom.glances import Window, half_steps
 from semfov.zoom.hints import Gist
+from semfov.zoom.looks import Window, half_steps
 from train.fit_zoom import judge_survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
@@ -79,10 +79,10 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
-    glance = _WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
-    for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
+    look = _WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    for target, rates in ((0, evidence.survey.rates(look.gist)), (2, evidence.rates(look.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
-        belief.add(glance)
+        belief.add(look)
         expected = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, LATTICE.levels)])
         torch.testing.assert_close(expected, rates[0].exp()[: len(expected), : LATTICE.rows, : LATTICE.columns])
         assert belief.foresight == (0.125 if target == 0 else 0.35)

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from semfov.detection.detections import Detections
 from semfov.motion import CameraStep
-from semfov.zoom.eye import Resampled, WindowEye, WindowLooks, WindowView
+from semfov.zoom.eye import Resampled, WindowDetections, WindowEye, WindowView
 from semfov.zoom.hints import Gist, Hints
 from semfov.zoom.lattice import Lattice
 
@@ -68,7 +68,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Glance:
+class WindowLook:
     """The result of a look at a window; cut `(L,)`, show `(K,)`; all hints, in a photograph alone."""
 
     window: Window
@@ -97,7 +97,7 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
                 yield Window.on(lattice, (level, column, row))
 
 
-class Glances(ABC):
+class WindowLooks(ABC):
     """Base of sources of looks at one picture: live ones, and stored ones."""
 
     lattice: Lattice
@@ -118,11 +118,11 @@ class Glances(ABC):
         return None
 
     @abstractmethod
-    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
         """Look at windows, in one batch where that is possible."""
 
 
-class LiveGlances(Glances):
+class LiveWindowLooks(WindowLooks):
     """Looks of an eye at a picture."""
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
@@ -147,7 +147,7 @@ class LiveGlances(Glances):
         fixation = torch.tensor([window.fixation], dtype=torch.float64)
         self._prepared[window] = self.eye.resample(self.view, fixation, [window.within])
 
-    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
         hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
@@ -155,10 +155,10 @@ class LiveGlances(Glances):
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         within = [window.within for window in windows]
         looks = self.eye.glance(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
-        return [_glance(looks, n, window, self.lattice) for n, window in enumerate(windows)]
+        return [_look_at(looks, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
-def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -> Glance:
+def _look_at(looks: WindowDetections, number: int, window: Window, lattice: Lattice) -> WindowLook:
     detections = looks.detections
     if len(detections.mask) > 1:  # a batch of one, without padding
         count, one = int(detections.mask[number].sum()), slice(number, number + 1)
@@ -173,4 +173,4 @@ def _glance(looks: WindowLooks, number: int, window: Window, lattice: Lattice) -
         scores = looks.hints[number].scores
         faint = looks.hints[number] if lattice.levels == 1 else None
     show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
-    return Glance(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
+    return WindowLook(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
