@@ -17,7 +17,7 @@ from train.zoom_slices import odds_of
 
 
 @pytest.fixture
-def looks_at(detector, picture):
+def source(detector, picture):
     eye = WindowEye(detector)
     return LiveWindowLooks(eye, eye.open(picture))
 
