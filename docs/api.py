@@ -21,6 +21,7 @@ MODULES = (
     "semfov.gaze.saliency",
     "semfov.episode",
     "semfov.live",
+    "semfov.settings",
     "semfov.paths",
     "semfov.viz",
     "semfov.report",

@@ -1,0 +1,167 @@
+"""Types of settings that state their ranges, and the check of values by these types."""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from semfov.errors import check
+from semfov.io.schema import excerpt, interval
+
+
+@dataclass(frozen=True)
+class Range:
+    """A range of numbers, in a type annotation: `Annotated[int, Range(1, 100)]`.
+
+    Args:
+        low: least value of the range.
+        high: largest value of the range.
+        above: number that values are larger than.
+        below: number that values are smaller than.
+        noun: what the numbers are, in messages (None: `a number`, or `a whole number`).
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: float | None = None
+    below: float | None = None
+    noun: str | None = None
+
+    def __repr__(self) -> str:
+        """The range in words, such as `from 1 to 100`."""
+        if self.above is not None and self.below is not None:
+            return f"above {self.above:g} and below {self.below:g}"
+        return interval(self.low, self.high, -math.inf if self.above is None else self.above).removeprefix("numbers ")
+
+    def holds(self, value: object, *, whole: bool) -> bool:
+        """Tell whether a value is a number in this range.
+
+        Args:
+            value: any value; numbers of NumPy are numbers, `True` and tensors are none.
+            whole: whether only a whole number is one.
+
+        Returns:
+            Whether it lies in the range, which NaN never does.
+        """
+        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+            return False
+        try:
+            number = int(value) if isinstance(value, Integral) else float(value)
+        except (OverflowError, ValueError):
+            return False
+        return (
+            self.low <= number <= self.high
+            and (self.above is None or number > self.above)
+            and (self.below is None or number < self.below)
+        )
+
+
+class _FileName:
+    """Restriction of a text setting to valid file names, in a type annotation."""
+
+    noun = None
+
+    def __repr__(self) -> str:
+        return "that is valid as a file name (letters, digits, space and _ . + -; at most 100 characters)"
+
+    def holds(self, value: object, *, whole: bool) -> bool:
+        return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
+
+
+SingleName = Annotated[str, _FileName()]  # name of a model to write
+Seed = Annotated[int, Range(0, 2**63 - 1)]  # seed of a random generator
+Count = Annotated[int, Range(1, 10**9)]  # a number of objects, at least one
+Whole = Annotated[int, Range(0, 10**9)]  # a number of objects, possibly 0
+Share = Annotated[float, Range(0, 1)]  # a share or a score
+Probability = Annotated[float, Range(0, 1, noun="a probability")]
+Positive = Annotated[float, Range(above=0, high=10**9)]  # a number above 0
+Weight = Annotated[float, Range(0, 10**9)]  # a number of 0 or more
+Seconds = Annotated[float, Range(0)]  # a time limit, possibly infinite
+Shifts = Annotated[int, Range(0, 10_000)]  # number of gaze shifts in an episode
+Side = Annotated[int, Range(1, 200)]  # number of cells in a row or in a column
+Workers = Annotated[int, Range(1, 1024)]  # number of processes
+
+_NOUNS = {int: "a whole number", float: "a number", str: "a name"}
+
+_type_hints = cache(get_type_hints)
+
+
+def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: bool = True) -> None:
+    """Raise `InputError`, with the dotted name and the range, if a setting is out of the range of its type.
+
+    Args:
+        config: dataclass of the settings.
+        values: the values by name, a mapping or what behaves as one; names that are missing are not checked.
+        prefix: start of the dotted names in the message.
+        nested: whether settings within settings are checked, too.
+    """
+    hints = _type_hints(config, include_extras=True)  # type: ignore[arg-type]
+    for field in fields(config):
+        if field.name not in values:
+            continue
+        value = values[field.name]
+        hint = hints[field.name]
+        if not is_dataclass(hint):
+            _check_value(hint, value, prefix + field.name)
+        elif nested and not is_dataclass(value) and value is not None:
+            check_settings(hint, value, f"{prefix}{field.name}.")  # type: ignore[arg-type]
+
+
+def _check_value(hint: Any, value: object, name: str) -> None:
+    """Raise `InputError` if a value is out of the range of its type, which may be of several kinds."""
+    if value is None or isinstance(value, Mapping):
+        return
+    if isinstance(value, str | Path):
+        check("\0" not in str(value), name, "text without NUL", excerpt(str(value)))
+    kind = get_origin(hint)
+    if kind is Annotated:
+        _check_ranges(hint, value, name)
+    elif kind is tuple and isinstance(value, list | tuple):
+        item_hints = get_args(hint)
+        for place, item in enumerate(value):
+            _check_value(item_hints[0 if item_hints[-1] is Ellipsis else place], item, f"{name}[{place}]")
+    else:
+        _check_alternatives(get_args(hint), value, name)
+
+
+def _check_ranges(hint: Any, value: object, name: str) -> None:
+    """Raise `InputError` if a value is out of a range that its type is annotated with."""
+    base, *annotations = get_args(hint)
+    for annotation in annotations:
+        if isinstance(annotation, Range | _FileName):
+            expected = f"{annotation.noun or _NOUNS[base]} {annotation}"
+            check(annotation.holds(value, whole=base is int), name, expected, excerpt(value))
+
+
+def _check_alternatives(alternatives: tuple[Any, ...], value: object, name: str) -> None:
+    """Raise `InputError` if a value is out of the range of the alternative that it is meant to be."""
+    # Where a setting is a number or a word, its words are checked where the setting is used.
+    is_word = isinstance(value, str) and any(map(_takes_text, alternatives))
+    for alternative in alternatives:
+        if is_dataclass(alternative) and not is_dataclass(value) and hasattr(value, "__dict__"):
+            check_settings(alternative, vars(value), f"{name}.")  # type: ignore[arg-type]
+        elif get_origin(alternative) is Annotated and _takes_text(alternative) == is_word:
+            _check_ranges(alternative, value, name)
+
+
+def _takes_text(hint: Any) -> bool:
+    """Tell whether text can be a value of a type."""
+    if get_origin(hint) is Annotated:
+        return get_args(hint)[0] is str
+    return hint is str or hint is Path or get_origin(hint) is Literal
+
+
+@dataclass(frozen=True)
+class CheckedSettings:
+    """Base of dataclasses of settings; it refuses values that are out of the ranges of their types.
+
+    A class documents its own settings, and inherited ones only where they mean something else.
+    """
+
+    def __post_init__(self) -> None:
+        """Check all values (`check_settings`)."""
+        check_settings(type(self), vars(self), nested=False)

@@ -1,0 +1,267 @@
+"""The settings of each task: made once where a task is asked for, read by its episode, and shown as its options.
+
+The fields of these classes are the keywords of `ActivePerception.search`, `find_all`, `explore` and `live`, and the
+options of the commands, which take their names, types and help from here. In all of them None is the default that suits
+the kind of look and the models of the agent.
+
+                      LookSettings    StartSettings    DecisionSettings    its own
+    SearchSettings         x                x                 x            boxes
+    FindSettings           x                                               worth, least, batch
+    ExploreSettings        x                x                              worth, least, policy
+    StreamSettings                          x                 x            how, rate, color
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Literal, get_args
+
+from torch import Tensor
+
+from semfov.data.inputs import Color
+from semfov.errors import InputError, check, lookup
+from semfov.io.ranges import CheckedSettings, Probability, Range, Seconds, Seed, Shifts
+
+__all__ = [
+    "DecisionSettings",
+    "ExploreSettings",
+    "FindSettings",
+    "LookSettings",
+    "SearchSettings",
+    "StartSettings",
+    "StreamSettings",
+]
+
+KindOfLook = Literal["fovea", "windows", "head"]
+"""Kind of look: foveal fixations of a photograph, windows of a picture, or views of a scene."""
+
+How = Literal["auto", "fovea", "windows", "head"]
+"""Kind of look, or `auto` for the one that suits the picture."""
+
+Start = int | tuple[int, int] | None
+"""First cell of a fovea, by its number or its column and row, or first action of a head; None for the usual one."""
+
+OnLook = Callable[[Any], object]
+"""Function that is called after each look with the record so far; the episode ends if it returns False."""
+
+MOST_PASSES = 1_000_000
+"""Largest number of passes that can be asked for."""
+
+Passes = Annotated[int, Range(1, MOST_PASSES)]
+CloserLooks = Annotated[int, Range(0, 100)]
+Gain = Annotated[float, Range(0)]
+PriorShare = Annotated[float, Range(above=0, below=1, noun="a share")]
+Rate = Annotated[float, Range(0, 100)]
+
+_KINDS = "kinds"  # metadata of a field: the kinds of look that the setting is for, first the one that messages suggest
+_INSTEAD = "instead"  # metadata of a field: what a message suggests for other kinds of look
+
+
+def _only_for(*kinds: KindOfLook, instead: str) -> Mapping[str, object]:
+    """Make the metadata of a setting that means nothing to other kinds of look."""
+    return {_KINDS: kinds, _INSTEAD: instead}
+
+
+@dataclass(frozen=True)
+class LookSettings(CheckedSettings):
+    """Settings of all episodes with a picture: the kind of look, and the limits. It ends at the first that is reached.
+
+    Args:
+        how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
+            in front of the viewer), or `auto` for the one that suits the picture.
+        passes: largest number of passes of the detector, closer looks included (None: 24 for windows, 40 for a head).
+        shifts: largest number of gaze shifts of a fovea (None: 30 for a search, 20 otherwise; with `passes` no limit).
+        seconds: longest time in seconds for a picture on this machine.
+        duration: in a scene, longest time in seconds that the movements of eye and head take (None: 30).
+        on_look: function that is called after each look with the record so far; returning False ends the episode.
+
+    Raises:
+        InputError: a value is out of range, or the kind of look is unknown.
+
+    >>> LookSettings(passes=8)
+    LookSettings(how='auto', passes=8, shifts=None, seconds=None, duration=None, on_look=None)
+    """
+
+    how: How = "auto"
+    passes: Passes | None = None
+    shifts: Shifts | None = field(default=None, metadata=_only_for("fovea", instead="passes="))
+    seconds: Seconds | None = None
+    duration: Seconds | None = field(default=None, metadata=_only_for("head", instead="seconds="))
+    on_look: OnLook | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        lookup(self.how, get_args(How), "kind of look")
+        check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
+
+
+@dataclass(frozen=True)
+class StartSettings(CheckedSettings):
+    """Settings of the first look, and of what is drawn at random.
+
+    Args:
+        start: first cell of a fovea, by its number row by row or as `(column, row)`, or first action of a head
+            (`semfov.head.views.Views`); None draws the cell at random, and looks straight ahead.
+        seed: seed of the generator that draws the start and breaks ties.
+
+    Raises:
+        InputError: a value is out of range.
+
+    >>> StartSettings((5, 5))
+    StartSettings(start=(5, 5), seed=0)
+    """
+
+    start: Start = field(default=None, metadata=_only_for("fovea", "head", instead="none"))
+    seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class DecisionSettings(CheckedSettings):
+    """Settings of the decision of a search (`semfov.decision`).
+
+    Args:
+        confirm: least probability of the target for `found`: with closer looks, that it is at the place; otherwise,
+            that the picture holds it (None: the threshold that was chosen when the model was fitted, or a score of 0.5
+            for agents without a fitted belief).
+        give_up: probability of the target below which a look is not worth a pass (None: the threshold of the model).
+        closer: largest number of closer looks, in which a window around a place that seems to hold the target is
+            enlarged to the detector's input, each a pass (None: 3 in a photograph, all that there are passes for in a
+            large picture, 2 for a fovea); 0 makes none.
+        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: half of them).
+
+    Raises:
+        InputError: a value is out of range.
+
+    >>> DecisionSettings(closer=0)
+    DecisionSettings(confirm=None, give_up=None, closer=0, prior=None)
+    """
+
+    confirm: Probability | None = None
+    give_up: Probability | None = None
+    closer: CloserLooks | None = field(default=None, metadata=_only_for("fovea", "windows", instead="confirm"))
+    prior: PriorShare | None = None
+
+
+@dataclass(frozen=True)
+class SearchSettings(DecisionSettings, StartSettings, LookSettings):
+    """Settings of a search of a picture for a class (`ActivePerception.search`).
+
+    Args:
+        boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of a photograph; the search then ends
+            without a decision, with the gaze on a cell that a box meets.
+
+    Raises:
+        InputError: a value is out of range, or the kind of look is unknown.
+
+    >>> SearchSettings(confirm=0.9, passes=8).confirm
+    0.9
+    """
+
+    boxes: Tensor | Sequence[Sequence[float]] | None = field(
+        default=None, compare=False, metadata=_only_for("fovea", instead="passes")
+    )
+
+
+@dataclass(frozen=True)
+class FindSettings(LookSettings):
+    """Settings of the search for all objects of a picture (`ActivePerception.find_all`).
+
+    Args:
+        worth: least expected gain of a look that is worth a pass: of windows the new objects (None: 0.01), of a head
+            the further right cells (None: 0).
+        least: score from which on an object counts; in windows its probability, or its score in the whole picture
+            (None: 0.5 there).
+        batch: number of windows that are chosen jointly and pass the detector together.
+
+    Raises:
+        InputError: a value is out of range, or the kind of look is unknown.
+
+    >>> FindSettings(worth=0.05).batch
+    1
+    """
+
+    worth: Gain | None = field(default=None, metadata=_only_for("windows", "head", instead="passes"))
+    least: Probability | None = None
+    batch: Annotated[int, Range(1, MOST_PASSES)] = 1
+
+
+@dataclass(frozen=True)
+class ExploreSettings(StartSettings, LookSettings):
+    """Settings of an exploration of a picture (`ActivePerception.explore`).
+
+    Args:
+        worth: least expected gain of a look that is worth a pass: of a fovea with a learned map the cells that are
+            named right (None: 0.1), of a head the same (None: 0), of windows the new objects (None: 0.01); 0 makes all
+            looks.
+        least: score from which on an object counts; in windows its probability, or its score in the whole picture
+            (None: 0.5 there).
+        policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.
+
+    Raises:
+        InputError: a value is out of range, or the kind of look is unknown.
+
+    >>> ExploreSettings(policy="people", how="fovea").policy
+    'people'
+    """
+
+    worth: Gain | None = None
+    least: Probability | None = None
+    policy: str | None = field(default=None, metadata=_only_for("fovea", instead="none"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self.policy in (None, "people"), "policy", "'people', or None", self.policy)
+
+
+@dataclass(frozen=True)
+class StreamSettings(DecisionSettings, StartSettings):
+    """Settings of looks at a stream of frames (`ActivePerception.live`).
+
+    Args:
+        how: kind of look: `fovea`, `windows`, or `auto`: windows, or a fovea where frames are small and the agent has
+            no evidence for photographs or `start` is given.
+        rate: rate at which evidence fades, per second; 0: never (None: 2.5 for a fovea, 0.75 for windows).
+        confirm: the target is found from this probability on, with closer looks that of its place (None: that of the
+            model).
+        give_up: probability of the target below which a look is not worth a frame (None: that of the belief alone, as
+            a belief that fades can reach it, or with rate 0 that of a search).
+        closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
+            for windows of small frames, as many as there are frames for those of large ones); 0: none.
+        prior: how often the target is there: the share of the frames that hold it (None: half of them).
+        color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
+
+    Raises:
+        InputError: a value is out of range, or the kind of look or the order of channels is unknown.
+
+    >>> StreamSettings(rate=0).prior is None
+    True
+    """
+
+    how: How = "auto"
+    rate: Rate | None = None
+    color: Color = "rgb"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        lookup(self.how, get_args(How), "kind of look")
+        lookup(self.color, get_args(Color), "order of channels")
+
+
+def check_suits(settings: CheckedSettings, kind: str, described: str) -> None:
+    """Raise `InputError` for settings that mean nothing to a kind of look, with what to use instead.
+
+    Args:
+        settings: the settings of a task.
+        kind: the kind of look, one of `KindOfLook`.
+        described: the kind of look in words, such as `a head that turns`.
+
+    >>> check_suits(SearchSettings(passes=8), "windows", "windows")
+    """
+    for setting in fields(settings):
+        kinds = setting.metadata.get(_KINDS, (kind,))
+        value = getattr(settings, setting.name)
+        if value is not None and kind not in kinds:
+            instead = setting.metadata[_INSTEAD]
+            raise InputError(
+                f"{setting.name}: expected none for a picture that is looked at by {described}, got {value}; "
+                f"use {instead}, or how={kinds[0]!r}"
+            )
