@@ -32,6 +32,7 @@ MODULES = (
     "semfov.envs",
     "semfov.data",
     "semfov.data.fixations",
+    "semfov.human",
     "semfov.metrics.scanpath",
     "semfov.metrics.merging",
     "semfov.errors",

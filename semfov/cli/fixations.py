@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from semfov.cli.content import suspicions_by_content
 from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, suspicions
 from semfov.data.fixations.exports import PictureError
@@ -29,13 +30,18 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
                 self._files[name.lower()] = path
         self._sizes: dict[Path, tuple[int, int]] = {}
 
-    def __getitem__(self, name: str) -> tuple[int, int]:
+    def path(self, name: str) -> Path:
+        """The file of a picture by its name; `KeyError` where there is none."""
         whole = name.lower().replace("\\", "/")
         parts = whole.split("/")
         names = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
         path = next((self._files[each] for each in names if each in self._files), None)
         if path is None:
             raise KeyError(name)
+        return path
+
+    def __getitem__(self, name: str) -> tuple[int, int]:
+        path = self.path(name)
         if path not in self._sizes:
             self._sizes[path] = picture_size(path)
         return self._sizes[path]
@@ -75,6 +81,8 @@ def check_fixations(options: CheckOptions) -> int:
             if sizes is not None and not folder:  # one picture is compared with what was looked at in it
                 records = [each for each in records if each.picture in sizes] or records
             lines = suspicions(records, sizes)
+            if sizes is not None and not options.rules_alone:
+                lines += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
         except SemfovError as error:
             if len(options.files) == 1:
                 raise

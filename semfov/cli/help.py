@@ -116,6 +116,7 @@ semfov check: is a file of fixations what it seems to be?
   semfov check people.csv
   semfov check tobii.tsv recordings/*.asc
   semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (Pupil Cloud, whose tables have neither)
+  semfov check fixations.csv --picture PICTURES      (also by what lies under the fixations)
 
 usage: semfov check FILE [FILE ...] [options]
 
@@ -126,8 +127,10 @@ usage: semfov check FILE [FILE ...] [options]
   --picture NAME       the picture's name, where the file has none; --subject NAME and --size W,H (the frame) likewise
   --quiet              errors alone
 
-It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. The exit code
-is 1 if anything is suspicious. --help-all: all options.
+It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. With five
+pictures or more it also compares the fixations with where people look in them: y upwards, mirrored, the size at which
+pictures were shown, wrong names, a calibration that was off; --rules-alone leaves that out. The exit code is 1 if
+anything is suspicious. --help-all: all options.
 """,
     "gaze": """\
 semfov gaze: where people look in a picture that they view freely

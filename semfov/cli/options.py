@@ -290,6 +290,8 @@ class CheckOptions(Settings):
             whose sizes are compared with the frames, and are the frames where the file has none.
         subject: name of the person, where the file has none.
         columns: names of a table's columns by ours, where they differ, `x=FPOGX,y=FPOGY`.
+        rules_alone: leave out the comparison of fixations with where people look in the pictures, a pass of the
+            detector for each of at most 40 pictures.
         quiet: print errors alone; the exit code tells whether anything is suspicious.
     """
 
@@ -298,6 +300,7 @@ class CheckOptions(Settings):
     picture: str | None = None
     subject: str | None = None
     columns: str | None = None
+    rules_alone: bool = False
     quiet: bool = False
 
 

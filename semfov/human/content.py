@@ -1,0 +1,373 @@
+r"""What the coordinates of fixations are, told by what lies under them.
+
+People look at what is in a picture, so fixations that are read rightly lie where a model of fixations expects them *in
+that picture*, and fixations that are read wrongly lie elsewhere. Each way to read a file, such as with y upwards, puts
+its points at other places, and the places are compared by the particular density of each picture
+
+.. math:: d_i(u) = \log_2 p_i(u) - \frac{1}{N - 1} \sum_{j \ne i} \log_2 p_j(u)
+
+p is the density of fixations (`semfov.saliency.FixationDensity`) of picture i at the place u, in shares of the
+picture's sides. What all pictures have in common, above all the bias to the centre, is not in d. So fixations of
+another picture, or a reading that moves all points to the middle, gain nothing. The mean of d over the fixations of a
+picture is its *fit* in bits.
+
+     points of the file ──reading──► shares of the sides ──► d of the picture ──mean──► fit of each picture
+                          y upwards, mirrored, …, moved by (x, y)         compared over the pictures, paired
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from semfov.data.fixations import Fixations
+from semfov.errors import check
+
+_Array = NDArray[np.float64]
+
+CONTENT_PICTURES = 40
+"""Pictures whose densities are enough to tell; each costs a pass of a detector."""
+
+FEWEST_PICTURES = 5
+"""Pictures below which a fit cannot be told from chance."""
+
+_FEWEST_FIXATIONS = 40
+_SIDE = 100  # cells along each side of the particular densities: a share of 0.01
+_FAINTEST = -8.0  # bits below uniform at which a density is cut off: a model is not sure of less
+
+_STANDARD_ERRORS = 4.0
+"""How many standard errors over the pictures a difference must have: many readings are tried."""
+
+_LEAST_GAIN = 0.25  # bits by which another reading must fit better
+_EXCHANGED = 2.0  # bits by which both of two pictures must fit better if their names were exchanged
+_LEAST_FIT = 0.5  # bits below which fixations do not fit their picture
+_REACH = 20  # cells by which a shift is tried in each direction
+_LEAST_SHIFT = 0.03  # share of a side below which a shift of all fixations is what models are off anyway
+_LEAST_SHIFT_OF_SOME = 0.06  # the same of one person's or of later fixations, for what trackers are usually off
+
+
+_Shares = Callable[[_Array, _Array, _Array], _Array]
+"""Maps points `(n, 2)` in pixels of a frame, its size and the size of the picture to shares of the picture's sides."""
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A way to read points.
+
+    Attributes:
+        shares: where the points lie.
+        fault: what is wrong with the file if this reading is right, after *fixations look as if*.
+        remedy: how the file is read rightly.
+        frame_scale: how much larger than the file says the frame is.
+    """
+
+    shares: _Shares
+    fault: str = ""
+    remedy: str = ""
+    frame_scale: float = 1.0
+
+
+def _as_read(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Place the largest picture that fits, with its proportions, in the middle of the frame."""
+    scale = (frame / picture).min()
+    corner = (frame - scale * picture) / 2
+    return np.asarray((points + 0.5 - corner) / (scale * picture))
+
+
+def _y_upwards(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return _as_read(np.stack([points[:, 0], frame[1] - 1 - points[:, 1]], 1), frame, picture)
+
+
+def _mirrored(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return _as_read(np.stack([frame[0] - 1 - points[:, 0], points[:, 1]], 1), frame, picture)
+
+
+def _turned(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return _as_read(frame - 1 - points, frame, picture)
+
+
+def _swapped(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return _as_read(points[:, ::-1], frame, picture)
+
+
+def _at_own_size(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return np.asarray((points + 0.5 - (frame - picture) / 2) / picture)
+
+
+def _stretched(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    return np.asarray((points + 0.5) / frame)
+
+
+def _at_size_in_the_middle(part: float) -> _Shares:
+    """Make the map for pictures that filled a part of what they could, in the middle of the frame."""
+
+    def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
+        return np.asarray((_as_read(points, frame, picture) - 0.5) / part + 0.5)
+
+    return shares
+
+
+def _in_a_frame_of(scale: float) -> _Shares:
+    """Make the map for points whose frame was larger or smaller than the file says."""
+
+    def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
+        return _as_read(points / scale, frame, picture)
+
+    return shares
+
+
+_READ = _Reading(_as_read)
+
+_PARTS = (0.4, 0.5, 0.6, 2 / 3, 0.75, 0.8, 0.85)
+_FRAME_SCALES = (0.4, 0.5, 0.625, 0.75, 0.8, 1.25, 4 / 3, 1.5, 1.6, 1.875, 2.0, 2.4, 2.7)
+
+_OTHERS = (
+    _Reading(_y_upwards, "y ran upwards", "read them with origin='bottom left'"),
+    _Reading(_mirrored, "x ran from right to left", "take the width of the frame less x"),
+    _Reading(_turned, "they were turned by half a circle", "take the size of the frame less x and y"),
+    _Reading(_swapped, "y came before x", "swap the two columns"),
+    _Reading(_at_own_size, "the pictures were shown at their own size", "use in_picture(size, scale=1)"),
+    _Reading(_stretched, "the pictures were stretched over the frame", "use in_picture(size, place=(0, 0, *frame))"),
+    *(
+        _Reading(
+            _at_size_in_the_middle(part),
+            f"the pictures filled about {100 * part:.0f} % of the frame, in the middle",
+            "give the place of the picture, in_picture(size, place=…)",
+        )
+        for part in _PARTS
+    ),
+    *(_Reading(_in_a_frame_of(scale), "their frame had another size", frame_scale=scale) for scale in _FRAME_SCALES),
+)
+
+
+def content_suspicions(
+    fixations: Sequence[Fixations],
+    densities: Mapping[str, Tensor],
+    sizes: Mapping[str, tuple[int, int]],
+) -> list[str]:
+    """Tell from what lies under fixations whether they are read rightly, and if not, how they should be.
+
+    Frame, origin and axes, the size at which pictures were shown, their names, and a shift of the calibration are
+    tested, for all fixations and for each person. The pictures should differ; ten or more tell much.
+
+    Args:
+        fixations: the records.
+        densities: density of fixations in each picture, `(rows, columns)`, by the pictures' names.
+        sizes: `(width, height)` of the pictures in pixels, by their names.
+
+    Returns:
+        The lines, none where nothing is suspicious or too little is there to tell.
+
+    Raises:
+        InputError: a density is not a map.
+
+    >>> content_suspicions([], {}, {})
+    []
+    """
+    records = [record for record in fixations if record.picture in densities and len(record)]
+    names = sorted({record.picture for record in records})
+    if len(names) < FEWEST_PICTURES or sum(map(len, records)) < _FEWEST_FIXATIONS:
+        return []
+    evidence = _Evidence(records, {name: sizes[name] for name in names}, _particular_densities(names, densities))
+    moved = _shift_of(evidence, records, "all fixations", _LEAST_SHIFT)
+    read = _better_reading(evidence)
+    if moved or read:
+        # A shift and another size of the frame look alike where few fixations lie at the borders.
+        return [max((found for found in (moved, read) if found), key=lambda found: found.fit).line]
+    return _wrong_names(evidence) or _shifts_of_some(evidence)
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """What is suspicious, in a line, and the fit in bits without it."""
+
+    line: str
+    fit: float
+
+
+def _particular_densities(names: Sequence[str], densities: Mapping[str, Tensor]) -> dict[str, _Array]:
+    """Compute d of each picture, `(_SIDE, _SIDE)`, row by row from the top left."""
+    logs = []
+    for name in names:
+        density = densities[name]
+        check(density.ndim == 2, "densities", "a map (rows, columns) for each picture", tuple(density.shape))
+        uniform = 1 / density.numel()
+        bits = (density.double() / uniform).log2().clamp(min=_FAINTEST)
+        logs.append(interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")[0, 0])
+    stacked = torch.stack(logs)
+    others = (stacked.sum(0) - stacked) / (len(logs) - 1)
+    particular = stacked - others
+    return {name: particular[number].numpy() for number, name in enumerate(names)}
+
+
+class _Evidence:
+    """Fixations, and the particular densities of the pictures in which they were made.
+
+    Attributes:
+        records: the records of these pictures.
+        names: the pictures.
+    """
+
+    def __init__(
+        self, records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]], particular: Mapping[str, _Array]
+    ) -> None:
+        self.records = records
+        self.names = list(particular)
+        self._sizes = sizes
+        self._particular = particular
+
+    def fits(self, reading: _Reading) -> _Array:
+        """Compute the fit of each picture in bits, `(N,)`."""
+        return np.array([self.fit(name, name, reading) for name in self.names])
+
+    def fit(self, name: str, other: str, reading: _Reading) -> float:
+        """Compute the fit of the fixations that are named for one picture in another one."""
+        places = np.concatenate([self.places(record, reading) for record in self.records if record.picture == name])
+        return float(_looked_up(self._particular[other], places).mean())
+
+    def places(self, record: Fixations, reading: _Reading) -> _Array:
+        """Places of the fixations of a record in shares of the sides of its picture, `(n, 2)`."""
+        frame = np.array(record.size, np.float64)
+        return reading.shares(record.points, frame, np.array(self._sizes[record.picture], np.float64))
+
+    def best_shift(self, records: Sequence[Fixations]) -> tuple[_Array, _Array, _Array]:
+        """Find the shift with which some records fit best.
+
+        Returns:
+            The shift `(2,)` in shares of the sides, and the fits `(n,)` of the pictures of these records without it and
+            with it.
+        """
+        by_picture: dict[str, list[_Array]] = defaultdict(list)
+        for record in records:
+            by_picture[record.picture].append(self.places(record, _READ))
+        places = {name: np.concatenate(listed) for name, listed in by_picture.items()}
+        total = sum(_fit_by_shift(self._particular[name], places[name]) for name in places)
+        row, column = np.unravel_index(int(np.argmax(total)), np.shape(total))
+        shift = (np.array([column, row]) - _REACH) / _SIDE
+        before = [_looked_up(self._particular[name], places[name]).mean() for name in places]
+        after = [_looked_up(self._particular[name], places[name] + shift).mean() for name in places]
+        return shift, np.array(before), np.array(after)
+
+
+def _looked_up(particular: _Array, places: _Array) -> _Array:
+    """Take d at places `(n, 2)` in shares of the sides; 0 beyond the picture."""
+    cells = np.floor(places * _SIDE).astype(np.int64)
+    inside = ((cells >= 0) & (cells < _SIDE)).all(1)
+    columns, rows = np.where(inside[:, None], cells, 0).T
+    return np.where(inside, particular[rows, columns], 0.0)
+
+
+def _fit_by_shift(particular: _Array, places: _Array) -> _Array:
+    """Compute the fit of fixations for all shifts up to `_REACH` cells, `(2 · _REACH + 1, 2 · _REACH + 1)`."""
+    padded = np.pad(particular, 2 * _REACH)  # beyond the picture the fit is 0
+    cells = np.floor(places * _SIDE).astype(np.int64) + 2 * _REACH
+    # Fixations far outside the frame stay outside under every shift.
+    cells = cells.clip(_REACH, _SIDE + 3 * _REACH - 1)
+    steps = np.arange(-_REACH, _REACH + 1)
+    rows = cells[:, 1, None, None] + steps[:, None]
+    columns = cells[:, 0, None, None] + steps
+    return np.asarray(padded[rows, columns].mean(0))
+
+
+def _is_clear(gains: _Array, least: float) -> bool:
+    """Whether a mean gain over pictures is large, and far above its standard error."""
+    error = gains.std(ddof=1) / len(gains) ** 0.5
+    return bool(gains.mean() > least and gains.mean() > _STANDARD_ERRORS * error)
+
+
+def _better_reading(evidence: _Evidence) -> _Finding | None:
+    """Find the reading that fits better than the present one, if one does."""
+    present = evidence.fits(_READ)
+    fits = {reading: evidence.fits(reading) for reading in _OTHERS}
+    best = max(fits, key=lambda reading: fits[reading].mean())
+    if not (_is_clear(fits[best] - present, _LEAST_GAIN) and _is_clear(fits[best], _LEAST_GAIN)):
+        return None
+    width, height = evidence.records[0].size
+    frame = f"give a frame of about {width * best.frame_scale:.0f} × {height * best.frame_scale:.0f}"
+    fit = float(fits[best].mean())
+    line = (
+        f"fixations look as if {best.fault}: they fit their pictures by {fit:.2f} bits then, and by "
+        f"{present.mean():.2f} as they are read ({best.remedy or frame})"
+    )
+    return _Finding(line, fit)
+
+
+def _wrong_names(evidence: _Evidence) -> list[str]:
+    """Find fixations that are named for other pictures than those in which they were made."""
+    names = evidence.names
+    own = evidence.fits(_READ)
+    if _is_clear(own, 0.0):
+        return _exchanged(evidence, own)
+    for steps in (1, -1, 2, -2):
+        moved = names[steps:] + names[:steps]
+        gains = np.array([evidence.fit(name, other, _READ) for name, other in zip(names, moved, strict=True)]) - own
+        if _is_clear(gains, _LEAST_GAIN):
+            side = "after" if steps > 0 else "before"
+            return [
+                f"fixations fit the pictures that come {abs(steps)} {side} theirs in alphabetical order: check names"
+            ]
+    return [
+        f"fixations do not fit the pictures that they are named for ({own.mean():.2f} bits above those of the other "
+        "pictures): are these their pictures, and is the frame right?"
+    ]
+
+
+def _exchanged(evidence: _Evidence, own: _Array) -> list[str]:
+    """Find pairs of pictures whose fixations fit each other's picture."""
+    names = evidence.names
+    across = np.array([[evidence.fit(name, other, _READ) for other in names] for name in names])
+    gains = across - own[:, None]
+    found = []
+    for first, second in combinations(range(len(names)), 2):
+        both_gain = min(gains[first, second], gains[second, first]) > _EXCHANGED
+        neither_fits = max(own[first], own[second]) < _LEAST_FIT
+        if both_gain and neither_fits:
+            found.append(f"the fixations of {names[first]} and {names[second]} fit each other's picture")
+    return found
+
+
+def _shifts_of_some(evidence: _Evidence) -> list[str]:
+    """Find shifts of some people's fixations, or of those that were made later."""
+    by_person: dict[str, list[Fixations]] = defaultdict(list)
+    for record in evidence.records:
+        by_person[record.subject].append(record)
+    found = []
+    if len(by_person) > 1:
+        found = [
+            _shift_of(evidence, records, f"the fixations of person {person}", _LEAST_SHIFT_OF_SOME)
+            for person, records in by_person.items()
+        ]
+    if not any(found):
+        later = [record for records in by_person.values() for record in records[len(records) // 2 :]]
+        whose = "fixations in the second half of each person's pictures"
+        found = [_shift_of(evidence, later, whose, _LEAST_SHIFT_OF_SOME)]
+    return [finding.line for finding in found if finding]
+
+
+def _shift_of(evidence: _Evidence, records: Sequence[Fixations], whose: str, least: float) -> _Finding | None:
+    """Find the shift of some records in pixels of their frame, if they fit better without one.
+
+    Args:
+        evidence: the densities of the pictures.
+        records: the records.
+        whose: what the fixations are called.
+        least: share of a side from which on a shift is told.
+    """
+    if len({record.picture for record in records}) < FEWEST_PICTURES:
+        return None
+    shift, before, after = evidence.best_shift(records)
+    gains = after - before
+    if np.abs(shift).max() < least or not (_is_clear(gains, _LEAST_GAIN / 2) and _is_clear(after, _LEAST_GAIN)):
+        return None
+    x, y = (-shift * np.array(records[0].size)).round().astype(int).tolist()
+    line = (
+        f"{whose} lie about ({x}, {y}) px beside what they were made at, and fit by {gains.mean():.2f} bits more "
+        "without this shift (a drift of the calibration, or another origin)"
+    )
+    return _Finding(line, float(after.mean()))
