@@ -1,39 +1,57 @@
 """Colours of 16 bits a channel in PNG and PPM files, of which Pillow gives the upper eight bits alone."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_LOWER = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}  # ways to unpack the upper bytes, and the lower ones
-_FOUR_BYTES = "LA;16B"  # of grey and alpha, which Pillow also unpacks as the four channels of RGBA
+_LOWER_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}
+"""Pillow's ways to unpack the upper byte of each channel, and those that take the other byte for the upper one."""
+
+_GREY_AND_ALPHA = "LA;16B"  # four bytes a pixel, which Pillow also unpacks as the channels of RGBA
+_CHANNELS = {"L": 1, "RGB": 3}  # of a PPM
 
 
 def is_deep(image: Any) -> bool:
-    """Whether a Pillow image that is not decoded yet has more than 8 bits a channel that decoding would cut."""
+    """Tell whether a Pillow image that is not decoded yet has more than 8 bits a channel that decoding would cut."""
     if not image.tile:
         return False
-    codec, given = image.tile[0].codec_name, image.tile[0].args
-    return (codec == "zip" and given in (*_LOWER, _FOUR_BYTES)) or (codec == "ppm" and given[1] > 255)
+    tile = image.tile[0]
+    if tile.codec_name == "zip":
+        return tile.args in (*_LOWER_BYTES, _GREY_AND_ALPHA)
+    return tile.codec_name == "ppm" and tile.args[1] > 255
 
 
-def deep_values(copies: Sequence[Any], turned: Callable[[Any], Any]) -> tuple[NDArray[np.uint16], int]:
-    """The values `(H, W, C)` of a file, an alpha last, and the largest possible one.
+def deep_values(copies: tuple[Any, Any], load: Callable[[Any], Any]) -> tuple[NDArray[np.uint16], int]:
+    """Read the values of a file that `is_deep`.
 
-    `copies` has the image twice, not decoded yet; `turned` loads and turns one of them.
+    Args:
+        copies: the image twice, not decoded yet.
+        load: decodes an image and turns it.
+
+    Returns:
+        The values `(H, W, C)`, an alpha last, and the largest possible one.
     """
-    first, second = copies
-    tile = first.tile[0]
+    image, again = copies
+    tile = image.tile[0]
     if tile.codec_name == "ppm":
-        mode, most = tile.args
-        shape = first.height, first.width, {"L": 1, "RGB": 3}[mode]
-        first.fp.seek(tile.offset)
-        return np.frombuffer(first.fp.read(2 * int(np.prod(shape))), ">u2").reshape(shape).astype(np.uint16), most
-    if tile.args == _FOUR_BYTES:
-        first.tile = [tile._replace(args="RGBA")]
-        halves = np.asarray(turned(first))
+        return _ppm_values(image)
+    if tile.args == _GREY_AND_ALPHA:
+        image.tile = [tile._replace(args="RGBA")]
+        halves = np.asarray(load(image))
         return halves[..., 0::2] * np.uint16(256) + halves[..., 1::2], 65535
-    second.tile = [tile._replace(args=_LOWER[tile.args])]
-    upper, lower = (np.asarray(turned(each)) for each in (first, second))
+    again.tile = [tile._replace(args=_LOWER_BYTES[tile.args])]
+    upper = np.asarray(load(image))
+    lower = np.asarray(load(again))
     return upper * np.uint16(256) + lower, 65535
+
+
+def _ppm_values(image: Any) -> tuple[NDArray[np.uint16], int]:
+    """The values of a PPM, which are not packed, and the value that it says is white."""
+    tile = image.tile[0]
+    mode, white = tile.args
+    shape = image.height, image.width, _CHANNELS[mode]
+    image.fp.seek(tile.offset)
+    values = np.frombuffer(image.fp.read(2 * int(np.prod(shape))), ">u2")
+    return values.reshape(shape).astype(np.uint16), white

@@ -13,23 +13,29 @@ from torch import Tensor
 from semfov.data.images import PhotographPicture, open_pillow, opening, to_bytes, upright_size
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.rasters import open_by_windows
-from semfov.data.tone import White, black_and_white, check_white
-from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
+from semfov.data.tone import White, check_white, stated_limits
+from semfov.data.windowed import BY_WINDOWS, Box, ChosenBands, LargePicture
 from semfov.errors import DataError, check, lookup
 
-_Box = tuple[int, int, int, int]
 
+class ArrayPicture(LargePicture):
+    """A picture in an array `(H, W, 3)`, or `(H, W)` in grey, which may be a `numpy.memmap`.
 
-class _ArrayPicture(LargePicture):
-    """A picture in an array `(H, W, 3)`, which may be a `numpy.memmap`: only the pixels of windows are read."""
+    Only the pixels of windows are read.
+    """
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
-        fits = array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
-        check(fits and array.size > 0, "array", "bytes of shape (H, W, 3) or (H, W)", f"{array.dtype} {array.shape}")
+        is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
+        check(
+            array.dtype == np.uint8 and is_picture and array.size > 0,
+            "array",
+            "bytes of shape (H, W, 3) or (H, W)",
+            f"{array.dtype} {array.shape}",
+        )
         self._array = array
         self.size = array.shape[1], array.shape[0]
 
-    def pixels(self, box: _Box) -> NDArray[np.uint8]:
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
         x1, y1, x2, y2 = box
         window = self._array[y1:y2, x1:x2]
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
@@ -38,44 +44,97 @@ class _ArrayPicture(LargePicture):
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
 ) -> LargePicture:
-    """Open a picture of any common type (`semfov.as_image`) for reading by windows; `white` scales numbers to bytes."""
-    # TIFFs are read by tifffile, by rasterio if they have overviews or tifffile leaves them, else as other photographs.
+    """Open a picture of any common type (`semfov.as_image`) for reading by windows.
+
+    Args:
+        source: the picture; one that is open is given back.
+        color: order of the channels of arrays and tensors.
+        white: as for `semfov.read_image`.
+        bands: the number of a band of a TIFF or a raster, or three for red, green and blue, from 1; None for those that
+            the file names.
+
+    Returns:
+        The open picture.
+
+    Raises:
+        InputError: it is no picture, or an argument is not for such a picture.
+        DataError: the file cannot be read.
+    """
     check_white(white)
-    if bands is not None:
-        numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
-        fits = len(numbers) in (1, 3) and all(type(each) is int and each >= 1 for each in numbers)
-        check(fits, "bands", "the number of a band, or three for red, green and blue, from 1", bands)
+    _check_bands(bands)
     if isinstance(source, LargePicture):
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
-    kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
+    is_file = isinstance(source, str | PathLike)
+    has_bands = is_file and Path(source).suffix.lower() in BY_WINDOWS
     expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
-    check(bands is None or kind in BY_WINDOWS, "bands", expected, bands)
-    rows = isinstance(source, np.ndarray) and (source.ndim == 2 or (source.shape[2:] == (3,) and source.shape[0] != 3))
-    of_bytes = isinstance(source, Tensor | np.ndarray) and source.dtype in (torch.uint8, np.dtype(np.uint8))
-    if isinstance(source, np.ndarray) and white is None and of_bytes and source.size and rows:
-        swap = lookup(color, get_args(Color), "order of channels") == "bgr" and source.ndim == 3
-        return _ArrayPicture(source[..., ::-1] if swap else source)
-    if not isinstance(source, str | PathLike):
-        if white is None and of_bytes:
-            # Bytes are not converted to floats in between, which would take four times the memory.
-            pixels = as_pixels(source, argument="picture", color=color)
-            check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
-            return _ArrayPicture(to_bytes(pixels[0]))
-        return _ArrayPicture(to_bytes(as_image(source, argument="picture", color=color, white=white).detach()))
-    check_local(source, "picture")
-    if kind in BY_WINDOWS:
-        picture = open_by_windows(source, white=white, bands=bands)
+    check(bands is None or has_bands, "bands", expected, bands)
+    if is_file:
+        return _open_file(source, white, bands)
+    return ArrayPicture(_bytes_of(source, color, white))
+
+
+def _check_bands(bands: ChosenBands) -> None:
+    """Raise `InputError` for what are no numbers of bands."""
+    if bands is None:
+        return
+    numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
+    are_numbers = all(type(number) is int and number >= 1 for number in numbers)
+    expected = "the number of a band, or three for red, green and blue, from 1"
+    check(len(numbers) in (1, 3) and are_numbers, "bands", expected, bands)
+
+
+def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
+    """Open a file by the readers of its kind, and note how its values are shown."""
+    check_local(path, "picture")
+    picture: LargePicture
+    if Path(path).suffix.lower() in BY_WINDOWS:
+        picture = open_by_windows(path, white=white, bands=bands)
     else:
-        picture = PhotographPicture(source, white)
+        picture = PhotographPicture(path, white)
     if white is not None or bands is not None:
-        values = white if white is None or isinstance(white, str) else black_and_white(white, np.zeros(0))
-        picture.shown = {"white": values, "bands": bands}
+        is_stated = white is not None and not isinstance(white, str)
+        picture.shown = {"white": stated_limits(white) if is_stated else white, "bands": bands}
     return picture
 
 
+def _bytes_of(source: ImageLike, color: Color, white: White | None) -> NDArray[np.uint8]:
+    """The bytes of a picture in memory, `(H, W, 3)` or `(H, W)`; an array of them is not copied."""
+    if white is not None or not _is_of_bytes(source):
+        return to_bytes(as_image(source, argument="picture", color=color, white=white).detach())
+    if isinstance(source, np.ndarray) and _has_channels_last(source):
+        is_bgr = lookup(color, get_args(Color), "order of channels") == "bgr"
+        return source[..., ::-1] if is_bgr and source.ndim == 3 else source
+    # Bytes are not converted to floats in between, which would take four times the memory.
+    pixels = as_pixels(source, argument="picture", color=color)
+    check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
+    return to_bytes(pixels[0])
+
+
+def _is_of_bytes(source: ImageLike) -> bool:
+    """Whether a picture is an array or a tensor of bytes."""
+    return isinstance(source, Tensor | np.ndarray) and source.dtype in (torch.uint8, np.dtype(np.uint8))
+
+
+def _has_channels_last(array: NDArray[np.uint8]) -> bool:
+    """Whether an array is grey, or has its three channels last beyond doubt."""
+    if not array.size:
+        return False
+    return array.ndim == 2 or (array.shape[2:] == (3,) and array.shape[0] != 3)
+
+
 def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
-    """Size of a picture of any common type, without decoding a file; → `(width, height)`."""
+    """Tell the size of a picture of any common type, without decoding a file.
+
+    Args:
+        source: the picture, as for `open_large`.
+
+    Returns:
+        `(width, height)`.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
     from PIL import Image as Pillow
 
     if isinstance(source, LargePicture):

@@ -39,22 +39,22 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     torch.Size([3, 2, 4])
     """
     check_white(white)
-    if oriented and _is_raster(path):
+    if oriented and _is_read_by_windows(path):
         picture = open_by_windows(path, white=white)
         check_area(picture.size, f"image {Path(path)}")
         return picture.read((0, 0, *picture.size)).float().div_(255)
     return read_photograph(path, oriented=oriented, white=white)
 
 
-def _is_raster(path: str | PathLike[str]) -> bool:
-    """Whether a file is of a kind of which Pillow keeps only the precision of grey values right, and is none of these.
+def _is_read_by_windows(path: str | PathLike[str]) -> bool:
+    """Whether a file is a TIFF or JPEG 2000 of which Pillow would lose masks, channels that are pages, or 16 bits.
 
-    Masks, channels that are pages, and colours of 16 bits are read as they are by windows.
+    Grey pictures of 16 bits are Pillow's, as it keeps their precision, which bytes do not.
     """
     kind = Path(path).suffix.lower()
     if kind not in BY_WINDOWS:
         return False
     with suppress(Exception), quiet_decoders, open_pillow(path) as image:
-        grey = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
-        return image.format in ("TIFF", "JPEG2000") and not grey
+        is_precise = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
+        return image.format in ("TIFF", "JPEG2000") and not is_precise
     return kind in (".tif", ".tiff")  # of a compression that Pillow has not, or of 12 bits

@@ -20,40 +20,77 @@ def check_white(white: White | None) -> None:
     """Raise `InputError` for what is no white."""
     if white is None or (isinstance(white, str) and white == "auto"):
         return
-    pair: Sequence[Any] = white if isinstance(white, tuple | list) else (0.0, white)
-    # Numbers of NumPy and of a tensor, such as the largest of a picture, are numbers, too.
-    plain = [each.item() if getattr(each, "ndim", None) == 0 else each for each in pair]
-    fits = len(plain) == 2 and all(is_number(each) and np.isfinite(each) for each in plain) and plain[0] < plain[1]
-    check(fits, "white", "a value above 0, (black, white) with black < white, or 'auto'", white)
+    limits: Sequence[object] = white if isinstance(white, tuple | list) else (0.0, white)
+    numbers = [_plain(limit) for limit in limits]
+    are_finite = all(is_number(number) and np.isfinite(number) for number in numbers)
+    check(
+        len(numbers) == 2 and are_finite and numbers[0] < numbers[1],
+        "white",
+        "a value above 0, (black, white) with black < white, or 'auto'",
+        white,
+    )
+
+
+def _plain(number: Any) -> Any:
+    """A number of Python's for one of NumPy or of a tensor, such as the largest value of a picture."""
+    return number.item() if getattr(number, "ndim", None) == 0 else number
+
+
+def stated_limits(white: float | tuple[float, float]) -> tuple[float, float]:
+    """Read the values that are black and white out of a `white` that states them.
+
+    >>> stated_limits(4095), stated_limits((100, 200))
+    ((0.0, 4095.0), (100.0, 200.0))
+    """
+    black, most = white if isinstance(white, tuple | list) else (0.0, white)
+    return float(black), float(most)
 
 
 def black_and_white(white: White, values: NDArray[Any], nodata: float | None = None) -> tuple[float, float]:
-    """The values that are shown as black and as white, by percentiles of some values of the picture for `auto`."""
+    """Choose the values that are shown as black and as white.
+
+    Args:
+        white: checked by `check_white`.
+        values: some values of the picture, of any shape, of which `auto` takes percentiles.
+        nodata: the value of pixels without data, which percentiles leave out; None for none.
+
+    Returns:
+        The values that are black and white.
+    """
     if not isinstance(white, str):
-        pair = white if isinstance(white, tuple | list) else (0.0, white)
-        return float(pair[0]), float(pair[1])
-    there = values[np.isfinite(values) & (values != (np.nan if nodata is None else nodata))]
-    if not there.size:
+        return stated_limits(white)
+    with_data = np.isfinite(values) & (values != (np.nan if nodata is None else nodata))
+    shown = values[with_data].astype(np.float64)
+    if not shown.size:
         return 0.0, 1.0
-    low, high = (float(each) for each in np.percentile(there.astype(np.float64), _PERCENTILES))
+    low, high = np.percentile(shown, _PERCENTILES).tolist()
     return low, high if high > low else low + 1.0
 
 
 def between(values: NDArray[Any], tone: tuple[float, float]) -> NDArray[np.float32]:
-    """Values from 0, black, to 1, white; NaN is black."""
+    """Scale values to [0, 1] from black to white, `tone`, and cut what lies outside; NaN is black."""
     low, high = tone
     share = (values.astype(np.float64) - low) / (high - low)
     return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)
 
 
 def bytes_between(values: NDArray[Any], tone: tuple[float, float] | None) -> NDArray[np.uint8]:
-    """Bytes of values `(h, w, ...)`, a few rows at a time; without a tone white is the largest of 8 or 16 bits."""
+    """Convert values to bytes, a few rows at a time.
+
+    Args:
+        values: `(h, w, ...)`.
+        tone: the values that are black and white; None for 0 and the largest of 8 or 16 bits.
+
+    Returns:
+        Bytes of the same shape; the values themselves where nothing changes.
+    """
     if values.dtype == np.uint8 and tone is None:
         return values
     shown = np.empty(values.shape, np.uint8)
     for top in range(0, len(values), _ROWS):
         rows = slice(top, top + _ROWS)
         if tone is None:
+            # Rounded to the nearest byte, in whole numbers.
             shown[rows] = (values[rows].astype(np.uint32) * 255 + 32767) // 65535
         else:
             shown[rows] = np.rint(between(values[rows], tone) * 255)

@@ -1,9 +1,16 @@
-"""Pictures that are read window by window: their base, and what their files have in common."""
+"""Pictures that are read window by window: their base, and what their files have in common.
+
+    picture ── strip by strip ──► largest copy ── halved ──► copy ── halved ──► …
+
+A window that is resampled to far fewer pixels is read from a copy of the picture, reduced by a power of two. Copies are
+in memory and made when they are first needed; where the file has reduced copies itself (overviews), these are read.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +23,8 @@ from torch.utils.dlpack import from_dlpack
 
 from semfov.errors import check
 
-_Box = tuple[int, int, int, int]
+Box = tuple[int, int, int, int]
+"""A window: the pixels from `(x1, y1)` to before `(x2, y2)`."""
 
 _STRIP = 1 << 23  # pixels that are read at once for a copy
 _PIECE = 1 << 11  # columns of a strip of which it is asked whether they are stored
@@ -29,7 +37,18 @@ _OVERSAMPLING = 1.5  # pixels that a reduced window keeps for each wanted pixel,
 
 
 def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
-    """Largest factor by which a window may be reduced that is resampled afterwards."""
+    """Find the largest power of two by which a window may be reduced that is resampled afterwards.
+
+    Args:
+        ratio: pixels of the picture for one of the result, along a side.
+        oversampling: pixels that the reduced window keeps for one of the result.
+
+    Returns:
+        The factor, at least 1.
+
+    >>> reduction_for(2.9), reduction_for(3.0), reduction_for(6.0)
+    (1, 2, 4)
+    """
     reduction = 1
     while ratio >= 2 * oversampling * reduction:
         reduction *= 2
@@ -37,17 +56,34 @@ def reduction_for(ratio: float, oversampling: float = _OVERSAMPLING) -> int:
 
 
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bytes `(3, h, w)` resampled to a size `(h', w')` with the antialiased bilinear filter, `(1, 3, h', w')`."""
+    """Resample pixels with the antialiased bilinear filter.
+
+    Args:
+        pixels: bytes `(3, h, w)`.
+        size: `(height, width)` of the result.
+
+    Returns:
+        Bytes `(1, 3, height, width)`.
+    """
     height, width = pixels.shape[1:]
     # torch takes twice as long where the rows of a window are not adjacent in memory.
     canvas = pixels.permute(1, 2, 0).contiguous()
     if height > size[0]:
-        # torch shortens rows first. Columns first takes half of the time: that step is the faster one, and still faster
-        # if four bytes are a pixel.
-        lines = canvas.view(1, height, -1, 3 if width % 4 else 4).permute(0, 3, 1, 2)
-        canvas = F.interpolate(lines, (size[0], lines.shape[-1]), mode="bilinear", antialias=True).permute(0, 2, 3, 1)
+        canvas = _shortened(canvas, size[0])
     canvas = canvas.reshape(1, -1, width, 3).permute(0, 3, 1, 2)
     return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
+
+
+def _shortened(canvas: Tensor, height: int) -> Tensor:
+    """The columns of bytes `(h, w, 3)` resampled to a height, with the layout of `(height, w, 3)` in memory.
+
+    torch shortens rows first. Columns first takes half of the time: that step is the faster one, and still faster if
+    four bytes are a pixel.
+    """
+    channels = 3 if canvas.shape[1] % 4 else 4
+    lines = canvas.view(1, len(canvas), -1, channels).permute(0, 3, 1, 2)
+    shortened = F.interpolate(lines, (height, lines.shape[-1]), mode="bilinear", antialias=True)
+    return shortened.permute(0, 2, 3, 1)
 
 
 def _bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
@@ -73,108 +109,172 @@ _LARGE = 1 << 24  # pictures with more pixels have copies
 
 
 class LargePicture(ABC):
-    """Base of 8-bit pictures that are read window by window; size `(width, height)`."""
+    """Base of 8-bit pictures that are read window by window.
+
+    Attributes:
+        size: `(width, height)` in pixels.
+        path: the file; None for a picture in memory.
+        shown: `white` and `bands` with which the file was opened; None for neither.
+        nothing: the colour in which pixels without data are shown; None where there are none, or nothing tells them.
+
+    Private attributes: `_has_overviews` tells whether coarse windows are read from reduced copies in the file.
+    `_copies` has the copies in memory that were made so far, by their reduction: that by `_least_reduction`, the
+    largest, is made of the picture, and each other one of the copy that is twice as large.
+    """
 
     size: tuple[int, int]
     path: Path | None = None
-    shown: Mapping[str, Any] | None = None  # `white` and `bands` with which the file was opened; None for neither
-    _has_overviews = False  # whether coarse windows are read from reduced copies in the file
-    nothing: tuple[int, int, int] | None = None  # the colour in which pixels without data are shown, if a file has some
+    shown: Mapping[str, Any] | None = None
+    _has_overviews = False
+    nothing: tuple[int, int, int] | None = None
 
     @abstractmethod
-    def pixels(self, box: _Box) -> NDArray[np.uint8]:
-        """Read a window, in one thread at a time but not always the same one (`zoom.episode`); → `(h, w, 3)`."""
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        """Read a window, in one thread at a time but not always the same one (`zoom.episode`).
 
-    def holds(self, box: _Box) -> bool:
+        Args:
+            box: a window inside the picture.
+
+        Returns:
+            `(h, w, 3)`.
+        """
+
+    def holds(self, box: Box) -> bool:
         """Tell whether anything of a window is stored: one colour is shown where nothing is."""
         return True
 
     def reduction(self, ratio: float, oversampling: float = _OVERSAMPLING) -> int:
-        """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it."""
-        many = self.size[0] * self.size[1] > _LARGE
-        reduction = reduction_for(ratio, oversampling) if many else 1
-        return reduction if reduction >= self._first else 1
+        """Choose the factor by which windows are read that are resampled afterwards.
 
-    def read(self, box: _Box, reduction: int = 1) -> Tensor:
-        """Read a window, `(3, h, w)`; coarse ones of pictures of more than 16 million pixels from reduced copies."""
-        (x1, y1, x2, y2), (width, height) = box, self.size
+        Args:
+            ratio: pixels of the picture for one of the result, along a side.
+            oversampling: pixels that the reduced window keeps for one of the result.
+
+        Returns:
+            The factor, of which the edges of the windows are to be multiples.
+        """
+        reduction = reduction_for(ratio, oversampling) if self._is_large else 1
+        return reduction if reduction >= self._least_reduction else 1
+
+    def read(self, box: Box, reduction: int = 1) -> Tensor:
+        """Read a window; coarse ones of large pictures are read from reduced copies.
+
+        Args:
+            box: a window inside the picture.
+            reduction: factor by which the window is reduced if the picture has such a copy (`reduction`).
+
+        Returns:
+            Bytes `(3, h, w)`, which are not to be written to.
+
+        Raises:
+            InputError: the window reaches beyond the picture.
+        """
+        x1, y1, x2, y2 = box
+        width, height = self.size
         inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
         check(inside, "box", f"a window inside {width} × {height} pixels", box)
-        coarse = self._has_overviews or self.size[0] * self.size[1] > _LARGE
-        return self._reduced(box, reduction) if coarse and reduction >= self._first else _bytes_of(self._given(box))
+        has_copies = self._has_overviews or self._is_large
+        if has_copies and reduction >= self._least_reduction:
+            return self._reduced(box, reduction)
+        return _bytes_of(self._checked_pixels(box))
 
-    def _given(self, box: _Box) -> NDArray[np.uint8]:
+    def _checked_pixels(self, box: Box) -> NDArray[np.uint8]:
         """The pixels of a window; raises `InputError` where a reader gives others."""
-        (x1, y1, x2, y2), pixels = box, self.pixels(box)
-        fits = pixels.dtype == np.uint8 and pixels.shape == (y2 - y1, x2 - x1, 3)
-        check(fits, "pixels", f"bytes of shape {(y2 - y1, x2 - x1, 3)}", f"{pixels.dtype} of {pixels.shape}")
+        x1, y1, x2, y2 = box
+        pixels = self.pixels(box)
+        shape = y2 - y1, x2 - x1, 3
+        is_window = pixels.dtype == np.uint8 and pixels.shape == shape
+        check(is_window, "pixels", f"bytes of shape {shape}", f"{pixels.dtype} of {pixels.shape}")
         return pixels
 
-    @cached_property
-    def _first(self) -> int:
-        """Least factor by which windows are read reduced, so that the largest copy has at most `_LARGEST` pixels."""
-        first = _FIRST
-        while not self._has_overviews and self.size[0] * self.size[1] > _LARGEST * first**2:
-            first *= 2
-        return first
+    @property
+    def _is_large(self) -> bool:
+        return self.size[0] * self.size[1] > _LARGE
 
-    def _reduced(self, box: _Box, reduction: int) -> Tensor:
+    @cached_property
+    def _least_reduction(self) -> int:
+        """Least factor by which windows are read reduced, so that the largest copy has at most `_LARGEST` pixels."""
+        reduction = _FIRST
+        while not self._has_overviews and self.size[0] * self.size[1] > _LARGEST * reduction**2:
+            reduction *= 2
+        return reduction
+
+    def _reduced(self, box: Box, reduction: int) -> Tensor:
         """A window of a copy, `(3, h, w)`."""
         copy = self._copy(reduction)
-        high, wide = copy.shape[1:]
+        height, width = copy.shape[1:]
         x1, y1, x2, y2 = box
-        left, top = min(x1 // reduction, wide - 1), min(y1 // reduction, high - 1)
-        return copy[:, top : max(-(-y2 // reduction), top + 1), left : max(-(-x2 // reduction), left + 1)]
+        # The copy lacks what is left of the picture's sides, so that windows at its end have its last pixel.
+        left = min(x1 // reduction, width - 1)
+        top = min(y1 // reduction, height - 1)
+        right = max(-(-x2 // reduction), left + 1)
+        bottom = max(-(-y2 // reduction), top + 1)
+        return copy[:, top:bottom, left:right]
 
     @cached_property
     def _copies(self) -> dict[int, Tensor]:
-        """Copies `(3, h, w)` by their reduction, channels last in memory; each is made when it is first needed."""
+        """Copies `(3, h, w)` by their reduction, channels last in memory."""
         return {}
 
     def _copy(self, reduction: int) -> Tensor:
         """A copy, without what is left of sides that are no multiples of the reduction, less than one of its pixels."""
         if reduction not in self._copies:
-            if reduction == self._first:
-                self._copies[reduction] = self._largest()
+            if reduction == self._least_reduction:
+                self._copies[reduction] = self._largest_copy()
             else:
                 larger = self._copy(reduction // 2)
-                high, wide = (max(1, length // 2) for length in larger.shape[1:])
-                self._copies[reduction] = resized(larger[:, : 2 * high, : 2 * wide], (high, wide))[0]
+                height, width = (max(1, length // 2) for length in larger.shape[1:])
+                self._copies[reduction] = resized(larger[:, : 2 * height, : 2 * width], (height, width))[0]
         return self._copies[reduction]
 
-    def _largest(self) -> Tensor:
+    def _largest_copy(self) -> Tensor:
         """The largest copy, made strip by strip; what is not stored is not read."""
-        first = self._first
-        wide, high = (max(1, length // first) for length in self.size)
-        rows = max(1, _STRIP // self.size[0] // first)
-        copy = torch.empty(high, wide, 3, dtype=torch.uint8)
-        for top in range(0, high, rows):
-            bottom = min(top + rows, high)
-            for left, right, held in self._runs(top, bottom, wide, high):
+        width, height = self._copy_size
+        rows = max(1, _STRIP // self.size[0] // self._least_reduction)
+        copy = torch.empty(height, width, 3, dtype=torch.uint8)
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            for left, right, stored in self._runs(top, bottom):
                 # One pixel is the colour of all that is not stored.
-                end = (right, bottom) if held else (left + 1, top + 1)
-                copy[top:bottom, left:right] = self._part((left, top, *end), (wide, high))
+                box = (left, top, right, bottom) if stored else (left, top, left + 1, top + 1)
+                copy[top:bottom, left:right] = self._part(box)
         return copy.permute(2, 0, 1)
 
-    def _runs(self, top: int, bottom: int, wide: int, high: int) -> Iterator[tuple[int, int, bool]]:
-        """First and end of the columns of a strip of the largest copy that are stored, and of those that are not."""
-        step = max(1, _PIECE // self._first)
-        lefts = range(0, wide, step)
-        held = [self.holds(self._around((left, top, min(left + step, wide), bottom), (wide, high))) for left in lefts]
-        for stored, run in groupby(zip(lefts, held, strict=True), lambda piece: piece[1]):
-            pieces = [left for left, _ in run]
-            yield pieces[0], min(pieces[-1] + step, wide), stored
+    @property
+    def _copy_size(self) -> tuple[int, int]:
+        """`(width, height)` of the largest copy."""
+        width, height = self.size
+        return max(1, width // self._least_reduction), max(1, height // self._least_reduction)
 
-    def _around(self, box: _Box, size: tuple[int, int]) -> _Box:
-        """The window of a part of the largest copy, with what the filter reaches: less than one pixel of the copy."""
-        (x1, y1, x2, y2), (wide, high), first = box, size, self._first
-        right, bottom = min(x2 + 1, wide) * first, min(y2 + 1, high) * first
-        return max(x1 - 1, 0) * first, max(y1 - 1, 0) * first, min(right, self.size[0]), min(bottom, self.size[1])
+    def _runs(self, top: int, bottom: int) -> Iterator[tuple[int, int, bool]]:
+        """Runs of columns of a strip of the largest copy, `(left, right, stored)`, that are stored or are not."""
+        width, _ = self._copy_size
+        step = max(1, _PIECE // self._least_reduction)
+        pieces = []
+        for left in range(0, width, step):
+            right = min(left + step, width)
+            stored = self.holds(self._around((left, top, right, bottom)))
+            pieces.append((left, right, stored))
+        for stored, run in groupby(pieces, itemgetter(2)):
+            columns = list(run)
+            yield columns[0][0], columns[-1][1], stored
 
-    def _part(self, box: _Box, size: tuple[int, int]) -> Tensor:
+    def _with_border(self, box: Box) -> Box:
+        """A part of the largest copy with what the filter reaches, less than one pixel at each side."""
+        x1, y1, x2, y2 = box
+        width, height = self._copy_size
+        return max(x1 - 1, 0), max(y1 - 1, 0), min(x2 + 1, width), min(y2 + 1, height)
+
+    def _around(self, box: Box) -> Box:
+        """The window of the picture of which a part of the largest copy is made."""
+        left, top, right, bottom = (side * self._least_reduction for side in self._with_border(box))
+        width, height = self.size
+        return left, top, min(right, width), min(bottom, height)
+
+    def _part(self, box: Box) -> Tensor:
         """A part of the largest copy, `(h, w, 3)`."""
-        (x1, y1, x2, y2), (wide, high) = box, size
-        left, top, right, bottom = max(x1 - 1, 0), max(y1 - 1, 0), min(x2 + 1, wide), min(y2 + 1, high)
-        pixels = _bytes_of(self._given(self._around(box, size)))
+        x1, y1, x2, y2 = box
+        left, top, right, bottom = self._with_border(box)
+        pixels = _bytes_of(self._checked_pixels(self._around(box)))
         part = resized(pixels, (bottom - top, right - left))[0, :, y1 - top : y2 - top, x1 - left : x2 - left]
         return part.permute(1, 2, 0)

@@ -16,8 +16,9 @@ from torch.nn import functional
 
 from semfov import InputError, read_image
 from semfov.data import images
-from semfov.data.large import _ArrayPicture, open_large
-from semfov.data.rasters import _RasterPicture, _TiffPicture
+from semfov.data.large import ArrayPicture, open_large
+from semfov.data.rasters import RasterPicture
+from semfov.data.tiff import TiffPicture
 from semfov.data.windowed import LargePicture, resized
 from tests.refusals import refused, unusable
 
@@ -70,10 +71,10 @@ def test_a_photograph_whose_decoding_was_interrupted_is_decoded_anew(tmp_path, m
     assert np.array_equal(picture.pixels((0, 0, 20, 600)), array)
 
 
-@pytest.mark.parametrize("reader", [_TiffPicture, _RasterPicture])
+@pytest.mark.parametrize("reader", [TiffPicture, RasterPicture])
 def test_threads_read_windows_of_one_picture_at_once(tmp_path, reader):
     """Each gets the pixels of its window, and afterwards warnings and logs are what they were."""
-    if reader is _RasterPicture:
+    if reader is RasterPicture:
         pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
     array, logs = pixels(512, 512), [logging.getLogger(name) for name in ("PIL", "tifffile")]
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb", compression="zlib")
@@ -105,7 +106,7 @@ def test_windows_of_a_memory_mapped_file_need_little_memory(tmp_path):
     side = 6000
     mapped = np.lib.format.open_memmap(tmp_path / "large.npy", mode="w+", dtype=np.uint8, shape=(side, side, 3))
     mapped[2000:2100, 3000:3100] = 200
-    picture = _ArrayPicture(mapped)
+    picture = ArrayPicture(mapped)
     tracemalloc.start()
     window = picture.read((2900, 1900, 3316, 2316))
     overview = picture.read((0, 0, side, side), 8)
@@ -121,7 +122,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     array[1000:1100, 2000:2100] = 77
     tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
     del array
-    picture = _TiffPicture(tmp_path / "large.tif")
+    picture = TiffPicture(tmp_path / "large.tif")
     tracemalloc.start()
     window = picture.read((1900, 900, 2316, 1316))
     peak = tracemalloc.get_traced_memory()[1]
@@ -201,7 +202,7 @@ def test_a_tiff_is_read_by_pillow_where_tifffile_is_missing_or_leaves_it(tmp_pat
     tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb")
     monkeypatch.setitem(sys.modules, "tifffile", None)
     assert np.array_equal(open_large(tmp_path / "a.tif").pixels((0, 0, 230, 150)), array)
-    unusable("pip install tifffile", _TiffPicture, tmp_path / "a.tif")
+    unusable("pip install tifffile", TiffPicture, tmp_path / "a.tif")
 
 
 def test_signed_numbers_of_eight_bits_need_their_black_and_white(tmp_path):
@@ -220,7 +221,7 @@ def strips(monkeypatch):
     monkeypatch.setattr("semfov.data.windowed._LARGE", 4700)
 
 
-class Counting(_ArrayPicture):
+class Counting(ArrayPicture):
     """A picture that counts the rows of the windows that are read."""
 
     def __init__(self, array):
@@ -254,7 +255,7 @@ def test_bytes_are_resampled_as_by_floats_and_as_by_pillow(size):
 
 def test_a_copy_made_in_strips_equals_the_whole_picture_reduced(strips):
     array = pixels(128, 192)
-    copies = _ArrayPicture(array)
+    copies = ArrayPicture(array)
     quarter = resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
     assert torch.equal(copies.read((0, 0, 192, 128), 4), quarter)
     assert torch.equal(copies.read((16, 8, 96, 72), 4), quarter[:, 2:18, 4:24])
@@ -267,7 +268,7 @@ def test_a_copy_made_in_strips_equals_the_whole_picture_reduced(strips):
 def test_windows_of_copies_show_the_place_they_are_of(strips, shape):
     """Also where the sides of the picture are no multiples of the reduction."""
     height, width = shape
-    picture = _ArrayPicture(ramps(height, width))
+    picture = ArrayPicture(ramps(height, width))
     assert picture.reduction(10.0) == 4
     for x1, y1, x2, y2 in ((0, 0, width // 8 * 8, height // 8 * 8), (16, 8, 80, 72)):
         window = picture.read((x1, y1, x2, y2), 8)
@@ -280,7 +281,7 @@ def test_windows_of_copies_show_the_place_they_are_of(strips, shape):
 @pytest.mark.parametrize("size", [(2, 4000), (4000, 2), (1, 9000)])
 def test_thin_pictures_have_copies(strips, size):
     width, height = size
-    picture = _ArrayPicture(np.full((height, width, 3), 9, np.uint8))
+    picture = ArrayPicture(np.full((height, width, 3), 9, np.uint8))
     window = picture.read((0, 0, width, height), 8)
     assert window.shape == (3, max(1, height // 8), max(1, width // 8))
     assert bool((window == 9).all())
@@ -295,7 +296,7 @@ def test_copies_are_made_once_and_each_pixel_is_read_about_once(strips):
 
 
 def test_small_pictures_are_read_as_they_are_and_a_tiff_is_reduced_like_an_array(strips, tmp_path):
-    small, large = _ArrayPicture(pixels(60, 70)), _ArrayPicture(pixels(128, 192))
+    small, large = ArrayPicture(pixels(60, 70)), ArrayPicture(pixels(128, 192))
     assert [small.reduction(ratio) for ratio in (1, 9, 40)] == [1, 1, 1]
     assert [large.reduction(ratio) for ratio in (0.3, 1, 4, 5.9, 6, 17, 40)] == [1, 1, 1, 1, 4, 8, 16]
     assert small.read((0, 0, 70, 60), 4).shape == (3, 60, 70)
@@ -303,7 +304,7 @@ def test_small_pictures_are_read_as_they_are_and_a_tiff_is_reduced_like_an_array
     array = pixels(128, 192)
     tifffile.imwrite(tmp_path / "a.tif", array, tile=(32, 32), photometric="rgb")
     box = (32, 16, 128, 112)
-    assert torch.equal(_TiffPicture(tmp_path / "a.tif").read(box, 8), _ArrayPicture(array).read(box, 8))
+    assert torch.equal(TiffPicture(tmp_path / "a.tif").read(box, 8), ArrayPicture(array).read(box, 8))
 
 
 def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatch):

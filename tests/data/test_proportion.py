@@ -14,7 +14,7 @@ from PIL import Image
 from semfov import DataError, as_image, read_image
 from semfov.agents.picture import OpenedPicture
 from semfov.data.large import open_large, picture_size
-from semfov.data.rasters import _RasterPicture
+from semfov.data.rasters import RasterPicture
 from tests.data.test_large import pixels
 from tests.refusals import refused, unusable
 
@@ -76,7 +76,7 @@ def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
         size = {3: 2, 4: 4, 16: 8}[int(dtype)]
         content[at : at + size] = value.to_bytes(size, "little") if size > 2 or value < 2**16 else b"\xff\xff"
     path.write_bytes(bytes(content) + bomb)
-    monkeypatch.setattr("semfov.data.rasters._INFLATED", 100)
+    monkeypatch.setattr("semfov.data.tiff._INFLATED", 100)
     tracemalloc.start()
     unusable(r"expected tiles of 12,288 bytes, got one that", open_large(path).read, (0, 0, 1, 1))
     assert tracemalloc.get_traced_memory()[1] < 20e6
@@ -180,7 +180,7 @@ def test_sixteen_bits_with_few_values_are_warned_of(tmp_path, reader, request):
     """Of 12 bits and of reflectances; those that use their range are read without a word, and so are blank ones."""
     if reader == "raster":
         pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
-    read = {"fovea": read_image, "windows": open_large, "raster": _RasterPicture}[reader]
+    read = {"fovea": read_image, "windows": open_large, "raster": RasterPicture}[reader]
     grey = pixels(300, 400)[..., 0].astype(np.uint16)
     for factor, said in ((12, r"values from \d+ to 30\d\d of 16 bits"), (257, None), (0, None)):
         tifffile.imwrite(tmp_path / "a.tif", grey * factor, photometric="minisblack")

@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 
 from semfov import SemfovError, read_image
-from semfov.data.large import _ArrayPicture, open_large, picture_size
-from semfov.data.rasters import _RasterPicture, _TiffPicture
+from semfov.data.large import ArrayPicture, open_large, picture_size
+from semfov.data.rasters import RasterPicture
+from semfov.data.tiff import TiffPicture
 from semfov.errors import DataError
 from semfov.paths.georeference import georeference
 from tests.data.test_large import pixels
@@ -55,14 +56,14 @@ def empty(rasterio, path, side, block):
 @pytest.mark.parametrize("box", [(0, 0, 230, 150), (17, 33, 99, 120), (229, 149, 230, 150)])
 def test_windows_have_the_pixels_of_the_array(rasterio, tmp_path, box):
     array = pixels()
-    expected = _ArrayPicture(array).read(box)
+    expected = ArrayPicture(array).read(box)
     planes = write(rasterio, tmp_path / "planes.tif", array, interleave="band")
     wide = write(rasterio, tmp_path / "wide.tif", array.astype(np.uint16) * 257)
     for path in (planes, wide, write(rasterio, tmp_path / "copies.tif", array, (2, 4))):
-        picture = _RasterPicture(path)
+        picture = RasterPicture(path)
         assert picture.size == picture_size(path) == (230, 150)
         assert torch.equal(picture.read(box), expected)
-    grey = _RasterPicture(write(rasterio, tmp_path / "grey.tif", array[..., :1]))
+    grey = RasterPicture(write(rasterio, tmp_path / "grey.tif", array[..., :1]))
     assert torch.equal(grey.read(box), expected[:1].expand(3, -1, -1))
 
 
@@ -73,7 +74,7 @@ def test_channels_are_the_bands_with_their_names(rasterio, tmp_path):
     with rasterio.open(path, "r+") as file:
         meaning = rasterio.enums.ColorInterp
         file.colorinterp = meaning.undefined, meaning.blue, meaning.green, meaning.red, meaning.undefined
-    for reader in (_RasterPicture, _TiffPicture):
+    for reader in (RasterPicture, TiffPicture):
         assert np.array_equal(reader(path).pixels((5, 6, 50, 40)), array[6:40, 5:50])
 
 
@@ -84,7 +85,7 @@ def test_coarse_windows_come_from_the_overviews(rasterio, large, tmp_path):
     with rasterio.open(path, "r+", overview_level=1) as file:  # reduced by 4
         file.write(np.full((3, 64, 96), 50, np.uint8))
     picture = open_large(path)
-    assert isinstance(picture, _RasterPicture)
+    assert isinstance(picture, RasterPicture)
     assert picture.reduction(6) == 4
     assert set(picture.read((64, 32, 192, 160), 4).flatten().tolist()) == {50}
     assert set(picture.read((64, 32, 192, 160), 8).flatten().tolist()) == {200}
@@ -96,9 +97,9 @@ def test_coarse_windows_show_the_place_they_are_of(rasterio, large, tmp_path):
     down, across = np.indices((240, 250))
     array = np.stack([across, down, across], -1).astype(np.uint8)
     with_copies = open_large(write(rasterio, tmp_path / "a.tif", array, (2, 4, 8)))
-    without = _RasterPicture(write(rasterio, tmp_path / "b.tif", array))
+    without = RasterPicture(write(rasterio, tmp_path / "b.tif", array))
     for box in ((16, 8, 80, 72), (0, 0, 248, 240)):
-        expected = _ArrayPicture(array).read(box, 8)
+        expected = ArrayPicture(array).read(box, 8)
         assert torch.equal(without.read(box, 8), expected)
         assert int((with_copies.read(box, 8).int() - expected.int()).abs().max()) <= 2
 
@@ -128,23 +129,23 @@ def test_objects_of_a_mosaic_of_files_have_its_coordinates(rasterio, tmp_path):
 
 
 def test_other_tiffs_are_read_as_before(rasterio, tmp_path):
-    assert not isinstance(open_large(write(rasterio, tmp_path / "a.tif", pixels())), _RasterPicture)
+    assert not isinstance(open_large(write(rasterio, tmp_path / "a.tif", pixels())), RasterPicture)
     planes = write(rasterio, tmp_path / "b.tif", pixels(), interleave="band")
     assert np.array_equal(open_large(planes).pixels((5, 6, 50, 40)), pixels()[6:40, 5:50])
 
 
 def test_what_is_no_picture_is_refused(rasterio, tmp_path):
     with pytest.raises(DataError, match=r"expected bands of 8 or 16 bits, got float32; give white="):
-        _RasterPicture(write(rasterio, tmp_path / "a.tif", pixels().astype(np.float32)))
+        RasterPicture(write(rasterio, tmp_path / "a.tif", pixels().astype(np.float32)))
     palette = write(rasterio, tmp_path / "b.tif", pixels()[..., :1], photometric="palette")
     with rasterio.open(palette, "r+") as file:
         file.write_colormap(1, {0: (0, 0, 0, 255), 1: (255, 0, 0, 255)})
-    unusable("got a palette", _RasterPicture, palette)
+    unusable("got a palette", RasterPicture, palette)
     (tmp_path / "c.vrt").write_text("no raster")
     unusable("expected the XML text of a mosaic", open_large, tmp_path / "c.vrt")
     unusable("no such file", open_large, tmp_path / "d.jp2")
     copies = write(rasterio, tmp_path / "e.tif", pixels(), (2, 4))
-    refused("box: expected a window inside 230 × 150 pixels", _RasterPicture(copies).read, (0, 0, 231, 150), 4)
+    refused("box: expected a window inside 230 × 150 pixels", RasterPicture(copies).read, (0, 0, 231, 150), 4)
 
 
 def test_a_missing_rasterio_is_named(tmp_path, monkeypatch):
@@ -227,8 +228,8 @@ def test_text_is_no_photograph(rasterio, private, address, text, suffix):
     ):
         path = private.parent / f"public/photo{suffix}"
         path.write_text(text(str(name), 0) if text is mosaic else text.format(relative=0, name=name))
-        for read in (open_large, picture_size, read_image, _RasterPicture):
-            if read is not _RasterPicture or suffix in (".tif", ".tiff", ".jp2", ".vrt"):
+        for read in (open_large, picture_size, read_image, RasterPicture):
+            if read is not RasterPicture or suffix in (".tif", ".tiff", ".jp2", ".vrt"):
                 with pytest.raises(SemfovError):
                     read(path)
     assert not requests
@@ -252,12 +253,12 @@ def test_reduced_copies_are_those_of_the_file(rasterio, private, address, place)
         elif place == "ovr":
             path.with_name("photo.tif.ovr").write_text(raw)
         if place == "tag":
-            unusable("with overviews of its own", _RasterPicture, path)
+            unusable("with overviews of its own", RasterPicture, path)
             mosaics = path.with_name("mosaic.vrt")
             mosaics.write_text(mosaic("photo.tif", size=(64, 64)))
-            unusable(r"photo\.tif: expected a raster with overviews of its own", _RasterPicture, mosaics)
+            unusable(r"photo\.tif: expected a raster with overviews of its own", RasterPicture, mosaics)
         else:
-            picture = _RasterPicture(path)
+            picture = RasterPicture(path)
             assert not picture._has_overviews
             assert picture.pixels((0, 0, 64, 64), 2).max() == picture.pixels((0, 0, 64, 64), 2).min() == 7
     assert not requests
@@ -326,7 +327,7 @@ def test_rasters_that_claim_more_than_they_hold(rasterio, tmp_path):
         (tmp_path / "b.vrt").write_text(mosaic("a.png", size=size))
         unusable(said, open_large, tmp_path / "b.vrt")
     empty(rasterio, tmp_path / "b.tif", 10**5, 4096).close()
-    for reader in (open_large, _RasterPicture):
+    for reader in (open_large, RasterPicture):
         unusable(r"in proportion to the file, got 10,000,000,000 in [\d,]+ bytes", reader, tmp_path / "b.tif")
 
 
@@ -336,7 +337,7 @@ def test_names_are_no_addresses(rasterio, private, monkeypatch):
     monkeypatch.chdir(folder)
     for name in ("GTIFF_DIR:1:a.tif", "zip+file!a.tif", "a?b=c#d.tif", "gzip:a.tif"):
         write(rasterio, folder / name, pixels())
-        assert _RasterPicture(name).size == (230, 150)
+        assert RasterPicture(name).size == (230, 150)
         assert georeference(name) is not None
 
 

@@ -149,8 +149,9 @@ def test_a_strip_is_not_decoded_for_each_window(tmp_path, compression, monkeypat
     """One strip for the whole picture is read row by row, or decoded once."""
     tifffile.imwrite(tmp_path / "a.tif", pixels(900, 800), photometric="rgb", rowsperstrip=900, compression=compression)
     picture = open_large(tmp_path / "a.tif")
-    read, stored = [], type(picture)._stored
-    monkeypatch.setattr(type(picture), "_stored", lambda self, at, count: read.append(count) or stored(self, at, count))
+    read, tiles = [], type(picture._tiles)
+    stored = tiles.read_bytes
+    monkeypatch.setattr(tiles, "read_bytes", lambda self, at, count: read.append(count) or stored(self, at, count))
     for top in range(0, 900, 90):
         assert np.array_equal(picture.pixels((50, top, 150, top + 90)), pixels(900, 800)[top : top + 90, 50:150])
     assert sum(read) <= 2 * 900 * 800 * 3

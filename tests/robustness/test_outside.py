@@ -15,7 +15,7 @@ from PIL import Image
 
 from semfov import SemfovError, read_image
 from semfov.data.large import open_large, picture_size
-from semfov.data.rasters import _RasterPicture
+from semfov.data.rasters import RasterPicture
 from semfov.paths.georeference import georeference
 from tests.refusals import unusable
 
@@ -132,7 +132,7 @@ def look(path):
     found = []
     doors = [read_image, open_large]
     if path.suffix in (".tif", ".jp2", ".vrt"):
-        doors.append(_RasterPicture)
+        doors.append(RasterPicture)
     for door in doors:
         with suppress(SemfovError):
             opened = door(path)
@@ -140,7 +140,7 @@ def look(path):
                 found.append((opened * 255).round().byte().numpy())
             else:
                 found.append(opened.read((0, 0, *opened.size)).numpy())
-            if door is _RasterPicture:
+            if door is RasterPicture:
                 found.append(np.moveaxis(opened.pixels((0, 0, *opened.size), 4), -1, 0))
     return found
 

@@ -1,0 +1,367 @@
+"""TIFFs that are read tile by tile through tifffile.
+
+    page ──► a grid of tiles, (row, column); a strip is a tile as wide as the picture
+
+Channels lie beside each other in each pixel of a tile, or one after the other: then each has a grid of its own, in the
+same page (planes) or in a page of its own (layers).
+"""
+
+import lzma
+import re
+import weakref
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.data.description import Description, Values, as_rgb, named_colours
+from semfov.data.gdal import check_size
+from semfov.data.images import check_tile, opening
+from semfov.data.tiff_tags import (
+    GDAL_METADATA,
+    GDAL_NODATA,
+    MASK,
+    PALETTE,
+    PLANES,
+    PREMULTIPLIED,
+    REDUCED,
+    RGB,
+    UNASSOCIATED,
+    WHITE_IS_ZERO,
+)
+from semfov.data.tone import White, bytes_between
+from semfov.data.windowed import Box, ChosenBands, LargePicture
+from semfov.errors import DataError, check_data, needing
+
+_NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
+"""How GDAL writes the name of a band, counted from 0, into its tag."""
+
+_MOST_PAGES = 64  # that are looked through for the first that is no thumbnail
+_MOST_LAYERS = 64  # pages that are channels of one picture
+_ROWS = 64  # of a picture that is stored in one strip, which are read at once
+_INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
+_INFLATERS: dict[int, Callable[[], Any]] = {
+    8: zlib.decompressobj,
+    32946: zlib.decompressobj,
+    34925: lzma.LZMADecompressor,
+}
+"""Decoders of compressions whose data may inflate a thousandfold, by their numbers in a TIFF."""
+
+_WITH_DECODER = (1, 8, 32946)  # compressions whose decoders are always there
+
+
+class TiffPicture(LargePicture):
+    """A TIFF that tifffile reads by windows; values of neither 8 nor 16 bits need `white`.
+
+    Private attributes: `_channels` has the channels of a pixel that are read, from 0: one or three colours, and the
+    alpha last, if there is one. `_nodata` is the value of pixels without data, and None where the file states none.
+
+    Raises:
+        DataError: the file is damaged, or of a kind that is left to other readers.
+        InputError: it has no such band.
+    """
+
+    path: Path
+
+    def __init__(self, path: str | PathLike[str], *, white: White | None = None, bands: ChosenBands = None) -> None:
+        with needing("tifffile", path, error=DataError):
+            import tifffile
+        self.path = Path(path)
+        with opening(self.path, "opened"):
+            self.file = tifffile.TiffFile(path)
+            weakref.finalize(self, self.file.close)
+            self.page: Any = _first_page(self.file)
+            layers = _layers_of(self.file, self.page)
+            self.size = int(self.page.imagewidth), int(self.page.imagelength)
+            _check_kind(self.page, self.path, has_white=white is not None)
+            check_size(self.size, self.path.stat().st_size, self.path)
+            self._tiles = _Tiles(self.path, self.file, self.page, layers)
+        description = _describe(self.path, self.page, layers)
+        self._channels = [band - 1 for band in description.shown_bands(bands)]
+        self._colours = len(self._channels)
+        if description.alpha is not None:
+            self._channels.append(description.alpha - 1)
+        self._nodata = _nodata_of(self.page)
+        if self.page.compression not in _WITH_DECODER:
+            with opening(self.path, "decoded"):
+                self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
+        self._display = description.display(white, self._colour_values, self._nodata)
+        self.nothing = self._colour_of_nothing()
+
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        with opening(self.path, "decoded"):
+            return self._shown(self._values(box))
+
+    def holds(self, box: Box) -> bool:
+        return self._tiles.holds(box)
+
+    def stands_alone(self) -> bool:
+        """Tell whether the file has no reduced copies and no masks of the picture, of which tifffile knows nothing."""
+        with opening(self.path, "opened"):
+            # A page that has the tags of the first has none of its own, and is neither.
+            kinds = [getattr(page, "subfiletype", 0) for page in self.file.pages[1:]]
+            return not self.page.subifds and not any(kind & (REDUCED | MASK) for kind in kinds)
+
+    def _values(self, box: Box) -> Values:
+        """The values of the channels in a window, the alpha last, `(h, w, C)`."""
+        x1, y1, x2, y2 = box
+        # What is not stored is without data, or 0, as GDAL reads it.
+        window = np.full((y2 - y1, x2 - x1, len(self._channels)), self._nodata or 0, self.page.dtype)
+        if self._tiles.separate:
+            for place, channel in enumerate(self._channels):
+                for rows, columns, values in self._tiles.parts(box, channel):
+                    window[rows, columns, place] = values[..., 0]
+            return window
+        for rows, columns, values in self._tiles.parts(box):
+            all_in_order = self._channels == [*range(values.shape[-1])]
+            window[rows, columns] = values if all_in_order else values[..., self._channels]
+        return window
+
+    def _colour_values(self, box: Box) -> Values:
+        """The values in a window without the alpha, `(h, w, 1 or 3)`."""
+        return self._values(box)[..., : self._colours]
+
+    def _shown(self, values: Values) -> NDArray[np.uint8]:
+        """The bytes of values with the alpha last, over white, `(h, w, 3)`."""
+        pixels = self._display.colours(values[..., : self._colours])
+        if self._has_alpha:
+            opaque = np.iinfo(values.dtype).max if values.dtype.kind in "ui" else 1.0
+            alpha = bytes_between(values[..., self._colours :], (0.0, float(opaque)))
+            pixels = self._display.over_white(pixels, alpha)
+        return as_rgb(pixels)
+
+    @property
+    def _has_alpha(self) -> bool:
+        return len(self._channels) > self._colours
+
+    def _colour_of_nothing(self) -> tuple[int, int, int] | None:
+        """The colour in which pixels without data are shown; None where the file does not tell them."""
+        if self._has_alpha:
+            return 255, 255, 255
+        if self._nodata is None:
+            return None
+        pixel = np.full((1, 1, len(self._channels)), self._nodata, self.page.dtype)
+        red, green, blue = self._shown(pixel)[0, 0].tolist()
+        return red, green, blue
+
+
+class _Tiles:
+    """The tiles, or strips, of a picture, each read and decoded when a window needs it.
+
+    Args:
+        path: of the file.
+        file: of tifffile.
+        page: that of the picture, whose kind and size all layers have.
+        layers: the pages of the channels, or the page alone.
+
+    Attributes:
+        width, height: of a tile in pixels. Of a picture that is one strip of plain rows, some rows are a tile.
+        columns, rows: of tiles in the grid of a channel.
+        separate: whether each channel has a grid of tiles of its own.
+
+    Private attributes: `_decoded` keeps strips that are the whole picture, by page and number, as each window would
+    decode them again. `_lock` is held while the place in the file is moved.
+    """
+
+    def __init__(self, path: Path, file: Any, page: Any, layers: Sequence[Any]) -> None:
+        self._path = path
+        self._file = file
+        self._page = page
+        self._layers = layers
+        self._lock = Lock()
+        self._decoded: dict[tuple[int, int], Values] = {}
+        self._size = int(page.imagewidth), int(page.imagelength)
+        self._is_one_strip = not page.is_tiled and page.rowsperstrip >= self._size[1]
+        # What is not packed has its rows at known places.
+        is_plain = page.compression == 1 and page.predictor == 1 and page.fillorder == 1
+        self._has_plain_rows = self._is_one_strip and is_plain and all(page.databytecounts)
+        if page.is_tiled:
+            self.width, self.height = page.tilewidth, page.tilelength
+        else:
+            self.width = self._size[0]
+            self.height = min(_ROWS, self._size[1]) if self._has_plain_rows else page.rowsperstrip
+        self.columns = -(-self._size[0] // self.width)
+        self.rows = -(-self._size[1] // self.height)
+        self.separate = self._has_layers or (page.planarconfig == PLANES and page.samplesperpixel > 1)
+
+    @property
+    def _has_layers(self) -> bool:
+        return len(self._layers) > 1
+
+    @cached_property
+    def _is_stored(self) -> NDArray[np.bool_]:
+        """Which tiles the file has of any channel, `(rows, columns)`."""
+        if self._has_plain_rows or self._has_layers:
+            return np.ones((self.rows, self.columns), np.bool_)
+        counts = np.asarray(self._page.databytecounts, np.int64)
+        tiles = self.rows * self.columns
+        planes = max(len(counts) // tiles, 1)
+        return np.logical_or.reduce(counts[: planes * tiles].reshape(planes, self.rows, self.columns) > 0)
+
+    def holds(self, box: Box) -> bool:
+        """Tell whether a tile of a window is stored in the file."""
+        x1, y1, x2, y2 = box
+        rows = slice(y1 // self.height, -(-y2 // self.height))
+        columns = slice(x1 // self.width, -(-x2 // self.width))
+        return bool(self._is_stored[rows, columns].any())
+
+    def parts(self, box: Box, channel: int = 0) -> Iterator[tuple[slice, slice, Values]]:
+        """Read the parts of a window that are stored, tile by tile.
+
+        Args:
+            box: the window.
+            channel: whose tiles are read where channels are separate, from 0.
+
+        Yields:
+            Rows and columns in the window, and their values `(h, w, samples)`.
+        """
+        x1, y1, x2, y2 = box
+        for row in range(y1 // self.height, -(-y2 // self.height)):
+            for column in range(x1 // self.width, -(-x2 // self.width)):
+                tile = self._tile(row, column, channel)
+                if tile is None:
+                    continue
+                left = column * self.width
+                top = row * self.height
+                # The last tiles reach beyond the picture.
+                tile = tile[: self._size[1] - top, : self._size[0] - left]
+                rows = slice(max(y1 - top, 0), min(y2 - top, tile.shape[0]))
+                columns = slice(max(x1 - left, 0), min(x2 - left, tile.shape[1]))
+                rows_in_window = slice(top + rows.start - y1, top + rows.stop - y1)
+                columns_in_window = slice(left + columns.start - x1, left + columns.stop - x1)
+                yield rows_in_window, columns_in_window, tile[rows, columns]
+
+    def _tile(self, row: int, column: int, channel: int) -> Values | None:
+        """A tile, `(h, w, samples)`; None for one that is not stored in the file."""
+        layer = self._layers[channel] if self._has_layers else self._page
+        plane = channel if self.separate and not self._has_layers else 0
+        if self._has_plain_rows:
+            return self._plain_rows(layer, plane, row)
+        # In a page, the tiles of a plane follow those of the planes before it.
+        return self._decode(layer, (plane * self.rows + row) * self.columns + column)
+
+    def _decode(self, layer: Any, number: int) -> Values | None:
+        """Decode the tile of a number in a page, `(h, w, samples)`; None for one that is not stored in the file."""
+        key = layer.index, number
+        if key in self._decoded:
+            return self._decoded[key]
+        stored = layer.databytecounts[number]
+        if not stored:
+            return None
+        samples = 1 if self.separate else self._page.samplesperpixel
+        size = self.width * self.height * samples * self._page.dtype.itemsize
+        check_tile(size, stored, f"image {self._path}")
+        data = self.read_bytes(layer.dataoffsets[number], stored)
+        self._check_inflation(data, size)
+        tile: Values = self._page.decode(data, number, jpegtables=self._page.jpegtables)[0][0]
+        if self._is_one_strip:
+            self._decoded[key] = tile
+        return tile
+
+    def _check_inflation(self, data: bytes, size: int) -> None:
+        """Raise `DataError` for a packed tile that inflates to far more than its `size` in bytes."""
+        make_inflater = _INFLATERS.get(int(self._page.compression))
+        if make_inflater is None or len(data) <= _INFLATED:
+            return
+        most = 2 * size + 2**16
+        inflated = make_inflater().decompress(data, most)
+        got = "one that inflates to more; replace it"
+        check_data(len(inflated) < most, f"image {self._path}", f"tiles of {size:,} bytes", got)
+
+    def _plain_rows(self, layer: Any, plane: int, part: int) -> Values:
+        """Rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""
+        top = part * self.height
+        rows = min(self.height, self._size[1] - top)
+        samples = 1 if self._page.planarconfig == PLANES else self._page.samplesperpixel
+        kind = self._page.dtype.newbyteorder(self._file.byteorder)
+        line = self.width * samples * kind.itemsize
+        data = self.read_bytes(layer.dataoffsets[plane] + top * line, rows * line)
+        return np.frombuffer(data, kind).reshape(rows, self.width, samples)
+
+    def read_bytes(self, offset: int, count: int) -> bytes:
+        """Read bytes of the file."""
+        with self._lock:
+            self._file.filehandle.seek(offset)
+            return bytes(self._file.filehandle.read(count))
+
+
+def _first_page(file: Any) -> Any:
+    """The first page that is no reduced copy, such as a thumbnail, of another one."""
+    for number in range(min(len(file.pages), _MOST_PAGES)):
+        if not file.pages[number].is_reduced:
+            return file.pages[number]
+    return file.pages[0]
+
+
+def _layers_of(file: Any, page: Any) -> Sequence[Any]:
+    """The pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
+    for series in file.series[:1]:
+        pages = list(series.pages)
+        are_channels = series.axes == "CYX" and 2 <= len(pages) <= _MOST_LAYERS and page.samplesperpixel == 1
+        if are_channels and all(layer is not None and layer.shape == page.shape for layer in pages):
+            return pages
+    return [page]
+
+
+def _check_kind(page: Any, path: Path, *, has_white: bool) -> None:
+    """Raise `DataError` for a page that is left to other readers; `has_white` if its black and white are stated."""
+    import tifffile
+
+    kind = "" if page.dtype is None else page.dtype.kind
+    dimensions = 2 + (page.samplesperpixel > 1)
+    # Numbers of 12 bits, and volumes, are none of these.
+    is_image = kind in "uif" and len(page.shape) == dimensions and page.bitspersample == 8 * page.dtype.itemsize
+    remedy = "give white='auto', or the values that are black and white" if is_image else "convert it"
+    has_tone = has_white or page.dtype in (np.uint8, np.uint16)
+    check_data(is_image and has_tone, path, "8 or 16 bits", f"{page.dtype} {page.shape}; {remedy}")
+    check_data(page.photometric != PALETTE, path, "grey, RGB or bands", "a palette; convert it")
+    if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
+        packing = f"{page.compression.name} compression with predictor {int(page.predictor)}"
+        raise DataError(f"{path}: expected imagecodecs for {packing}; pip install imagecodecs")
+
+
+def _describe(path: Path, page: Any, layers: Sequence[Any]) -> Description:
+    """What the tags of a page say of its values."""
+    has_layers = len(layers) > 1
+    count = len(layers) if has_layers else int(page.samplesperpixel)
+    extra = [int(kind) for kind in page.extrasamples]
+    without_extra = count - len(extra)
+    metadata = page.tags.get(GDAL_METADATA)
+    names = _NAMED.findall("" if metadata is None else str(metadata.value))
+    numbers = {name.lower(): int(sample) + 1 for sample, name in names}
+    colours = named_colours(numbers)
+    if colours is None and without_extra == 3 and (page.photometric == RGB or has_layers):
+        colours = 1, 2, 3
+    place = next((place for place, kind in enumerate(extra) if kind in (PREMULTIPLIED, UNASSOCIATED)), None)
+    alpha = None if place is None else without_extra + place + 1
+    if alpha in numbers.values() and "alpha" not in numbers:
+        alpha = None  # GDAL names that band otherwise
+    return Description(
+        path=path,
+        size=(int(page.imagewidth), int(page.imagelength)),
+        count=count,
+        colours=colours,
+        alpha=alpha,
+        premultiplied=place is not None and extra[place] == PREMULTIPLIED,
+        white_is_zero=page.photometric == WHITE_IS_ZERO,
+        sixteen_bits=page.dtype == np.uint16,
+    )
+
+
+def _nodata_of(page: Any) -> float | None:
+    """The value of pixels without data; None where the file states none that its type has."""
+    tag = page.tags.get(GDAL_NODATA)
+    try:
+        value = float(str("" if tag is None else tag.value).strip("\0 "))
+    except ValueError:  # some programs write words
+        return None
+    if page.dtype.kind not in "ui":
+        return value
+    limits = np.iinfo(page.dtype)
+    return value if limits.min <= value <= limits.max else None
