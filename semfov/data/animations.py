@@ -14,10 +14,21 @@ _UNTIMED = 0.1  # seconds of a frame that states none, as browsers show it
 
 
 def animation(path: Path, white: White | None = None) -> Iterator[tuple[Tensor, float]]:
-    """Read the frames of an animation, `(3, H, W)`, each with the seconds for which it is shown."""
-    with ExitStack() as held:
+    """Read the frames of an animation.
+
+    Args:
+        path: the file.
+        white: as for `semfov.read_image`.
+
+    Yields:
+        A frame, `(3, H, W)`, and the seconds for which it is shown.
+
+    Raises:
+        DataError: the file, or a frame of it, cannot be read.
+    """
+    with ExitStack() as stack:
         with opening(path, "opened"):
-            image = held.enter_context(open_pillow(path))
+            image = stack.enter_context(open_pillow(path))
             check_proportion(image.size, path.stat().st_size, path)
         for number in count():
             with opening(path, "decoded"):

@@ -1,11 +1,11 @@
 """Annotation files in COCO's format; every entry is checked before it is used."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -41,94 +41,118 @@ class Annotations:
 
     def size(self, image: Id) -> tuple[int, int] | None:
         """`(width, height)` of an image; None if the file does not say."""
-        width, height = (self.images[image].get(side) for side in ("width", "height"))
+        width = self.images[image].get("width")
+        height = self.images[image].get("height")
         return None if width is None or height is None else (int(width), int(height))
 
 
 def read_annotations(path: str | PathLike[str]) -> Annotations:
-    """Read and check a COCO instances file; ids of images and categories are integers or strings.
+    """Read and check a COCO instances file.
 
-    Objects need no id and no area, which nothing depends on. Where `iscrowd` is missing or null it is 0. The name of an
-    image may be the end of its `coco_url`, as in LVIS.
+    Ids of images and categories are integers or strings. Objects need no id and no area, which nothing depends on.
+    Where `iscrowd` is missing or null it is 0. The name of an image may be the end of its `coco_url`, as in LVIS.
+
+    Args:
+        path: the file.
+
+    Returns:
+        What it holds.
+
+    Raises:
+        DataError: the file is missing or damaged; the message names the entry and the field.
     """
     name = f"annotations {Path(path)}"
     data = read_json(path, name=name)
     expected = "an object with images, annotations and categories"
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
     images = _by_id(data, "images", name, {"width": _SIDE, "height": _SIDE, ABSENT: _IDS, PARTIAL: _IDS})
-    for entry in images.values():
-        if entry.get("file_name") is None and isinstance(entry.get("coco_url"), str):
-            entry["file_name"] = PurePosixPath(entry["coco_url"]).name
-    _checked(data, "images", name, {"file_name": _TEXT})
-    categories = _by_id(data, "categories", name, {"name": _TEXT})
-    for key, entries in (("images", images), ("categories", categories)):
-        kinds = {type(each) for each in entries}
-        check_data(len(kinds) < 2, f"{name}: {key}", "ids of one kind", f"integers and strings; {_WAY}")
-    fields: dict[str, _Field] = {
-        "image_id": (lambda value: _ID[0](value) and value in images, "the id of one of the images"),
-        "category_id": (lambda value: _ID[0](value) and value in categories, "the id of one of the categories"),
+    for image in images.values():
+        if image.get("file_name") is None and isinstance(image.get("coco_url"), str):
+            image["file_name"] = PurePosixPath(image["coco_url"]).name
+    _checked(data, "images", name, {"file_name": _NAME})
+    categories = _by_id(data, "categories", name, {"name": _NAME})
+    _check_one_kind(images, f"{name}: images")
+    _check_one_kind(categories, f"{name}: categories")
+    fields = {
+        "image_id": _Field(lambda value: _is_id(value) and value in images, "the id of one of the images"),
+        "category_id": _Field(lambda value: _is_id(value) and value in categories, "the id of one of the categories"),
         "bbox": _BOX,
         "iscrowd": _CROWD,
     }
     objects: dict[Id, list[dict[str, Any]]] = {image: [] for image in images}
     for entry in _checked(data, "annotations", name, fields):
-        category, crowd = _plain_id(entry["category_id"]), int(entry.get("iscrowd") or 0)
-        objects[entry["image_id"]].append({"category_id": category, "bbox": entry["bbox"], "iscrowd": crowd})
+        crowd = int(entry.get("iscrowd") or 0)
+        box = {"category_id": _plain_id(entry["category_id"]), "bbox": entry["bbox"], "iscrowd": crowd}
+        objects[entry["image_id"]].append(box)
     return Annotations(images, categories, objects, sha256(path))
 
 
-_Field = tuple[Callable[[Any], object], str]  # whether a value of an entry fits, and what it is expected to be
+class _Field(NamedTuple):
+    """What the value of a field has to be: a test of it, and the same in words."""
 
-_ID: _Field = (
-    lambda value: _is_whole(value) or (isinstance(value, str) and is_plain(value)),
-    "an integer or a string without control characters",
-)
-_IDS: _Field = (
-    lambda value: value is None or (isinstance(value, list) and all(map(_ID[0], value))),
-    "a list of ids of categories",
-)
-_TEXT: _Field = (
-    lambda value: isinstance(value, str) and value and is_plain(value),
-    "a string without control characters",
-)
-_SIDE: _Field = (
-    lambda value: value is None or (is_number(value) and 1 <= value <= _LARGEST and value == int(value)),
-    "a whole number of pixels",
-)
-_BOX: _Field = (
-    lambda value: isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) >= 0,
-    "[x, y, width, height] with finite numbers and a size of at least 0",
-)
-_WAY = "correct or replace the file"
+    accepts: Callable[[Any], object]
+    expected: str
 
 
-_CROWD: _Field = (lambda value: value is None or value in (0, 1), "0 or 1")
+def _is_id(value: object) -> bool:
+    return _is_whole(value) or (isinstance(value, str) and is_plain(value))
+
+
+def _are_ids(value: object) -> bool:
+    return value is None or (isinstance(value, list) and all(map(_is_id, value)))
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and bool(value) and is_plain(value)
+
+
+def _is_side(value: Any) -> bool:
+    return value is None or (is_number(value) and 1 <= value <= _LARGEST and value == int(value))
+
+
+def _is_box(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) >= 0
+
+
+_ID = _Field(_is_id, "an integer or a string without control characters")
+_IDS = _Field(_are_ids, "a list of ids of categories")
+_NAME = _Field(_is_name, "a string without control characters")
+_SIDE = _Field(_is_side, "a whole number of pixels")
+_BOX = _Field(_is_box, "[x, y, width, height] with finite numbers and a size of at least 0")
+_CROWD = _Field(lambda value: value is None or value in (0, 1), "0 or 1")
+_REMEDY = "correct or replace the file"
 
 
 def _checked(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> list[dict[str, Any]]:
     """The entries of a list, whose fields are as expected."""
     entries = data.get(key)
     if not isinstance(entries, list):
-        raise DataError(f"{name}: expected {key} to be a list, got {_show(data, key)}; {_WAY}")
+        raise DataError(f"{name}: expected {key} to be a list, got {_shown(data, key)}; {_REMEDY}")
     for place, entry in enumerate(entries):  # of which there are many, so that messages are made where they are needed
         if not isinstance(entry, dict):
-            raise DataError(f"{name}: {key}[{place}]: expected an object, got {excerpt(entry)}; {_WAY}")
-        for field, (fits, expected) in fields.items():
-            if not fits(entry.get(field)):
-                fault = f"expected {field} to be {expected}, got {_show(entry, field)}; {_WAY}"
+            raise DataError(f"{name}: {key}[{place}]: expected an object, got {excerpt(entry)}; {_REMEDY}")
+        for field, (accepts, expected) in fields.items():
+            if not accepts(entry.get(field)):
+                fault = f"expected {field} to be {expected}, got {_shown(entry, field)}; {_REMEDY}"
                 raise DataError(f"{name}: {key}[{place}]: {fault}")
     return entries
 
 
 def _by_id(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, dict[str, Any]]:
     """The checked entries of a list by their ids, which are unique."""
-    found: dict[Id, dict[str, Any]] = {}
+    entries: dict[Id, dict[str, Any]] = {}
     for place, entry in enumerate(_checked(data, key, name, {"id": _ID, **fields})):
-        if entry["id"] in found:
-            fault = f"expected unique ids, got id {_show(entry, 'id')} more than once; {_WAY}"
+        if entry["id"] in entries:
+            fault = f"expected unique ids, got id {_shown(entry, 'id')} more than once; {_REMEDY}"
             raise DataError(f"{name}: {key}[{place}]: {fault}")
-        found[_plain_id(entry["id"])] = entry
-    return found
+        entries[_plain_id(entry["id"])] = entry
+    return entries
+
+
+def _check_one_kind(ids: Collection[Id], where: str) -> None:
+    """Raise `DataError` for ids of which some are numbers and others are strings, which have no order."""
+    kinds = {type(number) for number in ids}
+    check_data(len(kinds) < 2, where, "ids of one kind", f"integers and strings; {_REMEDY}")
 
 
 def _is_whole(value: object) -> bool:
@@ -137,22 +161,32 @@ def _is_whole(value: object) -> bool:
 
 
 def _plain_id(value: Any) -> Id:
+    """An id as an integer where it is a number, so that 7.0 is 7."""
     return int(value) if isinstance(value, float) else value
 
 
-def _show(entry: dict[str, Any], key: str) -> str:
+def _shown(entry: dict[str, Any], key: str) -> str:
     return excerpt(entry[key]) if key in entry else "nothing"
 
 
 def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, stacklevel: int = 3) -> None:
-    """Warn of boxes `(N, 4)` in pictures of sizes `(N, 4)` that look like no [x, y, width, height] in pixels."""
+    """Warn of boxes that look like no `[x, y, width, height]` in pixels.
+
+    Args:
+        boxes: `(N, 4)`, as the file has them.
+        limits: `(N, 4)`, width and height of the picture of each box, twice.
+        path: the file, for the message.
+        stacklevel: as for `warnings.warn`.
+    """
     if not len(boxes):
         return
-    corners = bool(((boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)).all())
-    beyond = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1).double().mean()
-    seems = "corners [x1, y1, x2, y2]" if corners and float(beyond) >= _BEYOND else None
+    are_ordered = (boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)
+    leaves_picture = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1)
     if float(boxes.max()) <= 1 and float(limits.min()) > 2:
-        seems = "fractions of the picture"
-    if seems is not None:
-        said = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {seems}"
-        warnings.warn(said, stacklevel=stacklevel)
+        form = "fractions of the picture"
+    elif bool(are_ordered.all()) and float(leaves_picture.double().mean()) >= _BEYOND:
+        form = "corners [x1, y1, x2, y2]"
+    else:
+        return
+    text = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {form}"
+    warnings.warn(text, stacklevel=stacklevel)

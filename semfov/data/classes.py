@@ -78,19 +78,18 @@ hair drier: hair dryer, blow dryer, hairdryer, dryer
 """
 
 
-def _read(table: str) -> dict[str, tuple[str, ...]]:
+def _classes_by_synonym(table: str) -> dict[str, tuple[str, ...]]:
     """Classes by each of their synonyms, which are written without spaces."""
     classes: dict[str, tuple[str, ...]] = {}
     for line in table.strip().splitlines():
-        name, _, others = line.partition(": ")
-        for other in others.split(", "):
-            key = other.replace(" ", "")
+        name, _, synonyms = line.partition(": ")
+        for synonym in synonyms.split(", "):
+            key = synonym.replace(" ", "")
             classes[key] = (*classes.get(key, ()), name)
     return classes
 
 
-_SYNONYMS = _read(_TABLE)  # names of COCO's classes by their synonyms, in lower case and without spaces
-
+_SYNONYMS = _classes_by_synonym(_TABLE)  # names of COCO's classes by their synonyms, in lower case, without spaces
 
 # Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
 _ALIASES = {
@@ -101,7 +100,9 @@ _ALIASES = {
     "diningtable": "dining table",
     "tvmonitor": "tv",
 }
-_SPELT = {"".join(new.split()): [old for old in _ALIASES if _ALIASES[old] == new] for new in _ALIASES.values()}
+_DARKNET = {new.replace(" ", ""): old for old, new in _ALIASES.items()}
+"""Darknet's names of these classes by those of COCO, without spaces."""
+
 _MOST_NAMED = 12  # largest number of classes that a message names
 
 _UNCHANGED = ("sheep", "skis", "scissors", "broccoli")
@@ -148,7 +149,7 @@ def plural(name: str) -> str:
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
-    """Index the classes by their canonical names."""
+    """Index the classes by their canonical names, from 1; raises `InputError` for two of one name."""
     indices = {canonical_name(name): index for index, name in enumerate(classes, 1)}
     check(len(indices) == len(classes), "classes", f"{len(classes)} different names", len(indices))
     return indices
@@ -175,42 +176,81 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     (2, 2)
     """
     if not isinstance(name, str):
-        value = name.item() if isinstance(name, Tensor) and name.ndim == 0 else name
-        inside = isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) <= len(classes)
-        check(inside, argument, f"a name, or a whole number from 1 to {len(classes)}", repr(value))
-        return int(value)
+        return _checked_index(name, len(classes), argument)
     if name in classes:
         return list(classes).index(name) + 1
-    name_key, keys = _plain_key(name), [_plain_key(other) for other in classes]
-    forms = [set().union(*map(_other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
-    for fits in (
-        [index for index, key in enumerate(keys, 1) if key == name_key],
-        [index for index, form in enumerate(forms, 1) if name_key in form],
-    ):
-        if len(fits) == 1:
-            return fits[0]
-        if fits:
-            raise InputError(_unknown(argument, name, [classes[index - 1] for index in fits], classes))
-    singular = [word for word in _SYNONYMS if name_key in _other_numbers(word)]
-    meant = [key for word in (name_key, *singular) for key in map(_plain_key, _SYNONYMS.get(word, ())) if key in keys]
-    near = get_close_matches(name_key, keys, n=3, cutoff=0.8 if meant else 0.6)
-    raise InputError(_unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes))
+    wanted = _plain_key(name)
+    keys = [_plain_key(known) for known in classes]
+    spellings = [[key] for key in keys]
+    inflections = [_inflections(key) for key in keys]
+    # A name in another number is looked for only where none has this spelling: `glass` is no plural of `glas`.
+    for forms_of_classes in (spellings, inflections):
+        indices = [index for index, forms in enumerate(forms_of_classes, 1) if wanted in forms]
+        if len(indices) == 1:
+            return indices[0]
+        if indices:
+            raise InputError(_unknown(argument, name, [classes[index - 1] for index in indices], classes))
+    similar = [classes[keys.index(key)] for key in _similar_keys(wanted, keys)]
+    raise InputError(_unknown(argument, name, similar, classes))
+
+
+def _checked_index(value: object, count: int, argument: str) -> int:
+    """An index of one of `count` classes, which may be a number of NumPy or of a tensor."""
+    number = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
+    is_whole = isinstance(number, Integral) and not isinstance(number, bool)
+    if not is_whole or not 1 <= int(number) <= count:
+        raise InputError(f"{argument}: expected a name, or a whole number from 1 to {count}, got {number!r}")
+    return int(number)
+
+
+def _inflections(key: str) -> set[str]:
+    """The singular and the plurals of a class, in COCO's and in Darknet's spelling."""
+    forms = _other_numbers(key)
+    if key in _DARKNET:
+        forms |= _other_numbers(_DARKNET[key])
+    return forms
+
+
+def _similar_keys(wanted: str, keys: Sequence[str]) -> list[str]:
+    """The classes that an unknown name may mean: those with it as a synonym, and those of a similar spelling."""
+    singular = [word for word in _SYNONYMS if wanted in _other_numbers(word)]
+    meant = []
+    for word in (wanted, *singular):
+        for name in _SYNONYMS.get(word, ()):
+            key = _plain_key(name)
+            if key in keys:
+                meant.append(key)
+    # A synonym says more than a similar spelling, which then has to be closer.
+    similar = get_close_matches(wanted, keys, n=3, cutoff=0.8 if meant else 0.6)
+    return [*meant, *similar]
 
 
 def class_numbers(
     names: str | int | Sequence[str | int] | None, classes: Sequence[str], argument: str = "class"
 ) -> tuple[int, ...]:
-    """Look up the indices of one class, of several, or of all classes."""
+    """Look up the indices of one class, of several, or of all classes.
+
+    Args:
+        names: one name or index, or several; None for all classes.
+        classes: names of the K classes.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The indices, from 1, in the order given and without repeats; none for all classes.
+
+    Raises:
+        InputError: there is no such class.
+    """
     if names is None:
         return ()
     if isinstance(names, str) or not isinstance(names, Sequence):
         try:
             return (class_index(names, classes, argument),)
         except InputError as error:
-            several = [name.strip() for name in str(names).split(",")]
-            if len(several) == 1:
+            words = [name.strip() for name in str(names).split(",")]
+            if len(words) == 1:
                 raise
-            raise InputError(f"{error}; several classes are a list: {several}") from None
+            raise InputError(f"{error}; several classes are a list: {words}") from None
     check(len(names) > 0, argument, "a class, several, or None for all", names)
     return tuple(dict.fromkeys(class_index(name, classes, argument) for name in names))
 

@@ -4,19 +4,24 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from semfov.data.annotations import Annotations, Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.reading import read_image
-from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check, check_data
 from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 _log = logging.getLogger(__name__)
+
+_MOST_REPAIRS = 8  # that a message lists by their reasons
 
 
 class CocoScenes(Scenes):
@@ -73,7 +78,7 @@ class CocoScenes(Scenes):
         max_target_area: float | None = 0.2,
         limit: int | None = None,
         ids: Collection[int | str] | None = None,
-        coverage: Literal["sum", "union"] = "sum",
+        coverage: Coverage = "sum",
         crowd: Literal["keep", "drop"] = "keep",
     ) -> None:
         check(min_instances >= 0, "min_instances", "at least 0", min_instances)
@@ -82,56 +87,65 @@ class CocoScenes(Scenes):
         check(coverage in ("sum", "union"), "coverage", "'sum' or 'union'", repr(coverage))
         check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
         self.classes = tuple(classes)
+        self._name = f"annotations {annotations}"
         file = read_annotations(annotations)
-        packed = _Packed(file, _match(file, self.classes, annotations), annotations, drop_crowds=crowd == "drop")
-        self.repairs = packed.repairs
+        labels = _labels_of(file, self.classes, self._name)
+        self._packed = _Packed(file, labels, annotations, drop_crowds=crowd == "drop")
+        self.repairs = self._packed.repairs
         if self.repairs:
-            first = ", ".join(f"{what}: {n}" for what, n in self.repairs.most_common(8))
-            rest = [n for _, n in self.repairs.most_common()[8:]]
-            _log.warning(
-                "%s: %s",
-                annotations,
-                first + (f", and {sum(rest)} boxes cut or dropped for {len(rest)} more reasons" if rest else ""),
-            )
+            _log.warning("%s: %s", annotations, _in_words(self.repairs))
 
-        self._packed = packed
-        self._rows: list[int] = []
-        self._targets: list[list[int]] = []
-        chosen = None if ids is None else _checked_ids(ids, packed.ids, annotations)
-        for row, instances in enumerate(packed.instances):
-            if instances < min_instances or len(self._rows) == limit:
-                continue
-            if chosen is not None and str(packed.ids[row]) not in chosen:
-                continue
-            targets = legal_targets(packed.annotation(row), max_target_area, coverage)
-            if targets or max_target_area is None:
-                self._rows.append(row)
-                self._targets.append(targets)
-        some = f"images with at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
-        got = f"none among {len(packed.ids)}; relax min_instances or max_target_area"
-        check_data(bool(self._rows), f"annotations {annotations}", some, got)
-        self.ids = [packed.ids[row] for row in self._rows]
-        names = [packed.names[row] for row in self._rows]
-        self._files = [inside(root, name) for name in names]
-        for path in self._files:
-            check_regular(path, f"image {path}")
-        if missing := [path for path in self._files if not os.path.exists(path)]:  # also names that are too long
-            counts = f"{len(missing)} of {len(names)} are missing"
-            raise DataError(f"image {missing[0]}: no such file ({counts}); check data.root")
+        criteria = _Criteria(min_instances, max_target_area, coverage)
+        targets_by_row = self._select(criteria, self._rows_of(ids), limit)
+        self._rows = list(targets_by_row)
+        self._targets = list(targets_by_row.values())
+        expected = (
+            f"images with at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
+        )
+        got = f"none among {len(self._packed.ids)}; relax min_instances or max_target_area"
+        check_data(bool(self._rows), self._name, expected, got)
+        self.ids = [self._packed.ids[row] for row in self._rows]
+        names = [self._packed.names[row] for row in self._rows]
+        self._files = _files_of(root, names)
         settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
         self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
+
+    def _rows_of(self, ids: Collection[int | str] | None) -> list[int]:
+        """The places of the images to select from, ascending; raises `DataError` for ids of no image."""
+        image_ids = [str(image) for image in self._packed.ids]
+        if ids is None:
+            return list(range(len(image_ids)))
+        chosen = {str(image) for image in ids}
+        missing = sorted(chosen - set(image_ids))
+        first = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+        got = f"none for {len(missing)} of them: {first}; correct ids or the annotations"
+        check_data(not missing, self._name, f"an image for each of {len(chosen)} ids", got)
+        return [row for row, image in enumerate(image_ids) if image in chosen]
+
+    def _select(self, criteria: "_Criteria", rows: Sequence[int], limit: int | None) -> dict[int, list[int]]:
+        """The legal targets of the first images that meet the criteria, by the places of the images."""
+        selected: dict[int, list[int]] = {}
+        for row in rows:
+            if len(selected) == limit:
+                break
+            if self._packed.instances[row] < criteria.min_instances:
+                continue
+            targets = legal_targets(self._packed.annotation(row), criteria.max_target_area, criteria.coverage)
+            if targets or criteria.max_target_area is None:
+                selected[row] = targets
+        return selected
 
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
         annotation = self.annotation(index)
-        path, (width, height) = self._files[index], annotation.size
+        path = self._files[index]
+        width, height = annotation.size
         image = read_image(path)
-        high, wide = image.shape[-2:]
-        if (wide, high) != annotation.size:
+        if image.shape[-2:] != (height, width):
+            got = f"{image.shape[-1]} × {image.shape[-2]}; use the image that the annotations were made for"
             image = read_image(path, oriented=False)
-            got = f"{wide} × {high}; use the image that the annotations were made for"
-            fits = image.shape[-2:] == (height, width)
-            check_data(fits, f"image {path}", f"{width} × {height} pixels as annotated", got)
+            is_annotated = image.shape[-2:] == (height, width)
+            check_data(is_annotated, f"image {path}", f"{width} × {height} pixels as annotated", got)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
@@ -173,74 +187,117 @@ class CocoScenes(Scenes):
         return json_sha256([sha256(path, f"image {path}"), self._packed.sizes[self._rows[index]]])
 
 
-def _checked_ids(ids: Collection[int | str], image_ids: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
-    """Ids as text, checked to be in the annotations."""
-    chosen = {str(i) for i in ids}
-    missing = sorted(chosen - {str(i) for i in image_ids})
-    some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-    got = f"none for {len(missing)} of them: {some}; correct ids or the annotations"
-    check_data(not missing, f"annotations {annotations}", f"an image for each of {len(chosen)} ids", got)
-    return chosen
+@dataclass(frozen=True)
+class _Criteria:
+    """Which images and targets are taken, as in `CocoScenes`."""
+
+    min_instances: int
+    max_target_area: float | None
+    coverage: Coverage
+
+
+def _in_words(repairs: Counter[str]) -> str:
+    """The most frequent repairs with their numbers, and the sum of the others."""
+    counts = repairs.most_common()
+    words = ", ".join(f"{repair}: {count}" for repair, count in counts[:_MOST_REPAIRS])
+    others = [count for _, count in counts[_MOST_REPAIRS:]]
+    if others:
+        words += f", and {sum(others)} boxes cut or dropped for {len(others)} more reasons"
+    return words
+
+
+def _files_of(root: str | PathLike[str], names: Sequence[str]) -> list[Path]:
+    """The files of images inside their folder; raises `DataError` unless all are there and regular."""
+    files = [inside(root, name) for name in names]
+    for path in files:
+        check_regular(path, f"image {path}")
+    missing = [path for path in files if not os.path.exists(path)]  # also names that are too long
+    if missing:
+        counts = f"{len(missing)} of {len(names)} are missing"
+        raise DataError(f"image {missing[0]}: no such file ({counts}); check data.root")
+    return files
 
 
 class _Packed:
-    """The objects of all images of a file, concatenated in a few tensors, which are cheap to send to workers."""
+    """The objects of all images of a file, concatenated in a few tensors, which are cheap to send to workers.
+
+    Attributes:
+        ids: ids of the images, ascending; the place of an image in this list is its row.
+        names: names of their files.
+        sizes: `(width, height)` of each image.
+        instances: number of boxes of each image, of any category, after the repairs.
+        repairs: how many boxes were cut or dropped, by reason.
+
+    Private attributes: `_boxes`, `_labels` and `_crowd` have the objects of the detector's classes, row after row, and
+    `_ends` where the objects of each row end.
+    """
 
     def __init__(self, file: Annotations, labels: dict[Id, int], path: object, *, drop_crowds: bool) -> None:
         self.ids: list[Any] = sorted(file.images)
-        self.names: list[str] = [file.images[i]["file_name"] for i in self.ids]
-        self.sizes: list[tuple[int, int]] = []
-        for image in self.ids:
-            size = file.size(image)
-            if size is None:
-                raise DataError(f"annotations {path}: expected width and height of image {image!r}, got none")
-            self.sizes.append(size)
+        self.names: list[str] = [file.images[image]["file_name"] for image in self.ids]
+        self.sizes = [_size_of(file, image, path) for image in self.ids]
         self.repairs: Counter[str] = Counter()
 
-        entries = [(row, entry) for row, i in enumerate(self.ids) for entry in file.objects[i]]
+        entries = [(row, entry) for row, image in enumerate(self.ids) for entry in file.objects[image]]
         rows = torch.tensor([row for row, _ in entries], dtype=torch.int64)
         label = torch.tensor([labels[entry["category_id"]] for _, entry in entries], dtype=torch.int64)
         crowd = torch.tensor([bool(entry["iscrowd"]) for _, entry in entries], dtype=torch.bool)
-        bboxes = torch.tensor([[float(v) for v in entry["bbox"]] for _, entry in entries], dtype=torch.float64)
+        numbers = [list(map(float, entry["bbox"])) for _, entry in entries]
+        bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
         limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
 
-        corner, extent = bboxes.reshape(-1, 4).split(2, -1)
+        corner, extent = bboxes.split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)
-        warn_of_form(bboxes.reshape(-1, 4), limits, path, stacklevel=5)
+        warn_of_form(bboxes, limits, path, stacklevel=5)
         cut = edges.clamp(min=0).minimum(limits)
         boxes = cut.float()
-        solid = (boxes[:, 2:] > boxes[:, :2]).all(-1)
-        dropped = solid & crowd & drop_crowds
-        valid = solid & ~dropped
+        has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+        is_dropped_crowd = has_area & crowd & drop_crowds
+        valid = has_area & ~is_dropped_crowd
         labelled = valid & (label > 0)
         # official files have two decimals, so a difference of up to 0.01 is rounding
-        outside = valid & ((edges - cut).abs() > 0.01).any(-1)
-        for what, which in (
-            ("without area in the image, dropped", ~solid),
-            ("of crowds, dropped", dropped),
-            ("cut to the image", outside),
-        ):
-            if which.any():
-                self.repairs[f"boxes {what}"] = int(which.sum())
-        for at in (valid & ~labelled).nonzero()[:, 0].tolist():
-            name = file.categories[entries[at][1]["category_id"]]["name"]
+        is_cut = valid & ((edges - cut).abs() > 0.01).any(-1)
+        self._count("boxes without area in the image, dropped", ~has_area)
+        self._count("boxes of crowds, dropped", is_dropped_crowd)
+        self._count("boxes cut to the image", is_cut)
+        for number in (valid & ~labelled).nonzero()[:, 0].tolist():
+            _, entry = entries[number]
+            name = file.categories[entry["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
         self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
-        self._boxes, self._labels, self._crowd = boxes[labelled], label[labelled], crowd[labelled]
+        self._boxes = boxes[labelled]
+        self._labels = label[labelled]
+        self._crowd = crowd[labelled]
         self._ends: list[int] = rows[labelled].bincount(minlength=len(self.ids)).cumsum(0).tolist()
 
+    def _count(self, repair: str, which: Tensor) -> None:
+        """Note a repair of some boxes, `(N,)` boolean."""
+        if which.any():
+            self.repairs[repair] = int(which.sum())
+
     def annotation(self, row: int) -> Annotation:
-        own = slice(self._ends[row - 1] if row else 0, self._ends[row])
-        boxes, labels, crowd = self._boxes[own], self._labels[own], self._crowd[own]
-        return Annotation(boxes.clone(), labels.clone(), crowd.clone(), self.sizes[row])
+        """Return the objects of an image, of the detector's classes."""
+        objects = slice(self._ends[row - 1] if row else 0, self._ends[row])
+        boxes = self._boxes[objects].clone()
+        labels = self._labels[objects].clone()
+        crowd = self._crowd[objects].clone()
+        return Annotation(boxes, labels, crowd, self.sizes[row])
 
 
-def _match(file: Annotations, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[Id, int]:
+def _size_of(file: Annotations, image: Id, path: object) -> tuple[int, int]:
+    """`(width, height)` of an image; raises `DataError` where the file does not say."""
+    size = file.size(image)
+    if size is None:
+        raise DataError(f"annotations {path}: expected width and height of image {image!r}, got none")
+    return size
+
+
+def _labels_of(file: Annotations, classes: tuple[str, ...], name: str) -> dict[Id, int]:
     """Index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
-    labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in file.categories.items()}
-    names = ", ".join(ascii(category["name"]) for category in list(file.categories.values())[:5]) or "none"
-    some = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
-    check_data(any(labels.values()), f"annotations {path}", some, names)
+    labels = {category: indices.get(canonical_name(entry["name"]), 0) for category, entry in file.categories.items()}
+    first = ", ".join(ascii(entry["name"]) for entry in list(file.categories.values())[:5]) or "none"
+    expected = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
+    check_data(any(labels.values()), name, expected, first)
     return labels

@@ -26,14 +26,25 @@ def container_of(path: Path) -> Container:
     """Tell the container of a video by its first bytes; raises `DataError` for a file that cannot be read."""
     with reading(path, f"source: {path}"), path.open("rb") as file:
         head = file.read(_HEAD)
-    return next((kind for (at, mark), kind in _MARKS.items() if head.startswith(mark, at)), "other")
+    for (place, mark), kind in _MARKS.items():
+        if head.startswith(mark, place):
+            return kind
+    return "other"
 
 
 def frames_stated(path: Path, container: Container, count: float) -> int:
-    """Number of frames that a file should give, by the count that it states; 0 where that does not tell it.
+    """Tell how many frames a file should give, by the count that it states.
 
     An AVI file states a count that its bytes can hold. That of an MP4 file counts frames that are not to be shown, too,
     so that it tells what is missing only where the file was cut. In others, the count is estimated from a duration.
+
+    Args:
+        path: the file.
+        container: its container.
+        count: number of frames that it states.
+
+    Returns:
+        The number; 0 where the count does not tell it.
     """
     if container == "avi":
         is_true = count * _LEAST_FRAME <= path.stat().st_size
@@ -44,17 +55,18 @@ def frames_stated(path: Path, container: Container, count: float) -> int:
 
 def _is_cut(path: Path) -> bool:
     """Tell whether the outer boxes of an MP4 file reach beyond its end."""
-    end, at = path.stat().st_size, 0
+    end = path.stat().st_size
+    start = 0  # of a box
     with path.open("rb") as file:
         for _ in range(_MOST_BOXES):
-            file.seek(at)
+            file.seek(start)
             head = file.read(_HEAD)
             size = int.from_bytes(head[:4], "big")
             if size == 1:  # it is in the next eight bytes
                 size = int.from_bytes(head[8:16], "big")
             if size < 8:  # 0 goes to the end of the file
                 return False
-            at += size
-            if at >= end:
-                return at > end
+            start += size
+            if start >= end:
+                return start > end
     return False

@@ -40,7 +40,15 @@ def example(name: str) -> Tensor:
 
 
 def example_scene(name: str, classes: Sequence[str]) -> Scene:
-    """Read an example picture, and the objects of the detector's classes in it."""
+    """Read an example picture, and the objects of the detector's classes in it.
+
+    Args:
+        name: as for `example`.
+        classes: names of the detector's classes.
+
+    Returns:
+        The scene.
+    """
     number = EXAMPLES.index(lookup(name, EXAMPLES, "example"))
     if name == "sheet":
         return sheet(classes)
@@ -52,37 +60,54 @@ def sheet(classes: Sequence[str]) -> Scene:
     scenes = EmbeddedScenes(classes, count=len(PHOTOGRAPHS))
     prints = [_single(scenes, index) for index in range(len(scenes))]
     rows = [prints[0::2], prints[1::2]]
-    width = max(sum(each.size[0] + _MARGIN for each in row) for row in rows) + _MARGIN
-    heights = [max(each.size[1] for each in row) for row in rows]
+    width = max(sum(scene.size[0] + _MARGIN for scene in row) for row in rows) + _MARGIN
+    heights = [max(scene.size[1] for scene in row) for row in rows]
     paper = torch.full((3, sum(heights) + _MARGIN * 3, width), _PAPER)
-    boxes, top = list[Tensor](), _MARGIN
+    boxes: list[Tensor] = []
+    top = _MARGIN
     for row, height in zip(rows, heights, strict=True):
-        gap = (width - sum(each.size[0] for each in row)) // (len(row) + 1)
+        gap = (width - sum(scene.size[0] for scene in row)) // (len(row) + 1)
         left = gap
-        for each in row:
-            right, bottom = left + each.size[0], top + each.size[1]
-            paper[:, top:bottom, left:right] = each.image
-            boxes.append(each.boxes + torch.tensor([left, top, left, top]))
+        for scene in row:
+            right = left + scene.size[0]
+            paper[:, top : top + scene.size[1], left:right] = scene.image
+            boxes.append(scene.boxes + torch.tensor([left, top, left, top]))
             left = right + gap
         top += height + _MARGIN
-    labels = torch.cat([each.labels for row in rows for each in row])
+    labels = torch.cat([scene.labels for row in rows for scene in row])
     return Scene("sheet", "sheet", paper, torch.cat(boxes), labels)
 
 
 def _single(scenes: EmbeddedScenes, index: int) -> Scene:
     """A scene without the boxes of crowds."""
-    scene, single = scenes[index], ~scenes.annotation(index).crowd
-    return replace(scene, boxes=scene.boxes[single], labels=scene.labels[single])
+    scene = scenes[index]
+    is_single = ~scenes.annotation(index).crowd
+    return replace(scene, boxes=scene.boxes[is_single], labels=scene.labels[is_single])
 
 
 def example_with(target: str | None, classes: Sequence[str]) -> str:
-    """Name the first photograph that shows an object of a class of the detector, or the first one without a target."""
-    shown = [[CLASSES[label - 1] for label in photograph.objects.labels] for photograph in PHOTOGRAPHS]
-    for photograph, names in zip(PHOTOGRAPHS, shown, strict=True):
-        if target is None or canonical_name(target) in names:
+    """Name the first photograph that shows an object of a class of the detector.
+
+    Args:
+        target: name of the class; None for any photograph.
+        classes: names of the detector's classes.
+
+    Returns:
+        Name of the example.
+
+    Raises:
+        InputError: no photograph shows the class.
+    """
+    if target is None:
+        return PHOTOGRAPHS[0].name
+    shown = set()
+    for photograph in PHOTOGRAPHS:
+        names = {CLASSES[label - 1] for label in photograph.objects.labels}
+        if canonical_name(target) in names:
             return photograph.name
-    held = sorted({name for name in classes if any(canonical_name(name) in names for names in shown)})
+        shown |= names
+    known = sorted({name for name in classes if canonical_name(name) in shown})
     raise InputError(
-        f"target: expected a class in the pictures that come with semfov ({', '.join(held)}), got {target!r}; give a "
+        f"target: expected a class in the pictures that come with semfov ({', '.join(known)}), got {target!r}; give a "
         f"photograph to search for it"
     )

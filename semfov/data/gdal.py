@@ -22,6 +22,8 @@ _BLOCKS = 64  # megabytes of decoded blocks that GDAL keeps; its default is a tw
 # Files beside a raster (.ovr, .aux.xml, .msk) may be rasters of any driver themselves, or name others.
 _SETTINGS = {"GDAL_CACHEMAX": _BLOCKS, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
 _PATH = re.compile(r"""["=@,]\s*(/|~|\.{1,2}[/\\]|[A-Za-z]+:[/\\])""")
+"""The beginning of a path in the words of a reference system."""
+
 _SIGNATURES = {
     b"II*\0": "GTiff",
     b"MM\0*": "GTiff",
@@ -32,42 +34,62 @@ _SIGNATURES = {
     b"\x89PNG\r\n\x1a\n": "PNG",
     b"\xff\xd8\xff": "JPEG",
 }
+"""Drivers by the first bytes of the files that they read."""
 
 
 def raster_settings() -> Any:
-    """GDAL's settings for rasters of others, a context in which rasters are opened and windows are read."""
+    """Make a context with GDAL's settings for rasters of others, in which rasters are opened and windows are read."""
     import rasterio
 
     return rasterio.Env(**_SETTINGS)
 
 
 def driver_of(path: Path) -> str | None:
-    """The only driver that may read a file, by the first bytes of it; None for other files than pictures."""
+    """Tell the only driver that may read a file, by its first bytes; None for other files than pictures."""
     with reading(path), path.open("rb") as opened:
         head = opened.read(8)
-    return next((driver for start, driver in _SIGNATURES.items() if head.startswith(start)), None)
+    for signature, driver in _SIGNATURES.items():
+        if head.startswith(signature):
+            return driver
+    return None
 
 
 def open_file(path: str | PathLike[str], driver: str) -> Any:
-    """A raster opened by one driver, inside `raster_settings`; raises `DataError` for what is refused."""
+    """Open a raster by one driver, inside `raster_settings`.
+
+    Args:
+        path: the file.
+        driver: name of GDAL's driver.
+
+    Returns:
+        The dataset of rasterio.
+
+    Raises:
+        DataError: the raster is too large, or names other files.
+    """
     import rasterio
 
     path = Path(path)
     held = path.stat().st_size  # GDAL has many messages for a file that is not there
     file = rasterio.open(path.absolute(), driver=driver)
     try:
-        check_size((file.width, file.height), held, path)
-        check_data(file.count <= _MOST_BANDS, path, f"at most {_MOST_BANDS:,} bands", file.count)
-        names = {key.upper() for key in file.tags(ns="OVERVIEWS")}
-        alone = "OVERVIEW_FILE" not in names
-        check_data(alone, path, "a raster with overviews of its own", "one that names another file")
-        block = max(math.prod(shape) for shape in file.block_shapes) * file.count * np.dtype(file.dtypes[0]).itemsize
-        got = f"{block:,}; convert it to a tiled TIFF"
-        check_data(block <= _MOST_BLOCK, path, f"tiles of at most {_MOST_BLOCK:,} bytes", got)
+        _check_opened(file, held, path)
     except DataError:
         file.close()
         raise
     return file
+
+
+def _check_opened(file: Any, held: int, path: Path) -> None:
+    """Raise `DataError` for a dataset out of proportion to the `held` bytes of its file, or with files beside it."""
+    check_size((file.width, file.height), held, path)
+    check_data(file.count <= _MOST_BANDS, path, f"at most {_MOST_BANDS:,} bands", file.count)
+    names = {key.upper() for key in file.tags(ns="OVERVIEWS")}
+    expected = "a raster with overviews of its own"
+    check_data("OVERVIEW_FILE" not in names, path, expected, "one that names another file")
+    block = max(math.prod(shape) for shape in file.block_shapes) * file.count * np.dtype(file.dtypes[0]).itemsize
+    got = f"{block:,}; convert it to a tiled TIFF"
+    check_data(block <= _MOST_BLOCK, path, f"tiles of at most {_MOST_BLOCK:,} bytes", got)
 
 
 def check_system(words: str, name: object) -> None:
@@ -76,7 +98,7 @@ def check_system(words: str, name: object) -> None:
 
 
 def check_size(size: tuple[int, int], held: int, path: Path) -> None:
-    """Raise `DataError` for a raster that claims a longer side, or more pixels, than its bytes may hold."""
+    """Raise `DataError` for a raster of `(width, height)` with a longer side, or more pixels, than its bytes hold."""
     got = f"{size[0]} × {size[1]}; divide it"
     check_data(max(size) <= MOST_SIDE, path, f"at most {MOST_SIDE:,} pixels along a side", got)
     check_proportion(size, held, path)

@@ -16,7 +16,7 @@ _VERSION = 1  # raise it whenever the same seed would give another picture
 
 
 class _Tile(NamedTuple):
-    """The place of a photograph in a mosaic."""
+    """A photograph in a mosaic: its position in the set, its slot, and the box in the slot that it fills."""
 
     scene: int
     slot: tuple[int, int, int, int]
@@ -24,7 +24,21 @@ class _Tile(NamedTuple):
 
 
 class Mosaics(ComposedScenes):
-    """Mosaics of photographs by a seed, none twice in one unless they are fewer; tile `(width, height)`."""
+    """Mosaics of photographs by a seed, none twice in one unless they are fewer than its slots.
+
+    Args:
+        scenes: the photographs.
+        columns: of slots.
+        rows: of slots.
+        tile: `(width, height)` of a slot in pixels, in which a photograph is letterboxed.
+        count: number of mosaics.
+        seed: of their composition.
+        fill: grey between photographs, in [0, 1].
+        alike: whether the photographs of a mosaic show an object of the same class.
+
+    Attributes:
+        size: `(width, height)` of a mosaic in pixels.
+    """
 
     def __init__(
         self,
@@ -41,33 +55,52 @@ class Mosaics(ComposedScenes):
         check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
         check(min(tile) >= 1, "tile", "a width and a height in pixels", tile)
         super().__init__(scenes.classes, count, seed)
-        self.scenes, self.columns, self.rows, self.tile, self.fill = scenes, columns, rows, tile, fill
+        self.scenes = scenes
+        self.columns = columns
+        self.rows = rows
+        self.tile = tile
+        self.fill = fill
         self.size = columns * tile[0], rows * tile[1]
         self._alike = alike
-        what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill, *([alike] if alike else [])]
-        self.fingerprint = json_sha256(what)
+        settings: list[object] = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill]
+        if alike:
+            settings.append(alike)
+        self.fingerprint = json_sha256(settings)
 
     def tiles(self, index: int) -> list[_Tile]:
-        """List the photographs of a mosaic, row by row."""
+        """List the photographs of a mosaic, row by row.
+
+        Args:
+            index: position of the mosaic in the set.
+
+        Returns:
+            The photographs with their places.
+        """
         generator = self._generator(index)
-        slots, photographs = self.columns * self.rows, np.arange(len(self.scenes))
+        slots = self.columns * self.rows
+        photographs = np.arange(len(self.scenes))
         if self._alike and self._sharing:
             photographs = self._sharing[int(generator.integers(len(self._sharing)))]
         rounds = -(-slots // len(photographs))
         order = np.concatenate([generator.permutation(photographs) for _ in range(rounds)])[:slots]
-        tiles = []
-        for slot, scene in enumerate(order.tolist()):
-            (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
-            scale = min(wide / width, high / height)
-            width, height = (max(1, round(side * scale)) for side in (width, height))
-            left, top = slot % self.columns * wide, slot // self.columns * high
-            x, y = left + (wide - width) // 2, top + (high - height) // 2
-            tiles.append(_Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height)))
-        return tiles
+        return [self._placed(slot, scene) for slot, scene in enumerate(order.tolist())]
+
+    def _placed(self, slot: int, scene: int) -> _Tile:
+        """A photograph in the middle of its slot, as large as fits with its proportions."""
+        slot_width, slot_height = self.tile
+        full_width, full_height = self.scenes.annotation(scene).size
+        scale = min(slot_width / full_width, slot_height / full_height)
+        width = max(1, round(full_width * scale))
+        height = max(1, round(full_height * scale))
+        left = slot % self.columns * slot_width
+        top = slot // self.columns * slot_height
+        x = left + (slot_width - width) // 2
+        y = top + (slot_height - height) // 2
+        return _Tile(scene, (left, top, left + slot_width, top + slot_height), (x, y, x + width, y + height))
 
     @cached_property
     def _sharing(self) -> list[NDArray[np.intp]]:
-        """The photographs of each class that enough of them show."""
+        """The photographs of each class that are enough for a mosaic: a quarter of its slots."""
         presence = np.zeros((len(self.scenes), len(self.classes) + 1), np.bool_)
         for index in range(len(self.scenes)):
             presence[index, self.scenes.annotation(index).labels.numpy()] = True
@@ -87,12 +120,15 @@ class Mosaics(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        parts, boxes = [(self.scenes.annotation(tile.scene), tile.box) for tile in self.tiles(index)], []
-        for part, (x1, y1, x2, y2) in parts:
-            scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)
-            boxes.append(part.boxes * scale + part.boxes.new_tensor([x1, y1] * 2))
-        labels, crowd = torch.cat([part.labels for part, _ in parts]), torch.cat([part.crowd for part, _ in parts])
-        return Annotation(torch.cat(boxes), labels, crowd, self.size)
+        boxes, labels, crowd = [], [], []
+        for tile in self.tiles(index):
+            objects = self.scenes.annotation(tile.scene)
+            x1, y1, x2, y2 = tile.box
+            scale = objects.boxes.new_tensor([(x2 - x1) / objects.size[0], (y2 - y1) / objects.size[1]] * 2)
+            boxes.append(objects.boxes * scale + objects.boxes.new_tensor([x1, y1] * 2))
+            labels.append(objects.labels)
+            crowd.append(objects.crowd)
+        return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a mosaic depend on."""

@@ -13,7 +13,15 @@ from semfov.io.files import inside, json_sha256, sha256
 
 
 class Pictures(Scenes):
-    """Photographs by the names of their files, as `Scenes` without objects."""
+    """Photographs by the names of their files, as `Scenes` without objects.
+
+    Args:
+        root: their folder.
+        names: of the files.
+        classes: names of the detector's classes.
+
+    Private attribute: `_sizes` has `(width, height)` of the photographs that were asked for, by their positions.
+    """
 
     ids: list[str]
 
@@ -23,8 +31,8 @@ class Pictures(Scenes):
         self.ids = sorted(set(names))
         self._sizes: dict[int, tuple[int, int]] = {}
         missing = [name for name in self.ids if not self._path(name).is_file()]
-        such = f"{len(self.ids) - len(missing)}: {', '.join(missing[:1])} is missing; check the folder and the names"
-        check_data(not missing, self.root, f"{len(self.ids)} pictures", such)
+        got = f"{len(self.ids) - len(missing)}: {', '.join(missing[:1])} is missing; check the folder and the names"
+        check_data(not missing, self.root, f"{len(self.ids)} pictures", got)
 
     @property
     def fingerprint(self) -> str:  # type: ignore[override]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape
 
-_Coverage = Literal["sum", "union"]
+Coverage = Literal["sum", "union"]
+"""How the fraction that boxes cover is measured (`box_coverage`)."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ class Scenes(ABC):
         return legal_targets(self.annotation(index))
 
 
-def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: _Coverage = "sum") -> float:
+def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum") -> float:
     """Compute the fraction of the image that boxes cover.
 
     - `sum`: Σ_i area(b_i) / (W·H). Overlaps count several times, so it may exceed 1.
@@ -149,7 +150,9 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: _Coverage = "su
     if coverage == "sum":
         area = ((x2 - x1) * (y2 - y1)).sum()
     else:
-        xs, ys = torch.cat([x1, x2]).unique(), torch.cat([y1, y2]).unique()
+        xs = torch.cat([x1, x2]).unique()
+        ys = torch.cat([y1, y2]).unique()
+        # Which of the columns and of the rows between these edges each box covers.
         columns = (x1[:, None] <= xs[:-1]) & (xs[1:] <= x2[:, None])
         rows = (y1[:, None] <= ys[:-1]) & (ys[1:] <= y2[:, None])
         covered = (rows.double().T @ columns.double() > 0).double()
@@ -158,11 +161,11 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: _Coverage = "su
 
 
 def boxes_meet(box: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether two boxes `(x1, y1, x2, y2)` have an area in common."""
+    """Tell whether two boxes `(x1, y1, x2, y2)` have an area in common."""
     return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
 
 
-def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: _Coverage = "sum") -> list[int]:
+def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: Coverage = "sum") -> list[int]:
     """List the classes that are present and whose boxes cover at most a given fraction of the image.
 
     Args:
@@ -193,7 +196,8 @@ class ComposedScenes(Scenes):
     def __init__(self, classes: tuple[str, ...], count: int, seed: int) -> None:
         check(count >= 1, "count", "at least 1", count)
         check(seed >= 0, "seed", "at least 0", seed)
-        self.classes, self._seed = classes, seed
+        self.classes = classes
+        self._seed = seed
         self.ids = list(range(count))
 
     def _generator(self, index: int, *part: int) -> np.random.Generator:
@@ -202,32 +206,42 @@ class ComposedScenes(Scenes):
 
     def _scene(self, index: int, kind: str, image: Tensor) -> Scene:
         """A composed image with its objects, named after its kind."""
-        annotation, number = self.annotation(index), self.ids[index]
+        annotation = self.annotation(index)
+        number = self.ids[index]
         return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)
 
 
 class ChosenScenes(Scenes):
-    """Scenes that are chosen from one or more sets of the same classes: each a set, and the position in it."""
+    """Scenes that are chosen from one or more sets of the same classes.
+
+    Args:
+        chosen: the set of each scene, and its position there.
+        ids: ids of the scenes here.
+        fingerprint: of the choice.
+    """
 
     def __init__(self, chosen: Sequence[tuple[Scenes, int]], ids: list[int] | list[str], fingerprint: str) -> None:
-        self._chosen, self.classes, self.ids, self.fingerprint = chosen, chosen[0][0].classes, ids, fingerprint
+        self._chosen = chosen
+        self.classes = chosen[0][0].classes
+        self.ids = ids
+        self.fingerprint = fingerprint
 
     def __getitem__(self, index: int) -> Scene:
         """Decode a scene."""
-        scenes, place = self._chosen[index]
-        return scenes[place]
+        scenes, position = self._chosen[index]
+        return scenes[position]
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a scene, without decoding its image."""
-        scenes, place = self._chosen[index]
-        return scenes.annotation(place)
+        scenes, position = self._chosen[index]
+        return scenes.annotation(position)
 
     def targets(self, index: int) -> list[int]:
         """List the classes of a scene that may be searched for."""
-        scenes, place = self._chosen[index]
-        return scenes.targets(place)
+        scenes, position = self._chosen[index]
+        return scenes.targets(position)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of everything that the pixels of a scene depend on."""
-        scenes, place = self._chosen[index]
-        return scenes.digest(place)
+        scenes, position = self._chosen[index]
+        return scenes.digest(position)

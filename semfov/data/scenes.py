@@ -22,7 +22,7 @@ _VERSION = 2  # raise it whenever the same seed would give another picture
 
 FOLDER = Path(__file__).parent / "photographs"
 _SIDES = (0.6, 1.0)  # sides of a part, as shares of those of its photograph
-_SEEN = 0.5  # share of its box by which an object is in a part
+_LEAST_SEEN = 0.5  # share of its box by which an object is in a part
 
 _Box = tuple[int, int, int, int]
 
@@ -41,14 +41,14 @@ class _Photograph(NamedTuple):
 def _photographs() -> tuple[tuple[str, ...], tuple[_Photograph, ...]]:
     """The names of all classes in the photographs, and the photographs, as their file in COCO's format lists them."""
     record = read_json(FOLDER / "photographs.json", name="photographs.json")
-    places = {category["id"]: place for place, category in enumerate(record["categories"], 1)}
+    labels_by_id = {category["id"]: label for label, category in enumerate(record["categories"], 1)}
     photographs = []
     for image in record["images"]:
-        own = [each for each in record["annotations"] if each["image_id"] == image["id"]]
-        x, y, width, height = torch.tensor([each["bbox"] for each in own], dtype=torch.float32).unbind(-1)
+        entries = [entry for entry in record["annotations"] if entry["image_id"] == image["id"]]
+        x, y, width, height = torch.tensor([entry["bbox"] for entry in entries], dtype=torch.float32).unbind(-1)
         boxes = torch.stack([x, y, x + width, y + height], -1)
-        labels = torch.tensor([places[each["category_id"]] for each in own])
-        crowd = torch.tensor([each["iscrowd"] == 1 for each in own])
+        labels = torch.tensor([labels_by_id[entry["category_id"]] for entry in entries])
+        crowd = torch.tensor([entry["iscrowd"] == 1 for entry in entries])
         objects = Annotation(boxes, labels, crowd, (image["width"], image["height"]))
         photographs.append(_Photograph(image["file_name"].removesuffix(".jpg"), objects))
     return tuple(category["name"] for category in record["categories"]), tuple(photographs)
@@ -67,15 +67,17 @@ class _Part(NamedTuple):
 
     def objects(self) -> Annotation:
         """The objects of which at least half is seen, with what is seen of their boxes."""
-        whole, (left, top, right, bottom) = self.photograph.objects, self.box
-        edges = torch.tensor([left, top, left, top]).float(), torch.tensor([right, bottom, right, bottom]).float()
-        boxes = whole.boxes.clamp(*edges)
-        kept = _areas(boxes) >= _SEEN * _areas(whole.boxes)
-        x1, y1, x2, y2 = (boxes[kept] - edges[0]).unbind(-1)
+        objects = self.photograph.objects
+        left, top, right, bottom = self.box
+        corner = torch.tensor([left, top, left, top]).float()
+        end = torch.tensor([right, bottom, right, bottom]).float()
+        boxes = objects.boxes.clamp(corner, end)
+        in_part = _areas(boxes) >= _LEAST_SEEN * _areas(objects.boxes)
+        x1, y1, x2, y2 = (boxes[in_part] - corner).unbind(-1)
         if self.mirrored:
             x1, x2 = right - left - x2, right - left - x1
-        seen = torch.stack([x1, y1, x2, y2], -1)
-        return Annotation(seen, whole.labels[kept], whole.crowd[kept], (right - left, bottom - top))
+        visible = torch.stack([x1, y1, x2, y2], -1)
+        return Annotation(visible, objects.labels[in_part], objects.crowd[in_part], (right - left, bottom - top))
 
     def image(self) -> Tensor:
         """The pixels, `(3, H, W)`."""
@@ -110,15 +112,15 @@ class EmbeddedScenes(ComposedScenes):
         super().__init__(tuple(classes), count, seed)
         indices = class_indices(self.classes)
         self._labels = torch.tensor([0, *(indices.get(name, 0) for name in CLASSES)])
-        some = f"at least one of {', '.join(sorted(CLASSES))}"
-        check(bool(self._labels.any()), "classes", some, self.classes)
-        self.fingerprint = json_sha256(
-            [_VERSION, self.classes, count, seed, [_digest(each.path) for each in PHOTOGRAPHS]]
-        )
+        check(bool(self._labels.any()), "classes", f"at least one of {', '.join(sorted(CLASSES))}", self.classes)
+        digests = [_digest(photograph.path) for photograph in PHOTOGRAPHS]
+        self.fingerprint = json_sha256([_VERSION, self.classes, count, seed, digests])
 
     def __getitem__(self, index: int) -> Scene:
         """Cut out a scene."""
-        number, part, annotation = self.ids[index], self.part(index), self.annotation(index)
+        number = self.ids[index]
+        part = self.part(index)
+        annotation = self.annotation(index)
         name = part.photograph.name
         if part.box != (0, 0, *part.photograph.objects.size):
             name = f"part of {name}, number {number} of seed {self._seed}"
@@ -155,8 +157,8 @@ class EmbeddedScenes(ComposedScenes):
         """
         objects = self.part(index).objects()
         labels = self._labels[objects.labels]
-        known = labels > 0
-        return Annotation(objects.boxes[known], labels[known], objects.crowd[known], objects.size)
+        is_known = labels > 0
+        return Annotation(objects.boxes[is_known], labels[is_known], objects.crowd[is_known], objects.size)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of the photograph and the part of it that a scene is.
@@ -173,10 +175,14 @@ class EmbeddedScenes(ComposedScenes):
 
 def _drawn(photograph: _Photograph, generator: np.random.Generator) -> _Part:
     """A random part of a photograph."""
-    whole = photograph.objects.size
-    width, height = (round(side * generator.uniform(*_SIDES)) for side in whole)
-    left, top = (int(generator.integers(most, endpoint=True)) for most in (whole[0] - width, whole[1] - height))
-    return _Part(photograph, (left, top, left + width, top + height), bool(generator.integers(2)))
+    # The numbers are drawn in this order, on which the scenes of a seed depend.
+    full_width, full_height = photograph.objects.size
+    width = round(full_width * generator.uniform(*_SIDES))
+    height = round(full_height * generator.uniform(*_SIDES))
+    left = int(generator.integers(full_width - width, endpoint=True))
+    top = int(generator.integers(full_height - height, endpoint=True))
+    mirrored = bool(generator.integers(2))
+    return _Part(photograph, (left, top, left + width, top + height), mirrored)
 
 
 def _areas(boxes: Tensor) -> Tensor:

@@ -2,10 +2,10 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Self
+from typing import IO, Self
 
 import torch
 from torch import Tensor
@@ -40,7 +40,9 @@ class WordVectors:
     """
 
     def __init__(self, vectors: Mapping[str, Tensor], missing: Sequence[str] = (), digest: str = "") -> None:
-        self.vectors, self.missing, self.digest = dict(vectors), tuple(missing), digest
+        self.vectors = dict(vectors)
+        self.missing = tuple(missing)
+        self.digest = digest
 
     @classmethod
     def read(cls, path: str | PathLike[str], names: Iterable[str]) -> Self:
@@ -59,30 +61,9 @@ class WordVectors:
             InputError: the file has none of the words.
         """
         words = sorted({word for name in names for word in _words_of(name)})
-        wanted, vectors = set(words), dict[str, Tensor]()
-        with reading(path), Path(path).open(encoding="utf-8", errors="replace", newline="\n") as file:
-            size: int | None = None
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
-                word, _, rest = line.strip().partition(" ")
-                if number == 1 and word.isdigit() and rest.isdigit():
-                    size = int(rest)
-                    continue
-                key = word.lower()
-                # A word in lower case takes precedence; in upper case it may be a proper name.
-                if key not in wanted or (key in vectors and word != key):
-                    continue
-                try:
-                    values = [float(value) for value in rest.split()]
-                except ValueError:
-                    values = []
-                size = len(values) if size is None else size
-                if not values or len(values) != size or not all(map(math.isfinite, values)):
-                    raise DataError(
-                        f"{path}, line {number}: expected a word and {size or 'some'} numbers, got {line[:60]!r}"
-                    )
-                vectors[key] = torch.tensor(values)
-        some = f"a file with vectors of some of the words {', '.join(words)}"
-        check(bool(vectors), "embeddings", some, f"{path}, which has none of them")
+        vectors = _read_vectors(Path(path), frozenset(words))
+        expected = f"a file with vectors of some of the words {', '.join(words)}"
+        check(bool(vectors), "embeddings", expected, f"{path}, which has none of them")
         return cls(vectors, [word for word in words if word not in vectors], sha256(Path(path)))
 
     def vector(self, name: str) -> Tensor:
@@ -132,6 +113,43 @@ class WordVectors:
         return units[0] @ units[1].mT
 
 
+def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
+    """The vectors of some words in a file, `(D,)` by word; raises `DataError` for a line without one."""
+    vectors: dict[str, Tensor] = {}
+    size: int | None = None  # of the vectors, which the first one determines unless word2vec's first line tells it
+    with reading(path), path.open(encoding="utf-8", errors="replace", newline="\n") as file:
+        for number, line in enumerate(_lines(file), 1):
+            word, _, rest = line.strip().partition(" ")
+            if number == 1 and word.isdigit() and rest.isdigit():
+                size = int(rest)
+                continue
+            key = word.lower()
+            # A word in lower case takes precedence; in upper case it may be a proper name.
+            if key not in wanted or (key in vectors and word != key):
+                continue
+            values = _numbers(rest)
+            size = len(values) if size is None else size
+            if not values or len(values) != size or not all(map(math.isfinite, values)):
+                expected = f"a word and {size or 'some'} numbers"
+                raise DataError(f"{path}, line {number}: expected {expected}, got {line[:60]!r}")
+            vectors[key] = torch.tensor(values)
+    return vectors
+
+
+def _lines(file: IO[str]) -> Iterator[str]:
+    """The lines of a file, longer ones in pieces: a file that is no text may be one line."""
+    while line := file.readline(_LONGEST):
+        yield line
+
+
+def _numbers(text: str) -> list[float]:
+    """Numbers with spaces between them; none where there is something else."""
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return []
+
+
 def _words_of(name: str) -> list[str]:
     """Split a name or a description into words, and leave out common words such as `the` and `something`."""
     words = re.findall(r"[^\W_]+(?:'[^\W_]+)?", canonical_name(name))
@@ -172,11 +190,11 @@ def spread(
     """
     check_number(least, "least", 0, 1)
     check(0 < temperature < math.inf, "temperature", "a number above 0", temperature)
-    meant = "a class, or a description with at least one word in the file of word vectors"
-    check(vectors.knows(description), "target", meant, repr(description))
-    near = vectors.similarity([description], classes)[0]
-    has_words = ~near.isnan()
+    expected = "a class, or a description with at least one word in the file of word vectors"
+    check(vectors.knows(description), "target", expected, repr(description))
+    similarity = vectors.similarity([description], classes)[0]
+    has_words = ~similarity.isnan()
     check(bool(has_words.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))
-    weights = ((near - near[has_words].max()) / temperature).exp().nan_to_num(0)
+    weights = ((similarity - similarity[has_words].max()) / temperature).exp().nan_to_num(0)
     order = weights.argsort(descending=True, stable=True).tolist()
-    return {classes[k]: float(weights[k]) for k in order if weights[k] >= least}
+    return {classes[index]: float(weights[index]) for index in order if weights[index] >= least}

@@ -218,4 +218,4 @@ def test_many_files_are_not_open_at_once(tmp_path):
     want = np.concatenate([pixels(8, 8, number) for number in range(80)], 1)
     for _ in range(2):
         assert np.array_equal(picture.pixels((0, 0, 640, 8)), want)
-    assert picture._file._file.cache_info().currsize <= 64
+    assert picture._file._open.cache_info().currsize <= 64
