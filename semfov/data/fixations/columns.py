@@ -1,12 +1,13 @@
-"""The columns and lines of tables, in files of text and in data frames."""
+"""The columns and rows of tables, in files of text and in data frames."""
 
 import csv
 import io
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, Protocol
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check, check_data
@@ -14,7 +15,7 @@ from semfov.io.files import read_text, reading
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 
-_BEFORE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
+_PREAMBLE = re.compile(r"(\s*\n|#[^\n]*\n|\"?sep=.\"?\s*\n)+", re.IGNORECASE)
 """What may come before the names of the columns: empty lines, remarks, and the separator that a spreadsheet notes."""
 
 _DECIMAL = re.compile(r"[+-]*(?=.*\d)\d*,[\deE-]*")  # a number with a decimal comma
@@ -28,59 +29,152 @@ _REMEDIES = {
 }
 """What to do with files that are no text, by their ends."""
 
-
-def of_source(source: Any) -> tuple[str, list[str], list[tuple[str, dict[str, str]]]]:
-    """The name of a file or of a `pandas.DataFrame`, the names of its columns, and its lines."""
-    frame = hasattr(source, "to_dict") and hasattr(source, "columns")
-    expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
-    check(frame or isinstance(source, str | PathLike), "source", expected, f"a {type(source).__name__}")
-    if not frame:
-        return str(source), *_of_file(Path(source))
-    header = [str(name) for name in source.columns]
-    _check_different("the table", header)
-    rows = []
-    for number, row in enumerate(source.itertuples(index=False, name=None)):
-        # A column of whole numbers in which one is missing is one of floats.
-        plain = [int(each) if isinstance(each, float) and each.is_integer() else each for each in row]
-        texts = ["" if str(value) in _MISSING else str(value) for value in plain]  # missing values are empty
-        rows.append((f"row {number}", dict(zip(header, texts, strict=True))))
-    return "the table", header, rows
-
-
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of pictures, whatever the names of their files say."""
 
+_LARGEST = 1e6  # largest coordinate and side in pixels
 
-def _of_file(path: Path) -> tuple[list[str], list[tuple[str, dict[str, str]]]]:
-    """Names of the columns of a file, and its lines; decimal commas become points."""
-    kind = path.suffix.lower()
-    with reading(path), path.open("rb") as file:
-        drawn = kind in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
-    check_data(kind not in _REMEDIES, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
-    got = "a video" if kind in VIDEOS else "a picture"
-    check_data(not drawn and kind not in VIDEOS, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
+
+class DataFrame(Protocol):
+    """What is read of a `pandas.DataFrame`."""
+
+    @property
+    def columns(self) -> Iterable[object]: ...
+
+    def itertuples(self, index: bool, name: str | None) -> Iterable[tuple[object, ...]]: ...
+
+
+class Row(NamedTuple):
+    """A row of a table.
+
+    Attributes:
+        table: name of the table, for messages.
+        place: of the row in it, in words, such as `line 3`.
+        fields: by the names of the columns.
+    """
+
+    table: str
+    place: str
+    fields: dict[str, str]
+
+    def __str__(self) -> str:
+        """Name the row in a message."""
+        return f"{self.table}: {self.place}"
+
+    def number(self, name: str) -> float:
+        """Read a field that is a number; raises `DataError` for one that is empty, or too large for a coordinate."""
+        value = self.number_or_none(name)
+        if value is None:
+            raise DataError(f"{self}, {name}: expected a number, got nothing")
+        if abs(value) > _LARGEST:
+            raise DataError(f"{self}, {name}: expected a number up to {_LARGEST:g}, got {value:g}")
+        return value
+
+    def number_or_none(self, name: str) -> float | None:
+        """Read a field that is a number; None for one that is empty or not there."""
+        text = self.fields.get(name)
+        if not text:
+            return None
+        try:
+            value = float(text.replace("_", "?"))  # which Python takes for a part of a number
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise DataError(f"{self}, {name}: expected a number, got {text[:40]!r}")
+        return value
+
+
+class Table(NamedTuple):
+    """A table: its name for messages, the names of its columns, and its rows."""
+
+    name: str
+    columns: list[str]
+    rows: list[Row]
+
+
+def table_of(source: str | PathLike[str] | DataFrame) -> Table:
+    """Read a table.
+
+    Args:
+        source: a file, or a `pandas.DataFrame`.
+
+    Returns:
+        The table; missing values are empty, and numbers have decimal points.
+
+    Raises:
+        InputError: it is neither.
+        DataError: the file is no table of text.
+    """
+    if isinstance(source, str | PathLike):
+        return _table_of_file(Path(source), str(source))
+    is_frame = hasattr(source, "to_dict") and hasattr(source, "columns")
+    expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
+    check(is_frame, "source", expected, f"a {type(source).__name__}")
+    return _table_of_frame(source)
+
+
+def _table_of_frame(frame: DataFrame) -> Table:
+    name = "the table"
+    columns = [str(column) for column in frame.columns]
+    _check_different(name, columns)
+    rows = []
+    for number, values in enumerate(frame.itertuples(index=False, name=None)):
+        texts = [_text_of(value) for value in values]
+        rows.append(Row(name, f"row {number}", dict(zip(columns, texts, strict=True))))
+    return Table(name, columns, rows)
+
+
+def _text_of(value: object) -> str:
+    """A value of a data frame as a file would have it."""
+    # A column of whole numbers in which one is missing is one of floats.
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    text = str(value)
+    return "" if text in _MISSING else text
+
+
+def _table_of_file(path: Path, name: str) -> Table:
+    _check_text_file(path)
     text = read_text(path)
-    before = _BEFORE.match(text)
-    text = text[before.end() :] if before else text
+    preamble = _PREAMBLE.match(text)
+    if preamble is not None:
+        text = text[preamble.end() :]
     separator = max(",;\t|", key=text.partition("\n")[0].count)
     try:
-        table = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-        lines = [(f"line {table.line_num}", line) for line in table]
+        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        lines = [(f"line {reader.line_num}", line) for line in reader]
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
-    header = [(name or "").strip() for name in table.fieldnames or ()]
-    _check_different(str(path), header)
+    columns = [(column or "").strip() for column in reader.fieldnames or ()]
+    _check_different(str(path), columns)
     rows = []
     for place, line in lines:
         if None in line:
-            raise DataError(f"{path}: {place}: expected {len(header)} fields, got more; quote them with {separator!r}")
-        values = [(value or "").strip() for value in line.values()]
+            raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
+        texts = [(field or "").strip() for field in line.values()]
         if separator != ",":
-            values = [value.replace(",", ".") if _DECIMAL.fullmatch(value) else value for value in values]
-        rows.append((place, dict(zip(header, values, strict=True))))
-    return header, rows
+            texts = [_with_point(text) for text in texts]
+        rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
+    return Table(name, columns, rows)
 
 
-def _check_different(where: str, header: Sequence[str]) -> None:
-    again = sorted({name for name in header if header.count(name) > 1 and name})
-    check_data(not again, where, "columns of different names", f"several named {', '.join(again)}")
+def _check_text_file(path: Path) -> None:
+    """Raise `DataError` for a file that is no table of text, with what to do with it."""
+    kind = path.suffix.lower()
+    with reading(path), path.open("rb") as file:
+        is_picture = kind in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
+    check_data(kind not in _REMEDIES, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
+    got = "a video" if kind in VIDEOS else "a picture"
+    is_table = not is_picture and kind not in VIDEOS
+    check_data(is_table, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
+
+
+def _with_point(text: str) -> str:
+    """A text in which the decimal comma of a number is a point."""
+    return text.replace(",", ".") if _DECIMAL.fullmatch(text) else text
+
+
+def _check_different(name: str, columns: Sequence[str]) -> None:
+    """Raise `DataError` for columns of one name, of which fields would get lost."""
+    repeated = sorted({column for column in columns if columns.count(column) > 1 and column})
+    check_data(not repeated, name, "columns of different names", f"several named {', '.join(repeated)}")

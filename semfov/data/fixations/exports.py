@@ -1,24 +1,26 @@
 """Reading of the tables that the programs of eye trackers export."""
 
-import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from semfov.data.fixations.columns import of_source
+from semfov.data.fixations.columns import DataFrame, Row, Table, table_of
 from semfov.data.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import FrameError, Size, named_columns, read_table, records_of
+from semfov.data.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of
 from semfov.errors import DataError, check, check_data
 
-_OURS = ("picture", "subject", "target", "trial")
-_NAMED = (*_OURS, "duration")
-_GONE = ("", ".", "-", "nan", "none", "null", "na", "undefined", "undefinednull")  # lost, or no number
+_SCANPATH = ("picture", "subject", "target", "trial")
+"""Our names of the fields that the fixations of a scanpath share."""
+
+_NAMED = (*_SCANPATH, "duration")  # fields whose columns a user may name
+_OTHERS = ("width", "height", "found", "x1", "y1", "x2", "y2")  # fields that `read_table` has, and few programs
+_EYE_KEYS = ("eye", "eyeused", "eyereported", "eyelr")
+_LOST = ("", ".", "-", "nan", "none", "null", "na", "undefined", "undefinednull")  # fields that hold nothing
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
 """Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
 
@@ -30,7 +32,7 @@ class PictureError(DataError):
 
 
 def read_export(
-    source: str | PathLike[str] | Any,
+    source: str | PathLike[str] | DataFrame,
     *,
     size: Size | None = None,
     picture: str | None = None,
@@ -83,115 +85,175 @@ def read_export(
     """
     named = named_columns(columns, _NAMED)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
-    where, header, rows = of_source(source)
-    known = _columns_of(header, rows)
-    program = program_of(known)
+    stored = table_of(source)
+    table = _with_pairs(stored)
+    table_columns = [Column.of(name) for name in table.columns]
+    program = program_of(table_columns)
     if program is None:
-        programs = ", ".join(dict.fromkeys(each.name for each in PROGRAMS))
+        programs = ", ".join(dict.fromkeys(program.name for program in PROGRAMS))
+        got = ", ".join(map(repr, stored.columns))[:300]
         raise DataError(
-            f"{where}: expected the columns of a table of {programs}, got {', '.join(map(repr, header))[:300]}; "
-            "use read_table with columns={…}"
+            f"{table.name}: expected the columns of a table of {programs}, got {got}; use read_table with columns={{…}}"
         )
-    layout = _Layout.of(program, known, named, where)
+    layout = _Layout.of(program, table_columns, named, table.name)
     if layout.unread:
-        warnings.warn(f"{where}: {layout.unread}", stacklevel=2)
-    lines = [(place, line) for place, row in rows if (line := layout.fields_of(row)) is not None]
-    file = Path(where).stem if len(header) and "." in where else "1"
-    for _, line in lines:
-        line["subject"] = subject if subject is not None else line["subject"] or file
-    _name_pictures(lines, picture, where)
-    check_data(bool(lines), where, f"fixations of {program.name}", "none that has a place on the picture")
-    lines = _of_one_eye(_viewings(lines), eye)
-    check_data(bool(lines), where, f"fixations of the {eye} eye", "those of the other one")
-    lines = _with_picture(lines, layout, where)
-    if size is None and not all(line["width"] and line["height"] for _, line in lines):
-        raise FrameError(f"{where}: expected the size of the frame, which {program.name} does not give; give size=")
-    return records_of(where, lines, size, units or layout.units, origin or program.origin)
+        warnings.warn(f"{table.name}: {layout.unread}", stacklevel=2)
+    rows = layout.fixations_of(table)
+    _name_people(rows, subject, table)
+    _name_pictures(rows, picture, table.name)
+    check_data(bool(rows), table.name, f"fixations of {program.name}", "none that has a place on the picture")
+    rows = _of_one_eye(_viewings(rows), eye)
+    check_data(bool(rows), table.name, f"fixations of the {eye} eye", "those of the other one")
+    rows = _with_picture(rows, layout, table.name)
+    if size is None and not all(row.fields["width"] and row.fields["height"] for row in rows):
+        expected = f"the size of the frame, which {program.name} does not give"
+        raise FrameError(f"{table.name}: expected {expected}; give size=")
+    coordinates = Coordinates(units or layout.units, origin or program.origin)
+    return records_of(table.name, rows, size, coordinates)
 
 
-_Fields = tuple[str, dict[str, str]]  # the place of a line in words, and its fields by our names
+_PAIR = ("location_x", "location_y")  # columns that are made of one of pairs
 
 
-def _columns_of(header: Sequence[str], rows: Sequence[tuple[str, dict[str, str]]]) -> list[Column]:
-    """The columns of a table; a column `location` of pairs, `[x, y]`, becomes two."""
-    columns = [Column.of(name) for name in header]
-    keys = {column.key: column.name for column in columns}
-    if "location" not in keys or "locationx" in keys:
-        return columns
-    for _, row in rows:
-        pair = re.split(r"[,\s]+", row.get(keys["location"], "").strip("[]() "))
-        row["location_x"], row["location_y"] = pair if len(pair) == 2 else ("", "")
-    return [*columns, Column.of("location_x"), Column.of("location_y")]
+def _with_pairs(table: Table) -> Table:
+    """A table in which a column `location` of pairs, `[x, y]`, has become two columns."""
+    names = {Column.of(name).key: name for name in table.columns}
+    if "location" not in names or "locationx" in names:
+        return table
+    rows = []
+    for row in table.rows:
+        pair = re.split(r"[,\s]+", row.fields.get(names["location"], "").strip("[]() "))
+        texts = pair if len(pair) == 2 else ("", "")
+        rows.append(row._replace(fields={**row.fields, **dict(zip(_PAIR, texts, strict=True))}))
+    return Table(table.name, [*table.columns, *_PAIR], rows)
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the fields of a fixation are in the table of a program, and in which units."""
+    """Where the fields of a fixation are in the table of a program, and in which units.
+
+    Attributes:
+        program: the program.
+        names: of the columns, by our names of the fields; None for a field that the table does not have.
+        filter: the column that tells fixations from other lines; None without one.
+        units: of the points.
+        milliseconds: of the unit of durations.
+        unread: a sentence on columns that may be durations, but are not read; empty where there are none.
+    """
 
     program: Program
-    names: Mapping[str, str | None]  # of the columns, by our names
-    keep: str | None  # the column that tells fixations from other lines
+    names: Mapping[str, str | None]
+    filter: str | None
     units: Units
-    milliseconds: float  # of the unit of durations
-    unread: str  # a sentence on columns that may be durations, but are not read
+    milliseconds: float
+    unread: str
 
     @classmethod
-    def of(cls, program: Program, columns: Sequence[Column], named: Mapping[str, str], where: str) -> "_Layout":
-        """Find the fields of a program's table; `named` are names of columns by ours, which a user gives."""
-        missing = ", ".join(repr(given) for given in named.values() if given not in {each.name for each in columns})
-        check_data(not missing, where, "the columns of columns=", f"none named {missing}")
+    def of(cls, program: Program, columns: Sequence[Column], named: Mapping[str, str], table: str) -> "_Layout":
+        """Find the fields of a program's table.
 
-        def name_of(keys: Sequence[str]) -> str | None:
-            found = (column.name for key in keys for column in columns if column.key == key)
-            return next(found, None)
+        Args:
+            program: the program.
+            columns: of the table.
+            named: names of columns that a user gives, by ours.
+            table: name of the table, for messages.
 
-        x, y = _point_columns(program, columns, where)
-        lasting = [column for key in program.duration for column in columns if column.key == key]
-        if "duration" in named:
-            lasting = [Column.of(named["duration"])]
-        duration = next((column for column in lasting if (column.unit or program.time) in TIMES), None)
-        names = {field: name_of(getattr(program, field)) for field in ("picture", "subject", "trial", "number")}
-        names |= {"eye": name_of(("eye", "eyeused", "eyereported", "eyelr")), "x": x.name, "y": y.name}
+        Returns:
+            The layout.
+        """
+        known = {column.name for column in columns}
+        missing = ", ".join(repr(name) for name in named.values() if name not in known)
+        check_data(not missing, table, "the columns of columns=", f"none named {missing}")
+        x, y = _point_columns(program, columns, table)
+        duration = _duration_column(program, columns, named.get("duration"))
+        names = {
+            "picture": _column_name(program.picture, columns),
+            "subject": _column_name(program.subject, columns),
+            "trial": _column_name(program.trial, columns),
+            "number": _column_name(program.number, columns),
+            "eye": _column_name(_EYE_KEYS, columns),
+            "x": x.name,
+            "y": y.name,
+        }
+        if program.size is not None:
+            width, height = program.size
+            names["width"] = _column_name((width,), columns)
+            names["height"] = _column_name((height,), columns)
+        names |= named
         names["duration"] = None if duration is None else duration.name
-        for field, key in zip(("width", "height"), program.size or (), strict=False):
-            names[field] = name_of((key,))
         return cls(
             program=program,
-            names={**names, **{field: name for field, name in named.items() if field != "duration"}},
-            keep=None if program.keep is None else name_of((program.keep[0],)),
+            names=names,
+            filter=None if program.keep is None else _column_name((program.keep[0],), columns),
             units=LENGTHS.get(x.unit, program.units),
             milliseconds=1.0 if duration is None else TIMES[duration.unit or program.time],
             unread="" if duration is not None else _unread(columns),
         )
 
-    def fields_of(self, row: Mapping[str, str]) -> dict[str, str] | None:
-        """The fields of a row by our names; None for a row that is no fixation, or has no place."""
-        program = self.program
-        beginnings = ("",) if program.keep is None else program.keep[1]
-        if self.keep is not None and not row[self.keep].lower().startswith(beginnings):
-            return None
-        line = {name: "" if at is None else row.get(at, "") for name, at in self.names.items()}
-        line = {**dict.fromkeys(("target", "width", "height", "found", "x1", "y1", "x2", "y2"), ""), **line}
-        if line["x"].lower() in _GONE or line["y"].lower() in _GONE:
-            return None
-        for name in ("duration", *_OURS):
-            if line[name].lower() in _GONE:
-                line[name] = ""
-        if line["duration"] and self.milliseconds != 1:
-            duration = math.nan  # which is refused with its place, as other texts are
-            with suppress(ValueError):
-                duration = float(line["duration"])
-            line["duration"] = repr(duration * self.milliseconds)
-        return line
+    def fixations_of(self, table: Table) -> list[Row]:
+        """Take the rows that are fixations with a place, with their fields by our names."""
+        fixations = []
+        for row in table.rows:
+            if self._is_fixation(row.fields):
+                fields = self._fields_of(row.fields)
+                if fields["x"] and fields["y"]:
+                    fixations.append(row._replace(fields=fields))
+        return fixations
+
+    def _is_fixation(self, stored: Mapping[str, str]) -> bool:
+        """Whether a row is that of a fixation on the picture."""
+        if self.filter is None or self.program.keep is None:
+            return True
+        _, beginnings = self.program.keep
+        return stored[self.filter].lower().startswith(beginnings)
+
+    def _fields_of(self, stored: Mapping[str, str]) -> dict[str, str]:
+        """The fields of a row by our names; those that hold nothing are empty."""
+        fields = dict.fromkeys(("target", *_OTHERS), "")
+        for name, column in self.names.items():
+            fields[name] = "" if column is None else stored.get(column, "")
+        for name in (*_NAMED, "x", "y"):
+            if fields[name].lower() in _LOST:
+                fields[name] = ""
+        if fields["duration"] and self.milliseconds != 1:
+            fields["duration"] = _scaled(fields["duration"], self.milliseconds)
+        return fields
 
 
-def _point_columns(program: Program, columns: Sequence[Column], where: str) -> tuple[Column, Column]:
+def _scaled(text: str, factor: float) -> str:
+    """A number multiplied by a factor; what is no number becomes one that is refused with its place."""
+    try:
+        return repr(float(text) * factor)
+    except ValueError:
+        return "nan"
+
+
+def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
+    """The name of the first column with one of some keys, of which the first counts most."""
+    for key in keys:
+        for column in columns:
+            if column.key == key:
+                return column.name
+    return None
+
+
+def _duration_column(program: Program, columns: Sequence[Column], name: str | None) -> Column | None:
+    """The column of durations in a unit that is read: that of a name, which a user gives, or of the program."""
+    if name is not None:
+        candidates = [Column.of(name)]
+    else:
+        candidates = [column for key in program.duration for column in columns if column.key == key]
+    read = [column for column in candidates if (column.unit or program.time) in TIMES]
+    return read[0] if read else None
+
+
+def _point_columns(program: Program, columns: Sequence[Column], table: str) -> tuple[Column, Column]:
     """The columns of x and y, in a unit that is read; fractions, which are not rounded to pixels, before pixels."""
     across, down = (program.of_point(key, columns) for key in program.point)
     pairs = [(x, y) for x in across for y in down if (x.frame, x.unit) == (y.frame, y.unit)]
     read = [(x, y) for x, y in pairs if not x.unit or x.unit in LENGTHS]
     got = ", ".join(repr(column.name) for column in (*across, *down))
-    check_data(bool(read), where, f"points of {program.name} in px or norm", f"the columns {got}; export them in px")
+    check_data(bool(read), table, f"points of {program.name} in px or norm", f"the columns {got}; export them in px")
     return min(read, key=lambda pair: LENGTHS.get(pair[0].unit) != "fractions")
 
 
@@ -201,61 +263,93 @@ def _unread(columns: Sequence[Column]) -> str:
     return names and f"no duration is read, although there is {names}; name it by columns={{'duration': …}}, in ms or s"
 
 
-def _name_pictures(lines: Sequence[_Fields], picture: str | None, where: str) -> None:
-    """Write the name of the picture that a user gives into lines of one picture."""
+def _name_people(rows: Sequence[Row], subject: str | None, table: Table) -> None:
+    """Write the name of the person into rows: that of a user, else that of the table, else of the file."""
+    is_file = bool(table.columns) and "." in table.name
+    file = Path(table.name).stem if is_file else "1"
+    for row in rows:
+        row.fields["subject"] = subject if subject is not None else row.fields["subject"] or file
+
+
+def _name_pictures(rows: Sequence[Row], picture: str | None, table: str) -> None:
+    """Write the name of the picture that a user gives into rows of one picture."""
     if picture is None:
         return
-    names = sorted({line["picture"] for _, line in lines if line["picture"]})
+    names = sorted({row.fields["picture"] for row in rows if row.fields["picture"]})
     got = f"{len(names)} of them, such as {', '.join(names[:3])}; leave picture= out"
-    check_data(len(names) <= 1, where, "at most one name of a picture beside picture=", got)
-    for _, line in lines:
-        line["picture"] = picture if line["picture"] or not names else ""
+    check_data(len(names) <= 1, table, "at most one name of a picture beside picture=", got)
+    for row in rows:
+        # Where the table has a name, rows without it are fixations between two pictures.
+        row.fields["picture"] = picture if row.fields["picture"] or not names else ""
 
 
-def _viewings(lines: Sequence[_Fields]) -> list[_Fields]:
-    """The lines with the number of their viewing in `trial`, and one line for each number of a fixation."""
-    kept: dict[object, _Fields] = {}
-    viewing, before = 0, None
-    for number, (place, line) in enumerate(lines):
-        who = tuple(line[name] for name in _OURS)
-        viewing += who != before
-        before = who
-        line["trial"] = f"{line['trial']} {viewing}"
-        key = line.pop("number") or None
-        kept[number if key is None else (viewing, key)] = place, line
-    return list(kept.values())
+def _viewings(rows: Sequence[Row]) -> list[Row]:
+    """The rows with the number of their viewing in `trial`, and one row for each number of a fixation."""
+    fixations: dict[object, Row] = {}
+    viewing = 0
+    previous = None
+    for place, row in enumerate(rows):
+        scanpath = tuple(row.fields[name] for name in _SCANPATH)
+        viewing += scanpath != previous
+        previous = scanpath
+        row.fields["trial"] = f"{row.fields['trial']} {viewing}"
+        number = row.fields.pop("number")
+        fixations[(viewing, number) if number else place] = row
+    return list(fixations.values())
 
 
-def _of_one_eye(lines: Sequence[_Fields], eye: str | None) -> list[_Fields]:
-    """The lines of an eye, of the right one in viewings of both; lines that name no eye, or both, are kept."""
-    words = [re.split(r"[\W_]", line.pop("eye").lower()) for _, line in lines]
-    sides = [next((_EYES[word] for word in each if word in _EYES), "") for each in words]
-    both = {line["trial"] for (_, line), side in zip(lines, sides, strict=True) if side == "right"}
-    dropped = [
-        side != eye if eye else side == "left" and line["trial"] in both
-        for (_, line), side in zip(lines, sides, strict=True)
-    ]
-    return [line for line, side, drop in zip(lines, sides, dropped, strict=True) if not (side and drop)]
+def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
+    """The rows of an eye, of the right one in viewings of both; rows that name no eye, or both, are kept."""
+    sides = [_side(row.fields.pop("eye")) for row in rows]
+    with_right = {row.fields["trial"] for row, side in zip(rows, sides, strict=True) if side == "right"}
+    chosen = []
+    for row, side in zip(rows, sides, strict=True):
+        preferred = eye or ("right" if row.fields["trial"] in with_right else "left")
+        if side in ("", preferred):
+            chosen.append(row)
+    return chosen
 
 
-def _with_picture(lines: Sequence[_Fields], layout: _Layout, where: str) -> list[_Fields]:
-    """The lines that name a picture; those that do not are left out with a warning."""
-    shown = [(place, line) for place, line in lines if line["picture"]]
-    if not shown:
-        lacks = f"the name of the picture, which {layout.program.name} does not give"
-        raise PictureError(f"{where}: expected {lacks}, got none; give picture=")
-    if len(shown) < len(lines):
+def _side(text: str) -> str:
+    """The side of an eye, `left` or `right`, in a field; empty where it tells none."""
+    for word in re.split(r"[\W_]", text.lower()):
+        if word in _EYES:
+            return _EYES[word]
+    return ""
+
+
+def _with_picture(rows: Sequence[Row], layout: _Layout, table: str) -> list[Row]:
+    """The rows that name a picture; those that do not are left out with a warning."""
+    with_picture = [row for row in rows if row.fields["picture"]]
+    if not with_picture:
+        expected = f"the name of the picture, which {layout.program.name} does not give"
+        raise PictureError(f"{table}: expected {expected}, got none; give picture=")
+    if len(with_picture) < len(rows):
         warnings.warn(
-            f"{where}: {len(lines) - len(shown)} of {len(lines)} fixations are left out, as "
+            f"{table}: {len(rows) - len(with_picture)} of {len(rows)} fixations are left out, as "
             f"{layout.names['picture']!r} names no picture, such as between two pictures",
             stacklevel=3,
         )
-    return shown
+    return with_picture
 
 
-def table_reader(source: Any, columns: Mapping[str, str] | None) -> Callable[..., list[Fixations]]:
-    """The reader of a table, by the names of its columns; `columns` as for `read_table`."""
-    header = of_source(source)[1]
-    if {"picture", "subject", "x", "y"} <= {name.lower() for name in header} or not {*(columns or ())} <= {*_NAMED}:
+def table_reader(
+    source: str | PathLike[str] | DataFrame, columns: Mapping[str, str] | None
+) -> Callable[..., list[Fixations]]:
+    """Choose the reader of a table by the names of its columns.
+
+    Args:
+        source: the file, or a `pandas.DataFrame`.
+        columns: as for `read_table`.
+
+    Returns:
+        `read_table` or `read_export`.
+    """
+    table = table_of(source)
+    is_ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in table.columns}
+    names_points = not {*(columns or ())} <= {*_NAMED}
+    if is_ours or names_points:
         return read_table
-    return read_table if program_of(_columns_of(header, [])) is None else read_export
+    columns_of_pairs = _with_pairs(table._replace(rows=[])).columns
+    program = program_of([Column.of(name) for name in columns_of_pairs])
+    return read_table if program is None else read_export

@@ -118,31 +118,44 @@ def read_eyelink(
     path = Path(path)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     lines = read_text(path, "cp1252").splitlines()
-    frame = next((match for line in lines if (match := _FRAME.match(line))), None)
     trials, fixations = _events(path, lines)
     views = [view for trial in trials for view in trial.viewed()]
     _share_out(fixations, views)
-    check_data(any(view.fixations for view in views), path, "lines EFIX after a message TRIALID", _none(trials))
-    check_data(size is not None or frame is not None, path, "a message DISPLAY_COORDS", "none; give size=")
-    left, top, right, bottom = (0.0, 0.0, 0.0, 0.0) if frame is None else map(float, frame.groups())
-    screen = (round(right - left) + 1, round(bottom - top) + 1) if size is None else size
-    records = []
-    for view in views:
-        rows = _of_one_eye(view.fixations, eye)
-        if rows:
-            x, y, width, height = view.place or (left, top, *screen)
-            points = np.array([(row.x - x, row.y - y) for row in rows])
-            durations = np.array([row.duration for row in rows])
-            name = path.stem if subject is None else subject
-            records.append(Fixations(view.picture, name, points, (round(width), round(height)), durations=durations))
+    seen = [view for view in views if view.fixations]
+    check_data(bool(seen), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials))
+    screen = _screen(path, lines, size)
+    person = path.stem if subject is None else subject
+    records = [record for view in seen if (record := _record(view, screen, person, eye)) is not None]
     check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
-    said = [*_lost(lines), *_outside_views(trials, fixations)]
-    seen = sum(bool(view.fixations) for view in views)
-    if len(records) < seen:
-        said.append(f"{seen - len(records)} of {seen} pictures have no fixation of the {eye} eye")
-    if said:
-        warnings.warn(f"{path}: {'; '.join(said)}", stacklevel=2)
+    remarks = [*_lost(lines), *_outside_views(trials, fixations)]
+    if len(records) < len(seen):
+        remarks.append(f"{len(seen) - len(records)} of {len(seen)} pictures have no fixation of the {eye} eye")
+    if remarks:
+        warnings.warn(f"{path}: {'; '.join(remarks)}", stacklevel=2)
     return warn_of_frames(path, records)
+
+
+def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:
+    """The screen as `(x, y, width, height)`, in the pixels in which points are counted; `size` overrides the file's."""
+    frame = next((match for line in lines if (match := _FRAME.match(line))), None)
+    if frame is None:
+        check_data(size is not None, path, "a message DISPLAY_COORDS", "none; give size=")
+        return (0.0, 0.0, *(size or (0, 0)))
+    left, top, right, bottom = map(float, frame.groups())
+    # The message has the first and the last pixel.
+    width, height = (round(right - left) + 1, round(bottom - top) + 1) if size is None else size
+    return left, top, width, height
+
+
+def _record(view: _View, screen: _Place, person: str, eye: str | None) -> Fixations | None:
+    """The fixations of an eye in a view, from the corner of the picture, or of the screen; None without any."""
+    fixations = _of_one_eye(view.fixations, eye)
+    if not fixations:
+        return None
+    left, top, width, height = view.place or screen
+    points = np.array([(fixation.x - left, fixation.y - top) for fixation in fixations])
+    durations = np.array([fixation.duration for fixation in fixations])
+    return Fixations(view.picture, person, points, (round(width), round(height)), durations=durations)
 
 
 def _events(path: Path, lines: Iterable[str]) -> tuple[list[_Trial], list[_Fixation]]:
@@ -150,19 +163,30 @@ def _events(path: Path, lines: Iterable[str]) -> tuple[list[_Trial], list[_Fixat
     trials: list[_Trial] = []
     fixations: list[_Fixation] = []
     for number, line in enumerate(lines, start=1):
-        words = line.split()
         try:
-            if words[:1] == ["EFIX"] and trials:
-                if "." not in words[5:7]:
-                    start, _, duration, x, y = map(float, words[2:7])
-                    fixations.append(_Fixation(words[1][:1], start, duration, x, y))
-            elif words[:1] == ["END"] and trials:
-                trials[-1].hide(float(words[1]))
-            elif words[:1] == ["MSG"] and (message := _MESSAGE.match(line)):
-                _read_message(message[3], float(message[1]) - float(message[2] or 0), trials)
+            fixation = _read_event(line, trials)
         except (ValueError, IndexError):
             raise DataError(f"{path}: line {number}: expected an event of EyeLink, got {line[:60]!r}") from None
+        if fixation is not None:
+            fixations.append(fixation)
     return trials, fixations
+
+
+def _read_event(line: str, trials: list[_Trial]) -> _Fixation | None:
+    """Add what a line tells to the trials; returns the fixation that it tells, if it has a place in a trial."""
+    words = line.split()
+    kind = words[0] if words else ""
+    if kind == "MSG" and (message := _MESSAGE.match(line)):
+        time, delay, text = message.groups()
+        _read_message(text, float(time) - float(delay or 0), trials)
+    elif kind == "END" and trials:
+        trials[-1].hide(float(words[1]))
+    elif kind == "EFIX" and trials:
+        _, eye, *numbers = words
+        if "." not in numbers[3:5]:  # a place that the tracker has lost
+            start, _, duration, x, y = map(float, numbers[:5])
+            return _Fixation(eye[:1], start, duration, x, y)
+    return None
 
 
 def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
@@ -187,19 +211,28 @@ def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
         trial.name = _file_name(variable[1])
 
 
-def _loaded(how: str, rest: str) -> tuple[str, _Place | None]:
-    """The picture of a message `IMGLOAD`, and its place on the screen where the message tells it with its size."""
-    placed = None if how == "FILL" else _PLACED.match(rest)
+def _loaded(mode: str, rest: str) -> tuple[str, _Place | None]:
+    """The picture of a message `IMGLOAD`, and its place on the screen where the message tells it with its size.
+
+    Args:
+        mode: how the picture is placed, such as `FILL`, `TOP_LEFT` or `CENTER`.
+        rest: of the message: the name of the file, and perhaps x, y, width and height.
+
+    Returns:
+        The name, and the place.
+    """
+    placed = None if mode == "FILL" else _PLACED.match(rest)
     if placed is None:
         return _file_name(rest), None
-    if placed[4] is None:
-        return _file_name(placed[1]), None
-    x, y, width, height = (float(placed[number]) for number in (2, 3, 4, 5))
+    name, *numbers = placed.groups()
+    if numbers[2] is None:
+        return _file_name(name), None
+    x, y, width, height = map(float, numbers)
     if min(width, height) < 1:
-        return _file_name(placed[1]), None
-    if how == "CENTER":
-        x, y = x - width / 2, y - height / 2
-    return _file_name(placed[1]), (x, y, width, height)
+        return _file_name(name), None
+    if mode == "CENTER":  # x and y are those of the middle
+        return _file_name(name), (x - width / 2, y - height / 2, width, height)
+    return _file_name(name), (x, y, width, height)
 
 
 def _file_name(path: str) -> str:
@@ -223,7 +256,7 @@ def _of_one_eye(fixations: Sequence[_Fixation], eye: str | None) -> list[_Fixati
     return [fixation for fixation in fixations if fixation.eye == side]
 
 
-def _none(trials: Sequence[_Trial]) -> str:
+def _lack_of_fixations(trials: Sequence[_Trial]) -> str:
     """What is there instead of fixations in trials."""
     return "none in the time of a picture" if trials else "none; convert the events, too"
 
@@ -233,15 +266,19 @@ def _lost(lines: Sequence[str]) -> list[str]:
     lost = [number for number, line in enumerate(lines, start=1) if _LOST.search(line)]
     if not lost:
         return []
-    where = ", ".join(map(str, lost[:5])) + (", …" if lost[5:] else "")
-    return [f"messages or data were lost (line {where}), so pictures may be missing or wrong from there on"]
+    numbers = ", ".join(map(str, lost[:5])) + (", …" if lost[5:] else "")
+    return [f"messages or data were lost (line {numbers}), so pictures may be missing or wrong from there on"]
 
 
 def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> list[str]:
     """A sentence on trials whose fixations all lie outside the time of their pictures."""
-    empty = [trial for trial in trials if trial.views and not any(view.fixations for view in trial.views)]
     starts = np.sort([fixation.start for fixation in fixations])
-    missed = [trial for trial in empty if np.diff(np.searchsorted(starts, (trial.start, trial.end)))[0] > 0]
+    missed = []
+    for trial in trials:
+        is_empty = bool(trial.views) and not any(view.fixations for view in trial.views)
+        first, end = np.searchsorted(starts, (trial.start, trial.end))
+        if is_empty and end > first:
+            missed.append(trial)
     if not missed:
         return []
     picture = missed[0].views[0].picture

@@ -2,15 +2,15 @@
 
 import csv
 import io
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semfov.data.fixations.columns import of_source
+from semfov.data.fixations.columns import DataFrame, Row, table_of
 from semfov.data.fixations.programs import Origin, Units
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
@@ -19,15 +19,15 @@ from semfov.io.files import write_text
 
 _COLUMNS = ("picture", "subject", "x", "y")
 _SIZE = ("width", "height")
+_EDGES = ("x1", "y1", "x2", "y2")
 _MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
-_LARGEST = 1e6  # largest coordinate and side in pixels
+_FOUND = {"true": True, "false": False, "1": True, "0": False, "": None}
+_UPWARDS = ("bottom left", "centre, y up")  # origins from which y points up
 
 Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 """`(width, height)` of all frames, or of each by the name of its picture."""
-
-Line = tuple[str, Mapping[str, str]]  # the place of a line in words, and its fields by our names of the columns
 
 
 class FrameError(DataError):
@@ -35,7 +35,7 @@ class FrameError(DataError):
 
 
 def read_table(
-    source: str | PathLike[str] | Any,
+    source: str | PathLike[str] | DataFrame,
     *,
     columns: Mapping[str, str] | None = None,
     size: Size | None = None,
@@ -83,47 +83,114 @@ def read_table(
     lookup(units, get_args(Units), "unit")
     lookup(origin, get_args(Origin), "origin")
     named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
-    where, header, rows = of_source(source)
-    by_lower = {name.lower(): name for name in reversed(header)}
+    table = table_of(source)
+    by_lower = {column.lower(): column for column in reversed(table.columns)}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
-        if name not in named and name not in header and name in by_lower:
+        if name not in named and name not in table.columns and name in by_lower:
             named[name] = by_lower[name]
-    needed = (*_COLUMNS, *(() if size is not None else _SIZE))
-    missing = [named.get(name, name) for name in needed if named.get(name, name) not in header]
+    needed = _COLUMNS if size is not None else (*_COLUMNS, *_SIZE)
+    missing = [named.get(name, name) for name in needed if named.get(name, name) not in table.columns]
     if missing:
+        among = ", ".join(map(repr, table.columns))[:300]
         text = (
-            f"{where}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
-            f"{', '.join(map(repr, header))[:300]}; name them by columns={{…}}"
+            f"{table.name}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
+            f"{among}; name them by columns={{…}}"
         )
         if {*missing} & {*_SIZE}:
             raise FrameError(f"{text} or give size=")
         raise DataError(text)
-    lines = [(place, {name: row.get(named.get(name, name), "") for name in (*needed, *_MORE)}) for place, row in rows]
-    return records_of(where, lines, size, units, origin)
+    rows = []
+    for row in table.rows:
+        fields = {name: row.fields.get(named.get(name, name), "") for name in (*needed, *_MORE)}
+        rows.append(row._replace(fields=fields))
+    return records_of(table.name, rows, size, Coordinates(units, origin))
 
 
-def records_of(where: str, lines: Sequence[Line], size: Size | None, units: Units, origin: Origin) -> list[Fixations]:
-    """The records of lines, one for each scanpath, with a warning of what their coordinates look like."""
-    groups: dict[tuple[str, ...], list[Line]] = {}
+class Coordinates(NamedTuple):
+    """In which unit, and from where, a table gives points and boxes."""
+
+    units: Units
+    origin: Origin
+
+    def points(self, points: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
+        """Convert points `(n, 2)` to pixels of a frame `(width, height)`, whose centres are at integers."""
+        if self == ("pixels", "top left"):
+            return points
+        # Pixels that are counted from a corner have their centres at integers.
+        is_centred = self == ("pixels", "bottom left")
+        return self._from_corner(points + 0.5 if is_centred else points, frame) - 0.5
+
+    def box(self, edges: Sequence[float], frame: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Convert the edges of a box, x1, y1, x2 and y2, to those of pixels of a frame `(width, height)`."""
+        corners = np.array(edges, dtype=np.float64).reshape(2, 2)
+        if self != ("pixels", "top left"):
+            corners = self._from_corner(corners, frame)
+        if self.origin in _UPWARDS:
+            corners[:, 1] = corners[::-1, 1]
+        x1, y1, x2, y2 = corners.flatten().tolist()
+        return x1, y1, x2, y2
+
+    def _from_corner(self, places: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
+        """Places `(n, 2)` in pixels from the top left corner of a frame, where 0 is its edge."""
+        sides = np.array(frame, dtype=np.float64)
+        places = places * (sides if self.units == "fractions" else 1.0)
+        if self.origin in _UPWARDS:
+            places[:, 1] *= -1
+        if self.origin == "bottom left":
+            places[:, 1] += sides[1]
+        elif self.origin != "top left":
+            places += sides / 2
+        return places
+
+
+def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> list[Fixations]:
+    """Make a record of the rows of each scanpath, with a warning of what their coordinates look like.
+
+    Args:
+        table: its name, for messages.
+        rows: with the fields of `read_table` by our names.
+        size: as for `read_table`.
+        coordinates: of the points.
+
+    Returns:
+        The records, in the order in which they begin.
+
+    Raises:
+        DataError: rows do not belong together, or a field is wrong.
+    """
+    groups: dict[tuple[str, ...], list[Row]] = {}
     previous = None
-    for place, line in lines:
-        who = tuple(line[name] for name in ("picture", "subject", "target", "trial"))
-        if who in groups and who != previous and not line["trial"]:
+    for row in rows:
+        fields = row.fields
+        scanpath = tuple(fields[name] for name in ("picture", "subject", "target", "trial"))
+        if scanpath in groups and scanpath != previous and not fields["trial"]:
             raise DataError(
-                f"{where}: {place}: expected the lines of a scanpath to follow each other, got those of "
-                f"{line['subject']!r} in {line['picture']!r} again; sort them, or add a column `trial` that tells "
+                f"{row}: expected the lines of a scanpath to follow each other, got those of "
+                f"{fields['subject']!r} in {fields['picture']!r} again; sort them, or add a column `trial` that tells "
                 "viewings apart"
             )
-        groups.setdefault(who, []).append((place, line))
-        previous = who
-    records = [_record(where, group, size, units, origin) for group in groups.values()]
-    return warn_of_frames(where, records, units=units == "pixels", stacklevel=4)
+        groups.setdefault(scanpath, []).append(row)
+        previous = scanpath
+    records = [_record(group, size, coordinates) for group in groups.values()]
+    return warn_of_frames(table, records, units=coordinates.units == "pixels", stacklevel=4)
 
 
 def named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
-    """The names of columns in a source by ours, of which some are known."""
-    fits = columns is None or (isinstance(columns, Mapping) and all(isinstance(each, str) for each in columns.values()))
-    check(fits, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
+    """Check the names of columns that a user gives.
+
+    Args:
+        columns: names in a source by ours; None for none.
+        known: our names.
+
+    Returns:
+        The names in a source by ours.
+
+    Raises:
+        InputError: it is no such mapping, or one of our names is not known.
+    """
+    are_names = isinstance(columns, Mapping) and all(isinstance(name, str) for name in columns.values())
+    expected = "names of the source by ours, such as {'x': 'FPOGX'}"
+    check(columns is None or are_names, "columns", expected, columns)
     return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
 
 
@@ -145,107 +212,87 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow([*_COLUMNS, *_SIZE, *_MORE])
     viewings: dict[tuple[str, str, str | None], int] = {}
-    for each in fixations:
-        times = [""] * len(each) if each.durations is None else each.durations.tolist()
-        box = [""] * 4 if each.box is None else each.box
-        found = "" if each.found is None else str(each.found).lower()
-        who = each.picture, each.subject, each.target
-        viewings[who] = trial = viewings.get(who, 0) + 1
-        for (x, y), time in zip(each.points.tolist(), times, strict=True):
-            rows.writerow([each.picture, each.subject, x, y, *each.size, each.target or "", time, *box, found, trial])
+    for record in fixations:
+        times = [""] * len(record) if record.durations is None else record.durations.tolist()
+        box = [""] * 4 if record.box is None else record.box
+        found = "" if record.found is None else str(record.found).lower()
+        scanpath = record.picture, record.subject, record.target
+        trial = viewings.get(scanpath, 0) + 1
+        viewings[scanpath] = trial
+        shared = [*box, found, trial]
+        for (x, y), time in zip(record.points.tolist(), times, strict=True):
+            rows.writerow([record.picture, record.subject, x, y, *record.size, record.target or "", time, *shared])
     write_text(Path(path), text.getvalue())
 
 
-def _record(where: str, group: Sequence[Line], size: Size | None, units: Units, origin: Origin) -> Fixations:
-    place, line = group[0]
-    check_data(line["picture"] != "", f"{where}: {place}, picture", "the name of a picture", "nothing")
-    for name in (*(() if size is not None else _SIZE), "x1", "y1", "x2", "y2", "found"):
-        at, other = next((each for each in group if each[1][name] != line[name]), group[0])
-        expected = f"{line[name]!r}, as in {place}"
-        check_data(other is line, f"{where}: {at}, {name}", expected, repr(other[name]))
-    frame = _frame(where, place, line, size)
-    points = np.array([[_number(where, at, row, name) for name in ("x", "y")] for at, row in group])
-    times = [_maybe(where, at, row, "duration") for at, row in group]
-    lacking = next((at for (at, _), time in zip(group, times, strict=True) if time is None), place)
-    timed = None not in times or {*times} == {None}
-    check_data(timed, f"{where}: {lacking}, duration", "a number, as in other lines of the scanpath", "nothing")
-    edges = [_maybe(where, place, line, name) for name in ("x1", "y1", "x2", "y2")]
-    whole = None not in edges or {*edges} == {None}
-    check_data(whole, f"{where}: {place}", "all of x1, y1, x2 and y2, or none", "some")
-    box: tuple[float, float, float, float] | None = None
-    if None not in edges:
-        corners = _placed(np.array(edges, dtype=np.float64).reshape(2, 2), frame, units, origin, edges=True)
-        if origin in ("bottom left", "centre, y up"):
-            corners[:, 1] = corners[::-1, 1]
-        x1, y1, x2, y2 = corners.flatten().tolist()
-        box = x1, y1, x2, y2
-    words = {"true": True, "false": False, "1": True, "0": False, "": None}
-    found = line["found"].lower()
-    check_data(found in words, f"{where}: {place}, found", "true, false or nothing", repr(found))
+def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> Fixations:
+    """The record of the rows of a scanpath."""
+    first = rows[0]
+    fields = first.fields
+    check_data(fields["picture"] != "", f"{first}, picture", "the name of a picture", "nothing")
+    for name in (*(() if size is not None else _SIZE), *_EDGES, "found"):
+        _check_same(rows, name)
+    frame = _frame(first, size)
+    points = np.array([[row.number("x"), row.number("y")] for row in rows])
+    durations = _durations(rows)
+    box = _box(first, frame, coordinates)
+    found = fields["found"].lower()
+    check_data(found in _FOUND, f"{first}, found", "true, false or nothing", repr(found))
     try:
         return Fixations(
-            picture=line["picture"],
-            subject=line["subject"],
-            points=_placed(points, frame, units, origin),
+            picture=fields["picture"],
+            subject=fields["subject"],
+            points=coordinates.points(points, frame),
             size=frame,
-            durations=None if None in times else np.array(times, dtype=np.float64),
-            target=line["target"] or None,
+            durations=durations,
+            target=fields["target"] or None,
             box=box,
-            found=words[found],
+            found=_FOUND[found],
         )
     except InputError as error:
-        raise DataError(f"{where}: {place}, {error}") from None
+        raise DataError(f"{first}, {error}") from None
 
 
-def _frame(where: str, place: str, line: Mapping[str, str], size: Size | None) -> tuple[int, int]:
+def _check_same(rows: Sequence[Row], name: str) -> None:
+    """Raise `DataError` unless a field is the same in all rows of a scanpath."""
+    first = rows[0]
+    for row in rows:
+        if row.fields[name] != first.fields[name]:
+            expected = f"{first.fields[name]!r}, as in {first.place}"
+            raise DataError(f"{row}, {name}: expected {expected}, got {row.fields[name]!r}")
+
+
+def _durations(rows: Sequence[Row]) -> NDArray[np.float64] | None:
+    """Durations of the fixations of a scanpath in ms, `(n,)`; None where no row has one."""
+    times = [row.number_or_none("duration") for row in rows]
+    if all(time is None for time in times):
+        return None
+    for row, time in zip(rows, times, strict=True):
+        expected = "a number, as in other lines of the scanpath"
+        check_data(time is not None, f"{row}, duration", expected, "nothing")
+    return np.array(times, dtype=np.float64)
+
+
+def _box(row: Row, frame: tuple[int, int], coordinates: Coordinates) -> tuple[float, float, float, float] | None:
+    """The box of the target, in pixels of the frame; None where a row has none."""
+    edges = [row.number_or_none(name) for name in _EDGES]
+    numbers = [edge for edge in edges if edge is not None]
+    check_data(len(numbers) in (0, len(_EDGES)), row, "all of x1, y1, x2 and y2, or none", "some")
+    return coordinates.box(numbers, frame) if numbers else None
+
+
+def _frame(row: Row, size: Size | None) -> tuple[int, int]:
     """Size of the frame of a scanpath."""
+    sides: Sequence[float]
     if size is None:
-        sides = [_number(where, place, line, name) for name in _SIZE]
+        sides = [row.number(name) for name in _SIZE]
     elif isinstance(size, Mapping):
-        check(line["picture"] in size, "size", f"a size of {line['picture']!r}", "none")
-        sides = [*size[line["picture"]]]
+        picture = row.fields["picture"]
+        check(picture in size, "size", f"a size of {picture!r}", "none")
+        sides = [*size[picture]]
     else:
         check(isinstance(size, tuple | list | np.ndarray), "size", "(width, height) in pixels", size)
         sides = [*size]
-    whole = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
-    check_data(whole, f"{where}: {place}, size", "a width and a height in whole pixels", sides)
+    are_pixels = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
+    check_data(are_pixels, f"{row}, size", "a width and a height in whole pixels", sides)
     return int(sides[0]), int(sides[1])
-
-
-def _placed(points: Any, frame: tuple[int, int], units: Units, origin: Origin, *, edges: bool = False) -> Any:
-    """Points, or edges of pixels, in pixels from the top left, given in a unit from an origin."""
-    if units == "pixels" and origin == "top left":
-        return points
-    sides = np.array(frame, dtype=np.float64)
-    # Between here and the end 0 is an edge. Pixels that are counted from a corner have their centres at integers.
-    counted = units == "pixels" and origin == "bottom left" and not edges
-    places = (points + 0.5 if counted else points) * (sides if units == "fractions" else 1.0)
-    if origin in ("bottom left", "centre, y up"):
-        places[:, 1] *= -1
-    if origin == "bottom left":
-        places[:, 1] += sides[1]
-    elif origin != "top left":
-        places += sides / 2
-    return places if edges else places - 0.5
-
-
-def _number(where: str, at: str, line: Mapping[str, str], name: str) -> float:
-    value = _maybe(where, at, line, name)
-    if value is None:
-        raise DataError(f"{where}: {at}, {name}: expected a number, got nothing")
-    if abs(value) > _LARGEST:
-        raise DataError(f"{where}: {at}, {name}: expected a number up to {_LARGEST:g}, got {value:g}")
-    return value
-
-
-def _maybe(where: str, at: str, line: Mapping[str, str], name: str) -> float | None:
-    text = line.get(name)
-    if not text:
-        return None
-    try:
-        value = float(text.replace("_", "?"))  # what Python takes for a number
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DataError(f"{where}: {at}, {name}: expected a number, got {text[:40]!r}")
-    return value
