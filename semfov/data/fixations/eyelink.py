@@ -19,9 +19,11 @@ from semfov.io.files import read_text
 _MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.*)$")
 """The time of a message, the milliseconds by which it is late, and its text."""
 
+# Messages of a trial: a picture is loaded, its name, and the screen is cleared.
 _LOAD = re.compile(r"^!V\s+IMGLOAD\s+(\S+)\s+(.+?)\s*$", re.IGNORECASE)
 _VARIABLE = re.compile(r"^!V\s+TRIAL_VAR\s+(?:image|picture|img|stimulus)\s+(.+?)\s*$", re.IGNORECASE)
 _CLEAR = re.compile(r"^!V\s+CLEAR\b", re.IGNORECASE)
+# What follows `IMGLOAD` and its mode: a name, x and y, and perhaps width and height.
 _PLACED = re.compile(r"^(.+?)\s+(-?[\d.]+)\s+(-?[\d.]+)(?:\s+([\d.]+)\s+([\d.]+))?$")
 _SIDE = r"[\s,]+(-?[\d.]+)"
 _FRAME = re.compile(rf"^MSG\s+\S+\s+(?:DISPLAY|GAZE)_COORDS\s*=?{4 * _SIDE}")
@@ -138,9 +140,10 @@ def read_eyelink(
 def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:
     """The screen as `(x, y, width, height)`, in the pixels in which points are counted; `size` overrides the file's."""
     frame = next((match for line in lines if (match := _FRAME.match(line))), None)
+    if frame is None and size is None:
+        raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
     if frame is None:
-        check_data(size is not None, path, "a message DISPLAY_COORDS", "none; give size=")
-        return (0.0, 0.0, *(size or (0, 0)))
+        return 0.0, 0.0, *size
     left, top, right, bottom = map(float, frame.groups())
     # The message has the first and the last pixel.
     width, height = (round(right - left) + 1, round(bottom - top) + 1) if size is None else size

@@ -8,31 +8,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations, by_picture
 from semfov.data.fixations.suspicions import warn_of_frames
-from semfov.errors import InputError, check, check_data
+from semfov.errors import DataError, InputError, check, check_data
 from semfov.io.files import read_json, write_text
 from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_content
 
-_PIXELS = Array(Number(low=-1e6, high=1e6), least=1)
+_COORDINATE = Number(low=-1e6, high=1e6)
+_COORDINATES = Array(_COORDINATE)
+_PIXELS = Array(_COORDINATE, least=1)
 _MILLISECONDS = Array(Number(low=0, high=1e9))
 _SIDE = Number(above=0, high=1e6)
+_BOX = Maybe(Array(_COORDINATE, 4))
+
 _SCREEN = 1680, 1050  # of COCO-Search18
-_BOX = Maybe(Array(Number(low=-1e6, high=1e6), 4))
+
+_Edges = tuple[float, float, float, float]
 
 _COCOSEARCH = Array(
     Object(
         {
-            **{"name": Text(), "task": Text(), "X": _PIXELS, "Y": _PIXELS, "T": _MILLISECONDS, "bbox": _BOX},
-            **dict.fromkeys(("width", "height"), _SIDE),
+            "name": Text(),
+            "task": Text(),
+            "X": _PIXELS,
+            "Y": _PIXELS,
+            "T": _MILLISECONDS,
+            "bbox": _BOX,
+            "width": _SIDE,
+            "height": _SIDE,
         },
         others=Json(),
         required=("name", "X", "Y"),
     )
 )
-_SOME = Array(Number(low=-1e6, high=1e6))
-_OSIE = Object(others=Array(Object({"x": _SOME, "y": _SOME, "duration_ms": _MILLISECONDS}, required=("x", "y"))))
+_OSIE = Object(
+    others=Array(
+        Object({"x": _COORDINATES, "y": _COORDINATES, "duration_ms": _MILLISECONDS}, required=("x", "y")),
+    )
+)
 _RUARTE = Object(
     others=Object(
         {
@@ -86,25 +101,23 @@ def read_cocosearch(
     >>> scanpath.target, scanpath.points.tolist()
     ('cup', [[840.0, 525.0], [700.5, 300.0]])
     """
-    path, scanpaths = Path(path), []
+    path = Path(path)
+    scanpaths = []
     for number, trial in enumerate(_read(path, _COCOSEARCH)):
-        box = trial.get("bbox")
-        name = f"[{number}] ({trial['name']})"
-        record = _record(
-            path,
-            name,
-            trial,
+        name = f"{path}: [{number}] ({trial['name']})"
+        points, durations = _points_and_durations(name, trial, ("X", "Y", "T"))
+        scanpath = Fixations(
             picture=trial["name"],
             subject=str(trial.get("subject", path.stem)),
-            size=_frame(f"{path}: {name}", trial, screen),
+            points=points,
+            size=_frame(name, trial, screen),
+            durations=durations,
             target=trial.get("task"),
-            box=None if box is None else tuple(map(float, (box[0], box[1], box[0] + box[2], box[1] + box[3]))),
-            found=_flag(f"{path}: {name}.fixOnTarget", trial.get("fixOnTarget")),
+            box=_edges_of(trial.get("bbox")),
+            found=_flag(f"{name}.fixOnTarget", trial.get("fixOnTarget")),
         )
-        scanpaths.append(record)
-    if sizes is not None:
-        scanpaths = [each.in_picture(sizes[each.picture]) for each in scanpaths if each.picture in sizes]
-    return warn_of_frames(path, scanpaths)
+        scanpaths.append(scanpath)
+    return warn_of_frames(path, _in_pictures(scanpaths, sizes))
 
 
 def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
@@ -123,18 +136,18 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
     'cup'
     """
     trials = []
-    for each in fixations:
-        x1, y1, x2, y2 = each.box or (0.0, 0.0, 0.0, 0.0)
+    for scanpath in fixations:
+        x1, y1, x2, y2 = scanpath.box or (0.0, 0.0, 0.0, 0.0)
         trial = {
-            "name": each.picture,
-            "subject": each.subject,
-            "task": each.target,
-            "bbox": None if each.box is None else [x1, y1, x2 - x1, y2 - y1],
-            "X": each.points[:, 0].tolist(),
-            "Y": each.points[:, 1].tolist(),
-            "length": len(each),
-            "T": None if each.durations is None else each.durations.tolist(),
-            "fixOnTarget": each.found,
+            "name": scanpath.picture,
+            "subject": scanpath.subject,
+            "task": scanpath.target,
+            "bbox": None if scanpath.box is None else [x1, y1, x2 - x1, y2 - y1],
+            "X": scanpath.points[:, 0].tolist(),
+            "Y": scanpath.points[:, 1].tolist(),
+            "length": len(scanpath),
+            "T": None if scanpath.durations is None else scanpath.durations.tolist(),
+            "fixOnTarget": scanpath.found,
         }
         trials.append({key: value for key, value in trial.items() if value is not None})
     write_text(path, json.dumps(trials) + "\n")
@@ -166,12 +179,14 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
     >>> scanpath.picture, scanpath.subject, scanpath.durations.tolist()
     ('1001.jpg', '1', [210.0, 180.0])
     """
-    path, scanpaths = Path(path), []
+    path = Path(path)
+    scanpaths = []
     for picture, people in _read(path, _OSIE).items():
         for number, person in enumerate(people):
-            who = {"picture": picture, "subject": str(number + 1), "size": size}
             if person["x"] or person["y"]:
-                scanpaths.append(_record(path, f"{picture}[{number}]", person, ("x", "y", "duration_ms"), **who))
+                name = f"{path}: {picture}[{number}]"
+                points, durations = _points_and_durations(name, person, ("x", "y", "duration_ms"))
+                scanpaths.append(Fixations(picture, str(number + 1), points, size, durations))
     return warn_of_frames(path, scanpaths)
 
 
@@ -192,13 +207,15 @@ def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> Non
     ...     len(read_osie(Path(folder, "osie.json"))[0])
     3
     """
-    check(len({each.size for each in fixations}) <= 1, "fixations", "pictures of one size", "several sizes")
-    pictures: dict[str, list[dict[str, Any]]] = {}
+    check(len({scanpath.size for scanpath in fixations}) <= 1, "fixations", "pictures of one size", "several sizes")
+    pictures: dict[str, list[dict[str, list[float]]]] = {}
     for picture, people in by_picture(fixations).items():
-        for each in people:
-            times = {} if each.durations is None else {"duration_ms": each.durations.tolist()}
-            person = {"x": each.points[:, 0].tolist(), "y": each.points[:, 1].tolist(), **times}
-            pictures.setdefault(picture, []).append(person)
+        pictures[picture] = []
+        for scanpath in people:
+            person = {"x": scanpath.points[:, 0].tolist(), "y": scanpath.points[:, 1].tolist()}
+            if scanpath.durations is not None:
+                person["duration_ms"] = scanpath.durations.tolist()
+            pictures[picture].append(person)
     write_text(path, json.dumps(pictures) + "\n")
 
 
@@ -239,26 +256,25 @@ def read_ruarte(
     >>> scanpath.target, scanpath.points.tolist()
     ('cup', [[24.5, 24.5], [424.5, 624.5]])
     """
-    path, scanpaths = Path(path), []
-    for name, trial in _read(path, _RUARTE).items():
+    path = Path(path)
+    scanpaths = []
+    for picture, trial in _read(path, _RUARTE).items():
+        name = f"{path}: {picture}"
+        points, durations = _points_and_durations(name, trial, ("X", "Y", "T"))
         # In cells, the last row and column are inside the box, which ends where the next cell begins.
-        cells = trial.get("receptive_width") == trial.get("receptive_height") == 1
-        box = trial.get("target_bbox")
-        record = _record(
-            path,
-            name,
-            trial,
-            picture=name,
+        is_in_cells = trial.get("receptive_width") == trial.get("receptive_height") == 1
+        scanpath = Fixations(
+            picture=picture,
             subject=subject if subject is not None else trial.get("subject", path.stem),
+            points=points,
             size=(int(trial["image_width"]), int(trial["image_height"])),
+            durations=durations,
             target=trial.get("target_object"),
-            box=None if box is None else tuple(map(float, (box[1], box[0], box[3] + cells, box[2] + cells))),
-            found=_flag(f"{path}: {name}.target_found", trial.get("target_found")),
+            box=_box_of_rows(trial.get("target_bbox"), is_in_cells),
+            found=_flag(f"{name}.target_found", trial.get("target_found")),
         )
-        scanpaths.append(record if screen is None else record.resized(screen))
-    if sizes is not None:
-        scanpaths = [each.in_picture(sizes[each.picture]) for each in scanpaths if each.picture in sizes]
-    return warn_of_frames(path, scanpaths)
+        scanpaths.append(scanpath if screen is None else scanpath.resized(screen))
+    return warn_of_frames(path, _in_pictures(scanpaths, sizes))
 
 
 def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
@@ -279,25 +295,25 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
     3
     """
     trials = {}
-    for each in fixations:
+    for scanpath in fixations:
         expected = "one scanpath for each picture"
-        check(each.picture not in trials, "fixations", expected, f"several for {each.picture}")
-        width, height = each.size
-        x1, y1, x2, y2 = each.box or (0.0, 0.0, 0.0, 0.0)
+        check(scanpath.picture not in trials, "fixations", expected, f"several for {scanpath.picture}")
+        width, height = scanpath.size
+        x1, y1, x2, y2 = scanpath.box or (0.0, 0.0, 0.0, 0.0)
         trial = {
-            "subject": each.subject,
+            "subject": scanpath.subject,
             "image_height": height,
             "image_width": width,
             "screen_height": height,
             "screen_width": width,
-            "X": each.points[:, 0].tolist(),
-            "Y": each.points[:, 1].tolist(),
-            "T": None if each.durations is None else each.durations.tolist(),
-            "target_object": each.target,
-            "target_bbox": None if each.box is None else [y1, x1, y2, x2],
-            "target_found": each.found,
+            "X": scanpath.points[:, 0].tolist(),
+            "Y": scanpath.points[:, 1].tolist(),
+            "T": None if scanpath.durations is None else scanpath.durations.tolist(),
+            "target_object": scanpath.target,
+            "target_bbox": None if scanpath.box is None else [y1, x1, y2, x2],
+            "target_found": scanpath.found,
         }
-        trials[each.picture] = {key: value for key, value in trial.items() if value is not None}
+        trials[scanpath.picture] = {key: value for key, value in trial.items() if value is not None}
     write_text(path, json.dumps(trials) + "\n")
 
 
@@ -330,31 +346,70 @@ def _read(path: Path, kind: Json) -> Any:
     return value
 
 
-def _flag(where: str, value: Any) -> bool | None:
+def _flag(name: str, value: object) -> bool | None:
     """A boolean of a file, or 1 or 0 in its place."""
-    check_data(value is None or value in (True, False), where, "true or false", repr(value))
+    check_data(value is None or value in (True, False), name, "true or false", repr(value))
     return None if value is None else bool(value)
 
 
-def _frame(where: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) -> tuple[int, int]:
+def _edges_of(box: Sequence[float] | None) -> _Edges | None:
+    """The edges x1, y1, x2 and y2 of a box `[x, y, width, height]`."""
+    if box is None:
+        return None
+    x, y, width, height = box
+    return float(x), float(y), float(x + width), float(y + height)
+
+
+def _box_of_rows(box: Sequence[float] | None, is_in_cells: bool) -> _Edges | None:
+    """The edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`."""
+    if box is None:
+        return None
+    top, left, bottom, right = box
+    return float(left), float(top), float(right + is_in_cells), float(bottom + is_in_cells)
+
+
+def _in_pictures(scanpaths: list[Fixations], sizes: Mapping[str, tuple[int, int]] | None) -> list[Fixations]:
+    """Scanpaths in pixels of their pictures, without those of other pictures; None leaves all as they are."""
+    if sizes is None:
+        return scanpaths
+    return [scanpath.in_picture(sizes[scanpath.picture]) for scanpath in scanpaths if scanpath.picture in sizes]
+
+
+def _frame(name: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) -> tuple[int, int]:
     """The frame of a trial of COCO-Search18: its own, else the screen."""
-    own = trial.get("width"), trial.get("height")
-    if own == (None, None):
+    width = trial.get("width")
+    height = trial.get("height")
+    if width is None and height is None:
         return _SCREEN if screen is None else screen
-    check_data(None not in own, where, "both a width and a height, or neither", own)
-    frame = int(own[0]), int(own[1])  # type: ignore[arg-type]  # which are not None
-    check_data(frame == own, where, "a width and a height in whole pixels", own)
-    check_data(screen is None or (*screen,) == frame, where, f"{screen}, which is given", frame)
+    if width is None or height is None:
+        raise DataError(f"{name}: expected both a width and a height, or neither, got {(width, height)}")
+    frame = int(width), int(height)
+    check_data(frame == (width, height), name, "a width and a height in whole pixels", (width, height))
+    check_data(screen is None or (*screen,) == frame, name, f"{screen}, which is given", frame)
     return frame
 
 
-def _record(
-    path: Path, name: str, trial: Mapping[str, Any], keys: tuple[str, str, str] = ("X", "Y", "T"), **fields: Any
-) -> Fixations:
-    """The record of a trial with lists of x, y and durations; a scanpath that was cut may have more durations."""
-    x, y, times = trial[keys[0]], trial[keys[1]], trial.get(keys[2])
-    count, most = len(x), len(x) if times is None else len(times)
-    check_data(count == len(y), f"{path}: {name}", "as many Y as X", f"{count} X and {len(y)} Y")
-    check_data(most >= count, f"{path}: {name}.{keys[2]}", f"durations of {count} fixations", most)
-    durations = None if times is None else np.asarray(times[:count], dtype=np.float64)
-    return Fixations(points=np.array([*zip(x, y, strict=True)], dtype=np.float64), durations=durations, **fields)
+def _points_and_durations(
+    name: str, trial: Mapping[str, Any], keys: tuple[str, str, str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """The points and durations of a trial.
+
+    Args:
+        name: of the trial, for messages.
+        trial: with lists of x, y and durations in ms.
+        keys: of these lists.
+
+    Returns:
+        Points `(n, 2)`, and durations `(n,)`; None without any.
+
+    Raises:
+        DataError: the lists do not belong together.
+    """
+    x, y, times = (trial.get(key) for key in keys)
+    check_data(len(x) == len(y), name, "as many Y as X", f"{len(x)} X and {len(y)} Y")
+    points = np.array([*zip(x, y, strict=True)], dtype=np.float64)
+    if times is None:
+        return points, None
+    # A scanpath that was cut may have more durations.
+    check_data(len(times) >= len(x), f"{name}.{keys[2]}", f"durations of {len(x)} fixations", len(times))
+    return points, np.asarray(times[: len(x)], dtype=np.float64)

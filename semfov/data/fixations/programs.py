@@ -3,7 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 Units = Literal["pixels", "fractions"]
 """Unit of the coordinates of a table: pixels, whose centres are at integers, or fractions of the sides of the frame."""
@@ -25,6 +25,7 @@ TIMES = {
 }
 """Milliseconds of a unit of time by the words in the names of columns."""
 
+# How a name ends in a unit: in brackets, perhaps after the frame, or after an underscore.
 _BRACKET = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 _ENDING = re.compile(r"_(px|norm|ms|msec|us|ns)$", re.IGNORECASE)
 _FRAME = re.compile(r"^(mcs|dacs|ucs|hucs|rcs)\s*")
@@ -58,12 +59,16 @@ class Column(NamedTuple):
         Returns:
             The column.
         """
-        end = _BRACKET.search(name) or _ENDING.search(name)
-        plain = name if end is None else name[: end.start()]
-        words = "" if end is None else unicodedata.normalize("NFKC", end[1]).lower().strip()  # of two signs for micro
-        frame = _FRAME.match(words)
-        unit = words if frame is None else words[frame.end() :]
-        return cls(name, re.sub(r"[^a-z0-9]", "", plain.lower()), "" if frame is None else frame[1], unit)
+        plain = name
+        frame = ""
+        unit = ""
+        if end := _BRACKET.search(name) or _ENDING.search(name):
+            plain = name[: end.start()]
+            unit = unicodedata.normalize("NFKC", end[1]).lower().strip()  # there are two signs for micro
+            if prefix := _FRAME.match(unit):
+                frame = prefix[1]
+                unit = unit[prefix.end() :]
+        return cls(name, re.sub(r"[^a-z0-9]", "", plain.lower()), frame, unit)
 
 
 class Program(NamedTuple):
@@ -113,8 +118,8 @@ class Program(NamedTuple):
             Whether it has what the program's tables have, and nothing that they lack.
         """
         keys = {column.key for column in columns}
-        placed = all(self.of_point(key, columns) for key in self.point)
-        return placed and keys.issuperset(self.needs) and keys.isdisjoint(self.lacks)
+        has_points = all(self.of_point(key, columns) for key in self.point)
+        return has_points and keys.issuperset(self.needs) and keys.isdisjoint(self.lacks)
 
     def of_point(self, key: str, columns: Sequence[Column]) -> list[Column]:
         """Find the columns of x or of y, in any unit.
@@ -130,61 +135,54 @@ class Program(NamedTuple):
 
 
 _TRUE = ("true", "1")
-_TOBII: dict[str, Any] = {
-    "point": ("fixationpointx", "fixationpointy"),
-    "duration": ("gazeeventduration", "eyemovementeventduration"),
-    "subject": ("participantname",),
-    "trial": ("recordingname",),
-}
-_PRO_LAB: dict[str, Any] = {
-    **_TOBII,
-    "picture": ("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
-    "number": ("eyemovementtypeindex",),
-    "keep": ("eyemovementtype", ("fixation",)),
-}
-_CLOUD: dict[str, Any] = {
-    "point": ("fixationx", "fixationy"),
-    "subject": ("recordingid",),
-    "trial": ("sectionid",),
-    "number": ("fixationid",),
-}
-_PLAYER: dict[str, Any] = {"point": ("normposx", "normposy"), "units": "fractions", "origin": "bottom left"}
+_TOBII = Program(
+    "Tobii",
+    point=("fixationpointx", "fixationpointy"),
+    duration=("gazeeventduration", "eyemovementeventduration"),
+    subject=("participantname",),
+    trial=("recordingname",),
+)
+_PRO_LAB = _TOBII._replace(
+    name="Tobii Pro Lab",
+    picture=("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
+    number=("eyemovementtypeindex",),
+    keep=("eyemovementtype", ("fixation",)),
+)
+_CLOUD = Program(
+    "Pupil Cloud",
+    point=("fixationx", "fixationy"),
+    subject=("recordingid",),
+    trial=("sectionid",),
+    number=("fixationid",),
+    needs=("fixationid",),
+)
+_PLAYER = Program("Pupil Player", point=("normposx", "normposy"), units="fractions", origin="bottom left")
 
 PROGRAMS = (
-    Program(
-        "Tobii Pro Lab",
+    _PRO_LAB._replace(
         frames=("mcs",),
         size=("presentedmediawidth", "presentedmediaheight"),
         needs=("presentedmediawidth", "presentedmediaheight"),
-        **_PRO_LAB,
     ),
-    Program(
-        "Tobii Pro Lab",
-        frames=("dacs", ""),
-        size=("recordingresolutionwidth", "recordingresolutionheight"),
-        **_PRO_LAB,
-    ),
-    Program(
-        "Tobii Studio",
+    _PRO_LAB._replace(frames=("dacs", ""), size=("recordingresolutionwidth", "recordingresolutionheight")),
+    _TOBII._replace(
+        name="Tobii Studio",
         frames=("mcs", ""),
         picture=("medianame",),
         number=("fixationindex",),
         size=("mediawidth", "mediaheight"),
         keep=("gazeeventtype", ("fixation",)),
         needs=("gazeeventtype",),
-        **_TOBII,
     ),
-    Program("Tobii Pro Lab", frames=("mcs",), **_PRO_LAB),
-    Program(
-        "Pupil Cloud",
+    _PRO_LAB._replace(frames=("mcs",)),
+    _CLOUD._replace(
         keep=("fixationdetectedinreferenceimage", _TRUE),
         needs=("fixationdetectedinreferenceimage",),
-        **_CLOUD,
     ),
-    Program("Pupil Cloud", keep=("fixationdetectedonsurface", _TRUE), needs=("fixationdetectedonsurface",), **_CLOUD),
-    Program("Pupil Cloud", needs=("fixationid",), **_CLOUD),
-    Program("Pupil Player", number=("fixationid",), keep=("onsurf", _TRUE), needs=("onsurf", "fixationid"), **_PLAYER),
-    Program("Pupil Player", number=("id",), needs=("dispersion",), lacks=("onsurf",), **_PLAYER),
+    _CLOUD._replace(keep=("fixationdetectedonsurface", _TRUE), needs=("fixationdetectedonsurface",)),
+    _CLOUD,
+    _PLAYER._replace(number=("fixationid",), keep=("onsurf", _TRUE), needs=("onsurf", "fixationid")),
+    _PLAYER._replace(number=("id",), needs=("dispersion",), lacks=("onsurf",)),
     Program(
         "PsychoPy",
         ("averagegazex", "averagegazey"),
@@ -245,4 +243,7 @@ def program_of(columns: Sequence[Column]) -> Program | None:
     Returns:
         The program; None where no program has such columns.
     """
-    return next((each for each in PROGRAMS if each.fits(columns)), None)
+    for program in PROGRAMS:
+        if program.fits(columns):
+            return program
+    return None

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations
 from semfov.errors import check, needing
@@ -31,23 +32,24 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
     """
     with needing("pysaliency", "to_pysaliency"):
         from pysaliency import FixationTrains
-    number = {name: index for index, name in enumerate(pictures)}
-    unknown = [each.picture for each in fixations if each.picture not in number]
+    stimuli = {name: index for index, name in enumerate(pictures)}
+    unknown = [record.picture for record in fixations if record.picture not in stimuli]
     check(not unknown, "pictures", "all pictures of the fixations", f"none named {unknown[:1]}")
-    onsets = [
-        np.arange(len(each), dtype=np.float64)
-        if each.durations is None
-        else (np.cumsum(each.durations) - each.durations) / 1000
-        for each in fixations
-    ]
-    people = {name: index for index, name in enumerate(sorted({each.subject for each in fixations}))}
+    people = {name: index for index, name in enumerate(sorted({record.subject for record in fixations}))}
     return FixationTrains.from_fixation_trains(
-        xs=[each.points[:, 0] + 0.5 for each in fixations],
-        ys=[each.points[:, 1] + 0.5 for each in fixations],
-        ts=onsets,
-        ns=[number[each.picture] for each in fixations],
-        subjects=[people[each.subject] for each in fixations],
+        xs=[record.points[:, 0] + 0.5 for record in fixations],
+        ys=[record.points[:, 1] + 0.5 for record in fixations],
+        ts=[_onsets(record) for record in fixations],
+        ns=[stimuli[record.picture] for record in fixations],
+        subjects=[people[record.subject] for record in fixations],
     )
+
+
+def _onsets(record: Fixations) -> NDArray[np.float64]:
+    """When each fixation begins, in seconds; its number where durations are not known, `(n,)`."""
+    if record.durations is None:
+        return np.arange(len(record), dtype=np.float64)
+    return (np.cumsum(record.durations) - record.durations) / 1000
 
 
 def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> list[Fixations]:
@@ -65,10 +67,12 @@ def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tu
 
         fixations = from_pysaliency(trains, ["1001.jpg", "1002.jpg"], {"1001.jpg": (800, 600), "1002.jpg": (800, 600)})
     """
-    scanpaths = []
+    records = []
     columns = (trains.train_xs, trains.train_ys, trains.train_ns, trains.train_subjects)
     for xs, ys, n, subject in zip(*columns, strict=True):
         points = np.stack([np.asarray(xs, dtype=np.float64), np.asarray(ys, dtype=np.float64)], axis=1) - 0.5
         picture = pictures[int(n)]
-        scanpaths.append(Fixations(picture, str(subject), points[np.isfinite(points).all(1)], sizes[picture]))
-    return scanpaths
+        # The trains are as long as the longest one, filled with NaN.
+        is_fixation = np.isfinite(points).all(1)
+        records.append(Fixations(picture, str(subject), points[is_fixation], sizes[picture]))
+    return records

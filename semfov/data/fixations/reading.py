@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from semfov.data.fixations.columns import DataFrame
 from semfov.data.fixations.exports import table_reader
 from semfov.data.fixations.eyelink import read_eyelink
 from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
@@ -15,13 +16,17 @@ from semfov.errors import DataError, InputError, check, check_options
 from semfov.io.files import read_text
 
 _Reader = Callable[..., list[Fixations]]
-DATA_SETS: dict[_Reader, str] = {read_cocosearch: "COCO-Search18", read_osie: "OSIE", read_ruarte: "Ruarte and others"}
+DATA_SETS: dict[_Reader, str] = {
+    read_cocosearch: "COCO-Search18",
+    read_osie: "OSIE",
+    read_ruarte: "Ruarte and others",
+}
 """Readers of JSON, with the data set whose form they read."""
 _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 """How a file of JSON begins: with a list, with an object whose first value is a list, or with another object."""
 
 
-def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fixations]:
+def read_fixations(source: str | PathLike[str] | DataFrame, **options: Any) -> list[Fixations]:
     r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
 
     Files `.asc` are those of EyeLink (`read_eyelink`), files `.json` those of COCO-Search18, OSIE, or Ruarte and
@@ -49,16 +54,28 @@ def read_fixations(source: str | PathLike[str] | Any, **options: Any) -> list[Fi
     return read_by(reader_of(source, options.get("columns")), source, options)
 
 
-def read_by(reader: _Reader, source: Any, options: dict[str, Any]) -> list[Fixations]:
-    """The records that a reader gives, if it has these options (`read_fixations`)."""
-    if reader in DATA_SETS:
-        name = DATA_SETS[reader]
-        if "size" in options and reader is not read_osie:
-            has = f"none for {source}, a file of {name}, whose frame is that of each trial"
-            check(reader is read_cocosearch, "size", has, options["size"])
-            options = {"screen": options["size"], **{key: each for key, each in options.items() if key != "size"}}
-    shown = source if isinstance(source, str | PathLike) else "it"
-    check_options(options, [*signature(reader).parameters][1:], f"{reader.__name__}, which reads {shown}")
+def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: Mapping[str, object]) -> list[Fixations]:
+    """Read a source by a reader, if it has these options.
+
+    Args:
+        reader: chosen by `reader_of`.
+        source: the file, or a `pandas.DataFrame`.
+        options: arguments of the reader; `size` is also the screen of a file of COCO-Search18.
+
+    Returns:
+        One record for each scanpath.
+
+    Raises:
+        InputError: the reader has no such argument.
+        DataError: the content is not of its form.
+    """
+    if "size" in options and reader in (read_cocosearch, read_ruarte):
+        expected = f"none for {source}, a file of {DATA_SETS[reader]}, whose frame is that of each trial"
+        check(reader is read_cocosearch, "size", expected, options["size"])
+        others = {name: value for name, value in options.items() if name != "size"}
+        options = {"screen": options["size"], **others}
+    name = source if isinstance(source, str | PathLike) else "it"
+    check_options(options, [*signature(reader).parameters][1:], f"{reader.__name__}, which reads {name}")
     try:
         return reader(source, **options)
     except DataError as error:
@@ -67,24 +84,35 @@ def read_by(reader: _Reader, source: Any, options: dict[str, Any]) -> list[Fixat
         raise DataError(f"{error}; it was read as a file of {DATA_SETS[reader]}") from None
 
 
-def reader_of(source: str | PathLike[str] | Any, columns: Mapping[str, str] | None = None) -> _Reader:
-    """The reader of a file or a `pandas.DataFrame`, by its ending and content; `columns` as for `read_table`."""
+def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str] | None = None) -> _Reader:
+    """Choose the reader of a source by its ending and content.
+
+    Args:
+        source: the file, or a `pandas.DataFrame`.
+        columns: as for `read_table`.
+
+    Returns:
+        The reader.
+
+    Raises:
+        DataError: a file `.json` is none, or a table is not read.
+    """
     kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
     if kind == ".asc":
         return read_eyelink
     if kind != ".json":
         return table_reader(source, columns)
-    begins = _BEGINNING.match(read_text(source))
-    if begins is None:
+    beginning = _BEGINNING.match(read_text(source))
+    if beginning is None:
         raise DataError(f"{source}: expected JSON, a list or an object, got other text; correct or replace the file")
-    trials, people = begins.groups()
-    if trials:
+    list_of_trials, list_of_people = beginning.groups()
+    if list_of_trials:
         return read_cocosearch
-    return read_osie if people else read_ruarte
+    return read_osie if list_of_people else read_ruarte
 
 
 def frame_of(text: str) -> tuple[int, int]:
-    """Width and height of a frame that a command line gives, such as `1920,1080` or `800x600`."""
+    """Read the width and the height of a frame that a command line gives, such as `1920,1080` or `800x600`."""
     try:
         width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
     except ValueError:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
 
 import numpy as np
 import torch
@@ -47,8 +46,9 @@ class Letterbox:
     @property
     def offset(self) -> tuple[float, float]:
         """Width of the border on the left and height of the border at the top, in screen pixels."""
-        across, down = (whole - self.scale * part for whole, part in zip(self.screen, self.picture, strict=True))
-        return across / 2, down / 2
+        width = self.screen[0] - self.scale * self.picture[0]
+        height = self.screen[1] - self.scale * self.picture[1]
+        return width / 2, height / 2
 
     def to_picture(self, points: _Values) -> _Values:
         """Convert points from the screen to the picture.
@@ -95,23 +95,34 @@ class Letterbox:
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
-def _check_size(name: str, size: Any) -> None:
-    fits = isinstance(size, tuple | list | np.ndarray) and len(size) == 2
-    check(
-        fits and all(isinstance(side, Real) and 0 < float(side) < np.inf for side in size),
-        name,
-        "a width and a height above 0",
-        size,
-    )
+def _check_size(name: str, size: object) -> None:
+    """Raise `InputError` for what is no `(width, height)`."""
+    is_pair = isinstance(size, tuple | list | np.ndarray) and len(size) == 2
+    are_sides = is_pair and all(isinstance(side, Real) and 0 < float(side) < np.inf for side in size)
+    check(are_sides, name, "a width and a height above 0", size)
 
 
-def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
-    """Real numbers of any common type as an array of doubles."""
-    given = values.detach().cpu() if isinstance(values, Tensor) else values
-    if isinstance(given, Tensor) and given.dtype == torch.bfloat16:
-        given = given.float()  # NumPy has no such numbers
+def as_array(values: object, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
+    """Convert real numbers of any common type to an array of doubles.
+
+    Args:
+        values: an array, a tensor, a list or a number.
+        argument: name of the argument, for the message.
+        finite: whether NaN and infinite numbers are refused.
+
+    Returns:
+        An array of the same shape.
+
+    Raises:
+        InputError: there is something else than real numbers.
+    """
+    plain = values
+    if isinstance(plain, Tensor):
+        plain = plain.detach().cpu()
+        if plain.dtype == torch.bfloat16:
+            plain = plain.float()  # NumPy has no such numbers
     try:
-        array = np.asarray(given)
+        array = np.asarray(plain)
         numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
     except OverflowError:
         raise InputError(f"{argument}: expected finite numbers, got one that is larger than any float") from None
@@ -126,8 +137,20 @@ def as_array(values: Any, argument: str, *, finite: bool = False) -> NDArray[np.
     return numbers
 
 
-def as_path(points: Any, argument: str, *, least: int = 0) -> NDArray[np.float64]:
-    """Points of fixations, `(n, 2)`, finite; `least` is 1 where there must be one."""
+def as_path(points: object, argument: str, *, least: int = 0) -> NDArray[np.float64]:
+    """Convert the points of fixations to an array.
+
+    Args:
+        points: `(n, 2)`, or nothing.
+        argument: name of the argument, for the message.
+        least: smallest number of points; 1 where there must be one.
+
+    Returns:
+        `(n, 2)`, finite.
+
+    Raises:
+        InputError: there is something else, or too few points.
+    """
     path = as_array(points, argument, finite=True)
     path = path.reshape(0, 2) if path.shape == (0,) else path
     check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
@@ -136,6 +159,7 @@ def as_path(points: Any, argument: str, *, least: int = 0) -> NDArray[np.float64
 
 
 def _box(corners: _Values) -> tuple[float, float, float, float]:
+    """The box of two corners `(2, 2)`."""
     x1, y1, x2, y2 = corners.reshape(-1).tolist()
     return x1, y1, x2, y2
 
@@ -174,17 +198,17 @@ class Fixations:
 
     def __post_init__(self) -> None:
         """Check that the arrays belong together; lists and tensors become arrays."""
-        for name in ("points", "durations"):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, as_array(value, name))
+        object.__setattr__(self, "points", as_array(self.points, "points"))
+        if self.durations is not None:
+            object.__setattr__(self, "durations", as_array(self.durations, "durations"))
         shape = self.points.shape
         check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
         check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
         _check_size("size", self.size)
         if self.durations is not None:
             check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
-            lasting = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())
-            check(lasting, "durations", "milliseconds, 0 or more", self.durations.tolist()[:5])
+            are_times = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())
+            check(are_times, "durations", "milliseconds, 0 or more", self.durations.tolist()[:5])
         if self.box is not None:
             x1, y1, x2, y2 = self.box
             ordered = bool(np.isfinite(self.box).all()) and x1 <= x2 and y1 <= y2
@@ -233,22 +257,25 @@ class Fixations:
         >>> seen.in_picture((800, 600), scale=1).points, seen.in_picture((400, 300), place=(0, 0, 800, 600)).points
         (array([[0., 0.]]), array([[199.75, 149.75]]))
         """
-        placed = Letterbox(self.size, size)
         check(scale is None or place is None, "place", "None beside scale, or scale=None", place)
-        corner = np.array(placed.offset)
-        across = np.array((placed.scale, placed.scale))  # screen pixels per picture pixel
+        corner, scales = self._placement(size, scale, place)
+        box = None if self.box is None else _box((np.array(self.box).reshape(2, 2) - corner) / scales)
+        return replace(self, points=(self.points + 0.5 - corner) / scales - 0.5, size=size, box=box)
+
+    def _placement(
+        self, size: tuple[int, int], scale: float | None, place: tuple[float, float, float, float] | None
+    ) -> tuple[_Values, _Values]:
+        """The corner of a picture on the frame, and screen pixels per picture pixel along x and y, `(2,)` both."""
+        letterbox = Letterbox(self.size, size)
         if scale is not None:
             check_number(scale, "scale", 1e-6, 1e6)
-            corner = (np.array(self.size) - scale * np.array(size)) / 2
-            across = np.array((scale, scale))
-        elif place is not None:
+            return (np.array(self.size) - scale * np.array(size)) / 2, np.array((scale, scale))
+        if place is not None:
             sides = as_array(place, "place", finite=True)
-            covers = sides.shape == (4,) and bool((sides[2:] > 0).all())
-            check(covers, "place", "(x, y, width, height), with a width and a height above 0", place)
-            corner = sides[:2]
-            across = sides[2:] / size
-        box = None if self.box is None else _box((np.array(self.box).reshape(2, 2) - corner) / across)
-        return replace(self, points=(self.points + 0.5 - corner) / across - 0.5, size=size, box=box)
+            is_box = sides.shape == (4,) and bool((sides[2:] > 0).all())
+            check(is_box, "place", "(x, y, width, height), with a width and a height above 0", place)
+            return sides[:2], sides[2:] / size
+        return np.array(letterbox.offset), np.array((letterbox.scale, letterbox.scale))
 
     def first(self, count: int) -> "Fixations":
         """Take the first fixations.
@@ -283,6 +310,6 @@ def by_picture(fixations: Iterable[Fixations]) -> dict[str, list[Fixations]]:
     {'a.jpg': 1, 'b.jpg': 2}
     """
     pictures: dict[str, list[Fixations]] = {}
-    for each in fixations:
-        pictures.setdefault(each.picture, []).append(each)
+    for record in fixations:
+        pictures.setdefault(record.picture, []).append(record)
     return dict(sorted(pictures.items()))
