@@ -18,16 +18,29 @@ _FAR = 0.5
 """Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
 
 _MANY = 20  # fixations from which on shares tell something
-_BAR, _LEVEL = 0.06, 0.03  # shares of a side that is empty where a picture was letterboxed, and where it was not
-_MOST_FILLED = 0.6  # shares of a frame that fixations of several pictures fill in its middle, and no more
-_ENLARGED, _SEVERAL = 1.15, 5  # how much larger a frame would show a picture, and pictures that tell what one does not
-_MOST_OUTSIDE, _MOST_REPEATED, _MOST_ALIKE, _MOST_SHORT = 0.1, 0.02, 0.02, 0.1  # shares of the fixations
+_ENOUGH = 5 * _MANY  # fixations from which on their borders tell something
+_ENOUGH_PICTURES = 5  # that tell what one does not
+_ENLARGED = 1.15  # how much larger a frame would show a picture
 _STRETCH = 0.02  # what rounding to whole pixels may do to proportions
-_SHORT, _LONG = 50.0, 5000.0  # milliseconds
+
+# Shares of a side of the frame without fixations: where the picture was letterboxed, where it was not, and at most.
+_BAR = 0.06
+_LEVEL = 0.03
+_MOST_BAR = 0.4
+_MOST_FILLED = 0.6  # share of a side that fixations of several pictures fill in its middle, and no more
+
+# Shares of the fixations from which on they are suspicious.
+_MOST_OUTSIDE = 0.1
+_MOST_REPEATED = 0.02
+_MOST_ALIKE = 0.02
+_MOST_SHORT = 0.1
+
+_SHORT = 50.0  # milliseconds
+_LONG = 5000.0
 
 
 def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]] | None = None) -> list[str]:
-    """What is suspicious in fixations, in plain lines; none where nothing is.
+    """Say what is suspicious in fixations, in plain lines; none where nothing is.
 
     - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
       or many outside it; with `sizes`, frames of other proportions than those of their pictures, and points within the
@@ -54,17 +67,25 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     if not records:
         return ["there are no fixations"]
     points, sides = _joined(records)
-    looks = _looks_like(records)
-    found = [] if looks is None else [f"points look like {looks}"]
-    outside = _outside(points, sides).mean()
-    if looks is None and outside > _MOST_OUTSIDE:
-        found.append(f"{100 * outside:.0f} % of the fixations lie outside their frame (check its size and the origin)")
-    if looks is None:
-        own = [] if sizes is None else _own_size(records, sizes)
-        found += own or _letterbox(points, sides) or _middle(records, points, sides)
+    lines = _of_frames(records, points, sides, sizes)
     if sizes is not None:
-        found += _pictures(records, sizes)
-    return [*found, *_repeats(records, points), *_durations(records)]
+        lines += _of_pictures(records, sizes)
+    return [*lines, *_of_repeats(records, points), *_of_durations(records)]
+
+
+def _of_frames(
+    records: Sequence[Fixations], points: _Array, sides: _Array, sizes: Mapping[str, tuple[int, int]] | None
+) -> list[str]:
+    """What is suspicious in the frames of points `(n, 2)`, with `sides` `(n, 2)`."""
+    other_frame = _looks_like(records)
+    if other_frame is not None:
+        return [f"points look like {other_frame}"]
+    lines = []
+    outside = _outside(points, sides).mean()
+    if outside > _MOST_OUTSIDE:
+        lines.append(f"{100 * outside:.0f} % of the fixations lie outside their frame (check its size and the origin)")
+    own_size = [] if sizes is None else _own_size(records, sizes)
+    return lines + (own_size or _letterbox(points, sides) or _middle(records, points, sides))
 
 
 def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
@@ -72,16 +93,15 @@ def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | 
     points, sides = _joined(fixations)
     if len(points) < 3:
         return None
-    inside = 1 - _outside(points, sides).mean()
-    swapped = 1 - _outside(points[:, ::-1], sides).mean()
-    middle = (np.abs(points) <= sides / 2).all(1).mean()
-    negative = (points < -0.5).mean(0)
-    fractional = bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
-    if units and fractional and sides.min() > 8:
+    if units and _are_fractions(points) and sides.min() > 8:
         return "fractions of the sides (units='fractions')"
-    if negative.min() >= 0.2 and middle > 0.95:
+    negative = (points < -0.5).mean(0)
+    in_middle = (np.abs(points) <= sides / 2).all(1).mean()
+    if negative.min() >= 0.2 and in_middle > 0.95:
         return "pixels from the centre (origin='centre', or 'centre, y up')"
-    if inside < 0.9 and swapped > max(0.98, inside + 0.1):
+    inside = 1 - _outside(points, sides).mean()
+    inside_if_swapped = 1 - _outside(points[:, ::-1], sides).mean()
+    if inside < 0.9 and inside_if_swapped > max(0.98, inside + 0.1):
         return "y before x (swap the two columns)"
     if len(points) >= _MANY and bool((points.max(0) < 0.5 * sides.min(0)).all()):
         corner = " × ".join(f"{side:g}" for side in np.ceil(points.max(0) + 1))
@@ -89,34 +109,45 @@ def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | 
     return None
 
 
+def _are_fractions(points: _Array) -> bool:
+    """Whether all points lie in [0, 1], and not all at its ends."""
+    return bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
+
+
 def _joined(fixations: Sequence[Fixations]) -> tuple[_Array, _Array]:
     """The points of all records, and the sizes of their frames, `(n, 2)` both."""
-    points = np.concatenate([each.points for each in fixations])
-    return points, np.concatenate([np.tile(np.array(each.size, np.float64), (len(each), 1)) for each in fixations])
+    points = np.concatenate([record.points for record in fixations])
+    sides = np.concatenate([np.tile(np.array(record.size, np.float64), (len(record), 1)) for record in fixations])
+    return points, sides
 
 
 def _outside(points: _Array, sides: _Array) -> NDArray[np.bool_]:
+    """Whether points lie outside their frame, `(n,)`."""
     return np.asarray(~((points >= -0.5) & (points < sides - 0.5)).all(1))
 
 
 def _letterbox(points: _Array, sides: _Array) -> list[str]:
     """Bars without fixations at two opposite sides of one frame, while the other sides have none."""
-    if len(points) < 5 * _MANY or (sides != sides[0]).any():
+    if len(points) < _ENOUGH or (sides != sides[0]).any():
         return []
     share = (points + 0.5) / sides
-    low, high = np.quantile(share, 0.002, axis=0), 1 - np.quantile(share, 0.998, axis=0)
-    for axis, (name, places) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
-        bars, others = (low[axis], high[axis]), (low[1 - axis], high[1 - axis])
-        if min(bars) > _BAR and max(bars) < 0.4 and abs(bars[0] - bars[1]) < _LEVEL and max(others) < _LEVEL:
-            width = f"{100 * min(bars):.0f} % of the frame at the {name}"
-            return [f"no {places} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
+    # Empty shares at the left and the top, and at the right and the bottom; single points may lie in a bar.
+    before = np.quantile(share, 0.002, axis=0)
+    behind = 1 - np.quantile(share, 0.998, axis=0)
+    for axis, (borders, coordinate) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
+        bars = before[axis], behind[axis]
+        across = before[1 - axis], behind[1 - axis]
+        are_bars = min(bars) > _BAR and max(bars) < _MOST_BAR and abs(bars[0] - bars[1]) < _LEVEL
+        if are_bars and max(across) < _LEVEL:
+            width = f"{100 * min(bars):.0f} % of the frame at the {borders}"
+            return [f"no {coordinate} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
 
 
 def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list[str]:
     """Bars without fixations at all sides of one frame, whatever the picture."""
     pictures = len({record.picture for record in records})
-    if len(points) < 5 * _MANY or pictures < _SEVERAL or (sides != sides[0]).any():
+    if len(points) < _ENOUGH or pictures < _ENOUGH_PICTURES or (sides != sides[0]).any():
         return []
     low, high = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)
     filled = high - low
@@ -137,38 +168,57 @@ def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]
         if record.picture in sizes and Letterbox(record.size, sizes[record.picture]).scale >= _ENLARGED
     ]
     count = sum(map(len, smaller))
-    within = sum(int(record.in_picture(sizes[record.picture], scale=1).inside.sum()) for record in smaller)
-    if count < 5 * _MANY or count < 0.5 * sum(map(len, records)) or within < 0.99 * count:
+    if count < _ENOUGH or count < 0.5 * sum(map(len, records)):
         return []
-    (across, down), frame = sizes[smaller[0].picture], smaller[0].size
+    within = sum(int(record.in_picture(sizes[record.picture], scale=1).inside.sum()) for record in smaller)
+    if within < 0.99 * count:
+        return []
+    first = smaller[0]
+    width, height = sizes[first.picture]
     return [
-        f"fixations keep to the middle of their frames, such as {across} × {down} in {frame[0]} × {frame[1]} of "
-        f"{smaller[0].picture}: was it shown at its own size? (Fixations.in_picture with scale=1)"
+        f"fixations keep to the middle of their frames, such as {width} × {height} in {first.size[0]} × "
+        f"{first.size[1]} of {first.picture}: was it shown at its own size? (Fixations.in_picture with scale=1)"
     ]
 
 
-def _pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Pictures that are not there, and those whose proportions are not those of the frame."""
-    frames = {(each.picture, each.size) for each in records}
-    unknown = sorted({picture for picture, _ in frames if picture not in sizes})
-    number = len({each.picture for each in records})
-    found = [f"{len(unknown)} of {number} pictures are not there, such as {unknown[0]}"] if unknown else []
-    known = sorted((picture, size, sizes[picture]) for picture, size in frames if picture in sizes)
-    other = [each for each in known if not _alike(*each[1:])]
-    if other:
-        (name, (width, height), (across, down)), count = other[0], len({each[0] for each in other})
-        found.append(
-            f"{count} of {number} pictures have other proportions than their frames, such as {name}, {across} × {down} "
-            f"in {width} × {height}: was it letterboxed on a screen? (Fixations.in_picture)"
-        )
-    larger = [(each, sizes[each.picture]) for each in records if each.size > sizes.get(each.picture, each.size)]
-    if sum(len(each) for each, _ in larger) >= _MANY and not any((each.points > size).any() for each, size in larger):
-        each, (across, down) = larger[0]
-        found.append(
-            f"no fixation lies beyond the pixels of its picture, although frames are larger, such as {each.size[0]} × "
-            f"{each.size[1]} of {each.picture}: give its size, {across} × {down}, if that is what was looked at"
-        )
-    return found
+def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """What is suspicious beside the sizes of the pictures."""
+    pictures = {record.picture for record in records}
+    unknown = sorted(picture for picture in pictures if picture not in sizes)
+    lines = []
+    if unknown:
+        lines.append(f"{len(unknown)} of {len(pictures)} pictures are not there, such as {unknown[0]}")
+    return [*lines, *_other_proportions(records, sizes), *_smaller_pictures(records, sizes)]
+
+
+def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Pictures with other proportions than their frames."""
+    frames = sorted({(record.picture, record.size) for record in records if record.picture in sizes})
+    stretched = [(picture, frame) for picture, frame in frames if not _alike(frame, sizes[picture])]
+    if not stretched:
+        return []
+    picture, frame = stretched[0]
+    width, height = sizes[picture]
+    count = len({picture for picture, _ in stretched})
+    return [
+        f"{count} of {len({record.picture for record in records})} pictures have other proportions than their frames, "
+        f"such as {picture}, {width} × {height} in {frame[0]} × {frame[1]}: was it letterboxed on a screen? "
+        "(Fixations.in_picture)"
+    ]
+
+
+def _smaller_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Fixations in larger frames that lie within the pixels of their pictures."""
+    in_larger = [record for record in records if record.size > sizes.get(record.picture, record.size)]
+    beyond = any((record.points > sizes[record.picture]).any() for record in in_larger)
+    if beyond or sum(map(len, in_larger)) < _MANY:
+        return []
+    first = in_larger[0]
+    width, height = sizes[first.picture]
+    return [
+        f"no fixation lies beyond the pixels of its picture, although frames are larger, such as {first.size[0]} × "
+        f"{first.size[1]} of {first.picture}: give its size, {width} × {height}, if that is what was looked at"
+    ]
 
 
 def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -176,51 +226,80 @@ def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= _STRETCH
 
 
-def _repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
-    found = []
-    steps = np.concatenate([(each.points[1:] == each.points[:-1]).all(1) for each in records])
-    if len(steps) >= _MANY and (same := steps.mean()) > _MOST_REPEATED:
-        found.append(f"{100 * same:.0f} % of the fixations repeat the point before (are these samples of the tracker?)")
-    twice = Counter((each.picture, each.subject, each.target, each.points.tobytes()) for each in records)
-    again = [who for who, count in twice.items() if count > 1 and len(who[3]) > 16]
-    if again:
-        found.append(f"{len(again)} records occur more than once, such as that of {again[0][1]} in {again[0][0]}")
-    places = Counter(map(tuple, points.tolist()))
-    place, count = places.most_common(1)[0]
-    first = Counter(tuple(each.points[0].tolist()) for each in records)[place]
-    if len(points) >= _MANY and count - first > max(5.0, _MOST_ALIKE * len(points)):
-        at = ", ".join(f"{value:g}" for value in place)
-        found.append(f"{count} of {len(points)} fixations lie at ({at}): does the tracker write it during blinks?")
-    alone = sum(len(each) == 1 for each in records)
-    if len(records) >= _MANY and alone > 0.5 * len(records):
-        found.append(f"{alone} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)")
-    return found
+def _of_repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
+    """What repeats: points, records, one place, and scanpaths of a single fixation."""
+    lines = []
+    repeats = np.concatenate([(record.points[1:] == record.points[:-1]).all(1) for record in records])
+    if len(repeats) >= _MANY and repeats.mean() > _MOST_REPEATED:
+        share = f"{100 * repeats.mean():.0f} %"
+        lines.append(f"{share} of the fixations repeat the point before (are these samples of the tracker?)")
+    lines += _twice(records)
+    lines += _at_one_place(records, points)
+    single = sum(len(record) == 1 for record in records)
+    if len(records) >= _MANY and single > 0.5 * len(records):
+        lines.append(f"{single} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)")
+    return lines
 
 
-def _durations(records: Sequence[Fixations]) -> list[str]:
-    times = [each.durations for each in records if each.durations is not None]
-    if not times:
+def _twice(records: Sequence[Fixations]) -> list[str]:
+    """Records of more than one fixation that occur more than once."""
+    counts = Counter((record.picture, record.subject, record.target, record.points.tobytes()) for record in records)
+    one_point = np.zeros((1, 2)).nbytes
+    repeated = [key for key, count in counts.items() if count > 1 and len(key[3]) > one_point]
+    if not repeated:
         return []
-    values = np.concatenate(times)
-    found, middle = [], float(np.median(values))
+    picture, subject, _, _ = repeated[0]
+    return [f"{len(repeated)} records occur more than once, such as that of {subject} in {picture}"]
+
+
+def _at_one_place(records: Sequence[Fixations], points: _Array) -> list[str]:
+    """Many fixations at one same point, but for those at which scanpaths begin."""
+    place, count = Counter(map(tuple, points.tolist())).most_common(1)[0]
+    first = sum(tuple(record.points[0].tolist()) == place for record in records)
+    if len(points) < _MANY or count - first <= max(5.0, _MOST_ALIKE * len(points)):
+        return []
+    numbers = ", ".join(f"{value:g}" for value in place)
+    return [f"{count} of {len(points)} fixations lie at ({numbers}): does the tracker write it during blinks?"]
+
+
+def _of_durations(records: Sequence[Fixations]) -> list[str]:
+    """What is suspicious in durations: their unit, their being alike, and their length."""
+    durations = [record.durations for record in records if record.durations is not None]
+    if not durations:
+        return []
+    values = np.concatenate(durations)
+    median = float(np.median(values))
     least, most = (f"{value:g}" for value in (values.min(), values.max()))
-    if middle < 2 and values.max() < 20 and (values % 1 != 0).any():
+    if median < 2 and values.max() < 20 and (values % 1 != 0).any():
         return [f"durations from {least} to {most} look like seconds (multiply them by 1000)"]
-    if middle > 20_000:
-        return [f"durations of {middle:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
+    if median > 20_000:
+        return [f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
+    lines = []
+    short = (values < _SHORT).mean()
     if len(values) >= _MANY and (values == values[0]).all():
-        found.append(f"all durations are {least} ms (are these samples of the tracker?)")
-    elif middle < _SHORT:
-        found.append(f"durations of {middle:g} ms in the median are those of samples, not of fixations")
-    elif (short := (values < _SHORT).mean()) > _MOST_SHORT:
-        found.append(f"{100 * short:.0f} % of the fixations take less than {_SHORT:g} ms")
-    if (long := int((values > _LONG).sum())) > 0:
-        found.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
-    return found
+        lines.append(f"all durations are {least} ms (are these samples of the tracker?)")
+    elif median < _SHORT:
+        lines.append(f"durations of {median:g} ms in the median are those of samples, not of fixations")
+    elif short > _MOST_SHORT:
+        lines.append(f"{100 * short:.0f} % of the fixations take less than {_SHORT:g} ms")
+    long = int((values > _LONG).sum())
+    if long:
+        lines.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
+    return lines
 
 
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
-    """Refuse fixations in a frame of other proportions than `(width, height)`, or in another picture than the file."""
+    """Refuse fixations in a frame of other proportions than a picture, or in another picture.
+
+    Args:
+        fixations: the record.
+        argument: name of the argument, for the message.
+        size: `(width, height)` of the picture.
+        picture: name of its file; None where it has none.
+
+    Raises:
+        InputError: with how to convert the fixations.
+    """
     got = f"{fixations.size[0]} × {fixations.size[1]} of {fixations.subject!r}"
     expected = (
         f"frames with the proportions of {size[0]} × {size[1]} (Fixations.in_picture((width, height)), with scale=1 if "
@@ -228,36 +307,62 @@ def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], pic
     )
     check(_alike(fixations.size, size), argument, expected, got)
     name = Path(picture or fixations.picture).stem
-    same = Path(fixations.picture).stem == name
     remedy = "if both are one picture, dataclasses.replace(fixations, picture=…) names it"
-    check(same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}; {remedy}")
+    is_same = Path(fixations.picture).stem == name
+    check(is_same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}; {remedy}")
 
 
 def warn_of_frames(
     source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
 ) -> list[Fixations]:
-    """Warn of fixations that do not look like those of their frame, with what they look like; returns the records."""
-    looks = _looks_like(fixations, units=units) if fixations else None
-    if looks is None:
+    """Warn of fixations that do not look like those of their frame, with what they look like.
+
+    Args:
+        source: the file, for the message.
+        fixations: the records.
+        units: whether they may be fractions that were read as pixels.
+        stacklevel: as for `warnings.warn`.
+
+    Returns:
+        The records.
+    """
+    other_frame = _looks_like(fixations, units=units) if fixations else None
+    if other_frame is None:
         return warn_outside(source, fixations, stacklevel=stacklevel + 1)
-    first, total = fixations[0], sum(map(len, fixations))
+    first = fixations[0]
     warnings.warn(
-        f"{source}: {total} fixations were read as pixels of frames such as {first.size[0]} × {first.size[1]}, of "
-        f"{first.subject} in {first.picture}, but look like {looks}",
+        f"{source}: {sum(map(len, fixations))} fixations were read as pixels of frames such as {first.size[0]} × "
+        f"{first.size[1]}, of {first.subject} in {first.picture}, but look like {other_frame}",
         stacklevel=stacklevel,
     )
     return fixations
 
 
 def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, stacklevel: int = 3) -> list[Fixations]:
-    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share; returns the records."""
-    beyond = [np.maximum(-each.points, each.points - each.size).max(1) > _FAR * max(each.size) for each in fixations]
-    count, total = sum(int(each.sum()) for each in beyond), sum(map(len, beyond))
+    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share.
+
+    Args:
+        source: the file, for the message.
+        fixations: the records.
+        stacklevel: as for `warnings.warn`.
+
+    Returns:
+        The records.
+    """
+    counts = [int(_is_far_outside(record).sum()) for record in fixations]
+    count = sum(counts)
     if count:
-        first = next(record for record, far in zip(fixations, beyond, strict=True) if far.any())
+        total = sum(map(len, fixations))
+        first = next(record for record, outside in zip(fixations, counts, strict=True) if outside)
         warnings.warn(
             f"{source}: {count} of {total} fixations ({100 * count / total:.0f} %) lie far outside their frame, such "
             f"as those of {first.subject} in {first.picture}, {first.size[0]} × {first.size[1]}; check size and unit",
             stacklevel=stacklevel,
         )
     return fixations
+
+
+def _is_far_outside(fixations: Fixations) -> NDArray[np.bool_]:
+    """Whether each fixation lies farther than `_FAR` outside its frame, `(n,)`."""
+    distance = np.maximum(-fixations.points, fixations.points - fixations.size).max(1)
+    return np.asarray(distance > _FAR * max(fixations.size))
