@@ -26,6 +26,14 @@ PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
 
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
+"""The whole number that is white, by dtype."""
+
+_DTYPES = {
+    **{name: np.dtype(name) for name in ("u1", "u2", "f2", "f4", "f8")},
+    "f16": np.dtype(np.float64),  # which torch has not
+}
+"""Dtypes of tensors by the kind and bytes of the numbers of arrays."""
+
 STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")  # kinds of addresses of cameras and streams
 FRAME = 1 / 25  # seconds between two frames where nothing tells them
 
@@ -84,7 +92,22 @@ def as_images(
     color: Color = "rgb",
     white: White | None = None,
 ) -> Tensor:
-    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`; → `(B, 3, H, W)`."""
+    """Convert a picture, or a batch of pictures, to RGB in [0, 1].
+
+    Args:
+        images: the picture, or `(B, 3, H, W)` or `(B, H, W, 3)`; see `as_image`, also for the other arguments.
+        like: a tensor with the dtype and device of the result.
+        argument: name of the argument, for the message.
+        color: order of the channels.
+        white: the values that are black and white.
+
+    Returns:
+        `(B, 3, H, W)`.
+
+    Raises:
+        InputError: as for `as_image`.
+        DataError: the file cannot be read.
+    """
     pixels = as_pixels(images, argument=argument, color=color, white=white)
     device = pixels.device if like is None else like.device
     if pixels.is_floating_point():
@@ -93,25 +116,41 @@ def as_images(
         return pixels
     got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
     check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
-    dtype, most = torch.float32 if like is None else like.dtype, _WHITE[pixels.dtype]
+    return _scaled(pixels, _WHITE[pixels.dtype], device, torch.float32 if like is None else like.dtype)
+
+
+def _scaled(pixels: Tensor, white: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Whole numbers divided by that of white, on a device and in a dtype."""
     if dtype == torch.float32 and device.type == "cpu" and values_known(pixels):
         # Other than torch, NumPy converts and divides in one pass over memory.
-        return torch.from_numpy(np.divide(pixels.cpu().numpy(), most, dtype=np.float32))
-    return pixels.to(device, dtype).div_(most)
+        return torch.from_numpy(np.divide(pixels.cpu().numpy(), white, dtype=np.float32))
+    return pixels.to(device, dtype).div_(white)
 
 
 def as_pixels(
     images: ImageLike, *, argument: str = "image", color: Color = "rgb", white: White | None = None
 ) -> Tensor:
-    """The pixels of a picture or a batch, RGB `(B, 3, H, W)`, with the numbers as they are given (`as_images`)."""
+    """Convert a picture or a batch to RGB without a change of its numbers.
+
+    Args:
+        images: as for `as_images`, also the other arguments.
+        argument: name of the argument, for the message.
+        color: order of the channels.
+        white: the values that are black and white; with these, the result is in [0, 1].
+
+    Returns:
+        `(B, 3, H, W)`.
+    """
     check_white(white)
-    pixels = _channels_first(_pixels_of(images, argument, white), argument, choose=not isinstance(images, np.ndarray))
-    swap = lookup(color, get_args(Color), "order of channels") == "bgr"
-    return pixels.flip(1) if swap and isinstance(images, Tensor | np.ndarray) else pixels  # files are RGB already
+    is_array = isinstance(images, np.ndarray)
+    pixels = _channels_first(_pixels_of(images, argument, white), argument, choose=not is_array)
+    is_bgr = lookup(color, get_args(Color), "order of channels") == "bgr"
+    # Files and Pillow images are RGB already.
+    return pixels.flip(1) if is_bgr and isinstance(images, Tensor | np.ndarray) else pixels
 
 
 def as_batch(images: ImageLike) -> Tensor:
-    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
+    """Convert images to `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and range."""
     if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
         return images
     return as_images(images)
@@ -127,12 +166,7 @@ def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
         check(image.layout == torch.strided, argument, "a dense tensor", "a sparse one; use image.to_dense()")
         return image
     if isinstance(image, np.ndarray):
-        kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}
-        name = f"{image.dtype.kind}{image.dtype.itemsize}"
-        way = "; convert it to bytes, array.astype('uint8'), or give white=" if image.dtype.kind == "i" else ""
-        check(name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {image.dtype}{way}")
-        native = np.float64 if name == "f16" else np.dtype(name)
-        return torch.from_numpy(np.array(image, dtype=native, order="C"))
+        return _native(image, argument)
     if isinstance(image, str | PathLike):
         check_local(image, argument)
         return read_image(image, white=white)
@@ -141,14 +175,28 @@ def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
     if isinstance(image, Image):
         return from_pillow(image, argument, white)
     expected = "a path, a Pillow image, a NumPy array or a tensor"
-    got = type(image).__name__
+    raise InputError(f"{argument}: expected {expected}, got {_other_kind(image)}")
+
+
+def _native(array: NDArray[Any], argument: str) -> Tensor:
+    """An array of a dtype that torch has, in the byte order of the machine, as a tensor."""
+    name = f"{array.dtype.kind}{array.dtype.itemsize}"
+    is_signed = array.dtype.kind == "i"
+    remedy = "; convert it to bytes, array.astype('uint8'), or give white=" if is_signed else ""
+    check(name in _DTYPES, argument, "bytes, 16-bit numbers or floats", f"an array of {array.dtype}{remedy}")
+    return torch.from_numpy(np.array(array, dtype=_DTYPES[name], order="C"))
+
+
+def _other_kind(image: object) -> str:
+    """Say what is given in place of a picture, and the remedy."""
+    kind = type(image).__name__
     if image is None:
-        got = "None (OpenCV returns None for a file that it cannot read); check the path"
-    elif isinstance(image, bytes | bytearray | memoryview):
-        got = f"{got} of a file; open them with PIL.Image.open(io.BytesIO(…))"
-    elif isinstance(image, Sequence):
-        got = f"a {got}; give pictures one by one, or all of them to semfov.run"
-    raise InputError(f"{argument}: expected {expected}, got {got}")
+        return "None (OpenCV returns None for a file that it cannot read); check the path"
+    if isinstance(image, bytes | bytearray | memoryview):
+        return f"{kind} of a file; open them with PIL.Image.open(io.BytesIO(…))"
+    if isinstance(image, Sequence):
+        return f"a {kind}; give pictures one by one, or all of them to semfov.run"
+    return kind
 
 
 def check_local(path: str | PathLike[str], argument: str) -> None:
@@ -159,7 +207,7 @@ def check_local(path: str | PathLike[str], argument: str) -> None:
 
 
 def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
-    """Convert pixels from any layout that `as_image` accepts to channels first; choose `(3, H, 3)` → `(B, 3, H, W)`."""
+    """Pixels in any layout that `as_image` accepts as `(B, 3, H, W)`; `choose` takes `(3, H, 3)` as channels first."""
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")
     check(pixels.numel() > 0, argument, "at least one pixel", f"shape {shape}")
@@ -167,18 +215,30 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
         return pixels.expand(1, 3, *shape)
     batch = pixels if len(shape) == 4 else pixels[None]
     for channels in (3, 1):
-        first, last = batch.shape[1] == channels, batch.shape[-1] == channels
-        clear, got = choose or not (first and last), f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-        check(clear, argument, _SHAPES, got)
-        if first or last:
-            batch = batch if first else batch.movedim(-1, 1)
+        is_first = batch.shape[1] == channels
+        is_last = batch.shape[-1] == channels
+        got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+        check(choose or not (is_first and is_last), argument, _SHAPES, got)
+        if is_first or is_last:
+            batch = batch if is_first else batch.movedim(-1, 1)
             return batch.expand(-1, 3, -1, -1)
     remedy = "; drop the fourth channel, or give the Pillow image" if 4 in (shape[-1], shape[-3]) else ""
     raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")
 
 
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
-    """Convert points to a tensor; tensors stay as they are, other numbers become float64; → `(..., 2)`."""
+    """Convert points to a tensor.
+
+    Args:
+        points: one or several; tensors stay as they are, other numbers become float64.
+        argument: name of the argument, for the message.
+
+    Returns:
+        `(..., 2)`.
+
+    Raises:
+        InputError: they are no such pairs.
+    """
     if isinstance(points, Tensor):
         return points
     try:
@@ -190,7 +250,15 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
 
 
 def as_positions(values: Tensor, like: Tensor | torch.dtype | None = None) -> Tensor:
-    """Positions with the device and precision of a tensor, or a precision (None: their own), but float32 at least."""
+    """Convert positions to a precision of at least float32.
+
+    Args:
+        values: of any shape.
+        like: a tensor with the device and the precision of the result, or a precision; None for their own.
+
+    Returns:
+        The positions.
+    """
     # Half precision is off by pixels from 2,048 on, and whole numbers cut the fractions of what is added to them.
     dtype = like if isinstance(like, torch.dtype) else (values if like is None else like).dtype
     device = like.device if isinstance(like, Tensor) else values.device

@@ -30,8 +30,10 @@ PHOTOGRAPHS = (
 )
 """Ends of the names of photographs."""
 
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+"""Ends of the names of videos."""
+
 _HEAD = 4096  # bytes, in which the comment of a picture is
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")  # ends of the names of videos
 _WAIT = 10_000  # milliseconds that a stream may take to open, or to give a frame
 _PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0)  # seconds between the attempts to open a stream again that broke off
 _MOST_FRAMES = 1e9  # of a file; streams state numbers that mean nothing
@@ -40,12 +42,19 @@ _FASTEST = 1000  # frames per second
 _LONGEST = 1e9  # seconds between two frames
 _ROUNDING = 1e-3  # seconds by which differences of the time stamps of Matroska may be off
 
-_WIDE = {int.from_bytes(code, "little") for code in (b"Y1\0\x10", b"Y16 ")}
+_SIXTEEN_BITS = {int.from_bytes(code, "little") for code in (b"Y1\0\x10", b"Y16 ")}
 """Codes of frames of 16 bits, grey, of FFmpeg and of a camera."""
 
 
 class Picture(NamedTuple):
-    """A picture from a source; image `(3, H, W)`, boxes `(M, 4)`, and in a stream seconds since the last frame."""
+    """A picture from a source.
+
+    Attributes:
+        name: of the file, or of the frame.
+        image: `(3, H, W)`.
+        boxes: `(M, 4)`; None where they are not known.
+        passed: seconds since the last frame of a stream.
+    """
 
     name: str
     image: Tensor
@@ -54,38 +63,65 @@ class Picture(NamedTuple):
 
 
 def picture_files(source: Path, *, recursive: bool = False, frames: bool = False) -> list[Path]:
-    """List a photograph, or those of a folder, or its `frames`, `recursive` of folders in it, in the order of names."""
+    """List the photographs of a source, in the order of their names.
+
+    Args:
+        source: a file, which is taken whatever its name, or a folder.
+        recursive: whether folders in it are searched, too; pictures that semfov has written there are left out.
+        frames: whether they are the frames of a stream, for the message.
+
+    Returns:
+        The files.
+
+    Raises:
+        DataError: there are none.
+    """
     if not source.exists() and not source.is_symlink():  # a link to nothing is one that cannot be read
         raise DataError(f"picture: no such file or folder: {source}; check the path")
     if not source.is_dir():
         return [source]
-    # Names that begin with a dot are notes of the system, such as the ._a.jpg of an Apple disk.
-    within = source.rglob("*") if recursive else source.iterdir()
-    seen = [path for path in within if not any(part.startswith(".") for part in path.relative_to(source).parts)]
-    files = sorted(path for path in seen if path.suffix.lower() in PHOTOGRAPHS)
-    files = _of_others(files, source) if recursive else files
-    photographs(seen, str(source))
-    mosaics = [path.name for path in source.iterdir() if path.suffix.lower() == ".vrt"]
+    visible = _visible_files(source, recursive=recursive)
+    files = sorted(path for path in visible if path.suffix.lower() in PHOTOGRAPHS)
+    if recursive:
+        files = _of_others(files, source)
+    photographs(visible, str(source))
+    _warn_of_mosaics(source)
+    if not files and frames:
+        raise DataError(f"source: expected frames (.jpg, .png, .tif, …) in {source}, got none")
+    if not files:
+        place = (
+            f"{source}, or in a folder in it"
+            if recursive
+            else f"{source}, and recursive=True also searches the folders in it"
+        )
+        raise DataError(f"picture: expected photographs (.jpg, .png, .tif, …) in {place}, got none")
+    return files
+
+
+def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
+    """What is in a folder, without names that begin with a dot: notes of the system, such as ._a.jpg of Apple."""
+    paths = folder.rglob("*") if recursive else folder.iterdir()
+    return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+
+
+def _warn_of_mosaics(folder: Path) -> None:
+    """Warn of mosaics in a folder, which are left out."""
+    mosaics = [path.name for path in folder.iterdir() if path.suffix.lower() == ".vrt"]
     if mosaics:
         remedy = "as their files are there, too; name them to look at them"
-        warnings.warn(f"{source}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=2)
-    if not files:
-        where = ", or in a folder in it" if recursive else ", and recursive=True also searches the folders in it"
-        what, where = ("source: expected frames", "") if frames else ("picture: expected photographs", where)
-        raise DataError(f"{what} (.jpg, .png, .tif, …) in {source}{where}, got none")
-    return files
+        warnings.warn(f"{folder}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=3)
 
 
 def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     """Drop the figures and crops that semfov has written, with a warning."""
-    own = [path for path in files if _made_here(path)]
-    if own:
-        what = f"{len(own)} pictures that semfov has written, such as {printable(str(own[0]))}, are left out"
+    written = [path for path in files if _is_made_here(path)]
+    if written:
+        what = f"{len(written)} pictures that semfov has written, such as {printable(str(written[0]))}, are left out"
         warnings.warn(f"{source}: {what}; name them, or their folder, to look at them", stacklevel=3)
-    return [path for path in files if path not in own]
+    return [path for path in files if path not in written]
 
 
-def _made_here(path: Path) -> bool:
+def _is_made_here(path: Path) -> bool:
     """Tell whether a picture has the comment of those that semfov writes."""
     try:
         with path.open("rb") as file:
@@ -95,19 +131,38 @@ def _made_here(path: Path) -> bool:
 
 
 def photographs(paths: Sequence[Path], where: str) -> list[Path]:
-    """The paths without the files whose names end as those of videos, texts and others, with a warning of these."""
+    """Drop files that are no photographs (by suffix), with a warning.
+
+    Args:
+        paths: files and folders.
+        where: they are, for the message.
+
+    Returns:
+        The others, among them folders, mosaics and files without a suffix.
+    """
     kinds = {"", ".vrt", *PHOTOGRAPHS}
-    others = {path: None for path in paths if path.suffix.lower() not in kinds and path.is_file()}
+    others = dict.fromkeys(path for path in paths if path.suffix.lower() not in kinds and path.is_file())
     if others:
-        count, such = len(others), printable(min(others).name)
-        kept = "1 file is no photograph and is" if count == 1 else f"{count} files are no photographs and are"
-        video = "; `semfov live` takes videos" if any(path.suffix.lower() in VIDEOS for path in others) else ""
-        warnings.warn(f"{where}: {kept} left out, {'' if count == 1 else 'such as '}{such}{video}", stacklevel=3)
+        name = printable(min(others).name)
+        if len(others) == 1:
+            text = f"1 file is no photograph and is left out, {name}"
+        else:
+            text = f"{len(others)} files are no photographs and are left out, such as {name}"
+        if any(path.suffix.lower() in VIDEOS for path in others):
+            text += "; `semfov live` takes videos"
+        warnings.warn(f"{where}: {text}", stacklevel=3)
     return [path for path in paths if path not in others]
 
 
 class Stream(NamedTuple):
-    """A video or a camera; `gaps` counts frames that were `lost` or `skipped`, and how often it was `reconnected`."""
+    """A video or a camera.
+
+    Attributes:
+        name: for messages, without a password.
+        rate: frames per second; None where nothing tells it.
+        frames: in their order.
+        gaps: how many frames were `lost` or `skipped` so far, and how often the source was `reconnected`.
+    """
 
     name: str
     rate: float | None
@@ -116,48 +171,76 @@ class Stream(NamedTuple):
 
 
 def open_stream(source: str | Path | int, most: int | None = None, white: White | None = None) -> Stream:
-    """Open a video by its file, a folder of frames by name, a camera by its number, or a stream by its address."""
+    """Open a stream of pictures.
+
+    Args:
+        source: the file of a video, a folder of frames, the number of a camera, or the address of a stream.
+        most: largest number of frames; None for no limit.
+        white: the values of 16 bits that are black and white, as for `semfov.read_image`.
+
+    Returns:
+        The stream, whose first frame is read.
+
+    Raises:
+        DataError: it cannot be opened.
+        InputError: no stream has such an address.
+    """
     check_white(white)
-    address = isinstance(source, str) and "://" in source
-    if not address and not isinstance(source, int):
-        source = Path(source)
-    name = f"camera {source}" if isinstance(source, int) else _name(str(source)) if address else Path(source).name
-    if isinstance(source, Path) and source.is_dir():
-        skips: Counter[str] = Counter()
-        return Stream(name, None, _read_frames(picture_files(source, frames=True)[:most], skips, white), skips)
-    container = container_of(source) if isinstance(source, Path) else "other"
-    check_data(container != "playlist", name, "a video", "a playlist, which names other files; give these")
+    is_address = isinstance(source, str) and "://" in source
+    if isinstance(source, int):
+        return _open_recorder(source, f"camera {source}", most, white)
+    if is_address:
+        return _open_recorder(source, _name(str(source)), most, white)
+    path = Path(source)
     gaps: Counter[str] = Counter()
-    if isinstance(source, Path) and container == "animation":
-        shown = animation(source, white)
-        begun = next(shown)
-        return Stream(name, 1 / begun[1], _animate(chain([begun], shown), name, most, gaps), gaps)
+    if path.is_dir():
+        frames = _read_frames(picture_files(path, frames=True)[:most], gaps, white)
+        return Stream(path.name, None, frames, gaps)
+    container = container_of(path)
+    check_data(container != "playlist", path.name, "a video", "a playlist, which names other files; give these")
+    if container == "animation":
+        shown = animation(path, white)
+        first = next(shown)
+        _, seconds = first
+        return Stream(path.name, 1 / seconds, _animate(chain([first], shown), path.name, most, gaps), gaps)
+    return _open_recorder(path, path.name, most, white, container)
+
+
+def _open_recorder(
+    source: str | Path | int, name: str, most: int | None, white: White | None, container: Container = "other"
+) -> Stream:
+    """Open a source that OpenCV reads."""
     with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
     recorder = _recorder(cv2, source)
     if not recorder.isOpened():
-        what = "OpenCV reads videos of this format"
-        if isinstance(source, int):
-            what = "it is connected and not in use"
-        elif address:
-            what = "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
-        raise DataError(f"{name}: cannot be opened; check that {what}")
+        raise DataError(f"{name}: cannot be opened; check that {_cause(source)}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
-    frames = _record(cv2, recorder, source, name, most, gaps, white, container)
+    gaps: Counter[str] = Counter()
+    frames = _Recording(cv2, recorder, source, name, gaps, white, container).frames(most)
     first = next(frames)
     return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
 
 
+def _cause(source: str | Path | int) -> str:
+    """What may keep a source from being opened, in words that tell what to check."""
+    if isinstance(source, int):
+        return "it is connected and not in use"
+    if isinstance(source, str):
+        return "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
+    return "OpenCV reads videos of this format"
+
+
 def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
     """Frames of files; one that cannot be read, or is not as large as the first, is skipped with a warning."""
-    size, passed = None, FRAME
+    size: tuple[int, int] | None = None
+    passed = FRAME
     for file in files:
         try:
             image = read_image(file, white=white)
-            size = size or image.shape[-2:]
-            first, here = (f"{width} × {height}" for height, width in (size, image.shape[-2:]))
-            remedy = "`semfov search`, `find` and `explore` take pictures of any size, each by itself"
-            check_data(first == here, file.name, f"{first} px, the size of the first frame", f"{here}; {remedy}")
+            height, width = image.shape[-2:]
+            size = size or (width, height)
+            _check_frame_size(file, (width, height), size)
         except Exception as error:
             reason = error if isinstance(error, SemfovError) else f"{type(error).__name__}: {error}"
             warnings.warn(f"skipped {file.name}: {reason}", stacklevel=2)
@@ -167,6 +250,13 @@ def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None)
         yield Picture(file.name, image, passed=passed)
         passed = FRAME
     check_data(size is not None, "source", "a frame that can be read", f"{len(files)} that cannot")
+
+
+def _check_frame_size(file: Path, size: tuple[int, int], first: tuple[int, int]) -> None:
+    """Raise `DataError` for a frame of another size than the first one, `(width, height)` both."""
+    expected = f"{first[0]} × {first[1]} px, the size of the first frame"
+    remedy = "`semfov search`, `find` and `explore` take pictures of any size, each by itself"
+    check_data(size == first, file.name, expected, f"{size[0]} × {size[1]}; {remedy}")
 
 
 def _animate(
@@ -202,7 +292,9 @@ class _Clock:
     """
 
     def __init__(self, frame: float, *, rounded: bool) -> None:
-        self.frame, self.rounded, self.stamp = frame, rounded, math.inf
+        self.frame = frame
+        self.rounded = rounded
+        self.stamp = math.inf
 
     @property
     def frames(self) -> int:
@@ -210,12 +302,22 @@ class _Clock:
         return round(self.stamp / self.frame) + 1 if math.isfinite(self.stamp) else 0
 
     def passed(self, stamp: float, lost: int) -> float:
-        """Seconds since the last frame, at the time stamp of one before which some were lost."""
-        seconds, self.stamp = stamp - self.stamp, stamp
+        """Move on to a frame.
+
+        Args:
+            stamp: its time stamp in seconds.
+            lost: how many frames before it could not be read.
+
+        Returns:
+            Seconds since the last frame.
+        """
+        seconds = stamp - self.stamp
+        self.stamp = stamp
         if not 0 < seconds < math.inf:
             return (1 + lost) * self.frame
         by_rate = round(seconds / self.frame) * self.frame
-        return by_rate if self.rounded and by_rate and abs(seconds - by_rate) <= _ROUNDING else seconds
+        follows_rate = self.rounded and by_rate > 0 and abs(seconds - by_rate) <= _ROUNDING
+        return by_rate if follows_rate else seconds
 
 
 def _recorder(cv2: Any, source: str | Path | int) -> Any:
@@ -233,67 +335,127 @@ def _recorder(cv2: Any, source: str | Path | int) -> Any:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _prepare(cv2: Any, recorder: Any, white: White | None) -> None:
-    """Let a camera or a stream keep the newest frame alone, where it can, and with `white` give 16 bits as they are."""
-    recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-    codes = {int(recorder.get(key)) for key in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC)}
-    if white is not None and codes & _WIDE:
-        recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-
-
 def _rgb(pixels: NDArray[Any], white: White | None) -> Tensor:
-    """A frame of OpenCV as RGB bytes `(3, H, W)`."""
+    """A frame of OpenCV, BGR or grey, as RGB bytes `(3, H, W)`."""
     if white is not None:
         pixels = bytes_between(pixels, black_and_white(white, pixels))
-        pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
+        if pixels.ndim == 2:
+            pixels = np.repeat(pixels[..., None], 3, -1)
     return torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
 
 
-def _record(
-    cv2: Any,
-    recorder: Any,
-    source: str | Path | int,
-    name: str,
-    most: int | None,
-    gaps: Counter[str],
-    white: White | None = None,
-    container: Container = "other",
-) -> Iterator[Picture]:
-    """Frames of a stream, RGB bytes; it goes on after frames that cannot be read, and opens what broke off again."""
-    total, rate = (float(recorder.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-    is_file = isinstance(source, Path) or 0 < total < _MOST_FRAMES
-    clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=container == "matroska")
-    read, missed, waited = 0, 0, 0.0
-    _prepare(cv2, recorder, white)
-    try:
-        while read != most:
-            there, pixels = recorder.read()
-            if there:
-                gaps["lost"] += missed
-                is_camera = isinstance(source, int)
-                stamp = time.monotonic() if is_camera else float(recorder.get(cv2.CAP_PROP_POS_MSEC)) / 1000
-                passed = min(clock.passed(stamp, missed) + waited, _LONGEST)
-                yield Picture(f"{name}, frame {read + gaps['lost']}", _rgb(pixels, white), passed=passed)
-                read, missed, waited = read + 1, 0, 0.0
-                continue
-            if is_file and missed < _MOST_ATTEMPTS and read + gaps["lost"] + missed < total:
-                missed += 1
-                continue
-            if not read:
-                raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
-            began = time.monotonic()
-            if is_file or isinstance(source, Path) or not _reopened(cv2, recorder, source):
-                stated = frames_stated(source, container, total) if isinstance(source, Path) else 0
-                # AVI counts the frames that a film leaves out, too, over which its time stamps go.
-                seen = max(read + gaps["lost"], clock.frames if container == "avi" else 0)
-                # The number of frames that a file states may be off by one.
-                gaps["lost"] += stated - seen if stated - seen > 1 else 0
-                return
-            _prepare(cv2, recorder, white)
-            gaps["reconnected"] += 1
-            waited, clock.stamp = time.monotonic() - began, math.inf
-    finally:
-        recorder.release()
+class _Recording:
+    """The frames of a source that OpenCV reads, through gaps and interruptions.
+
+    Args:
+        cv2: OpenCV.
+        recorder: its reader of the source, which is open.
+        source: file, number of a camera, or address.
+        name: of the source, for messages.
+        gaps: to which frames are added that were `lost`, and `reconnected`.
+        white: the values of 16 bits that are black and white.
+        container: of a file.
+
+    Private attributes, all of the frames so far: `_read` counts those that were read, and `_gaps` those that were lost
+    between them; `_missed` counts attempts since the last frame that gave none; `_waited` has the seconds for which a
+    stream was away since then.
+    """
+
+    def __init__(
+        self,
+        cv2: Any,
+        recorder: Any,
+        source: str | Path | int,
+        name: str,
+        gaps: Counter[str],
+        white: White | None = None,
+        container: Container = "other",
+    ) -> None:
+        self._cv2 = cv2
+        self._recorder = recorder
+        self._source = source
+        self._name = name
+        self._gaps = gaps
+        self._white = white
+        self._container = container
+        self._total = float(recorder.get(cv2.CAP_PROP_FRAME_COUNT))
+        rate = float(recorder.get(cv2.CAP_PROP_FPS))
+        self._is_file = isinstance(source, Path) or 0 < self._total < _MOST_FRAMES
+        self._clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=container == "matroska")
+        self._read = 0
+        self._missed = 0
+        self._waited = 0.0
+
+    def frames(self, most: int | None) -> Iterator[Picture]:
+        """Read up to `most` frames, RGB bytes; what cannot be read is passed over, and what broke off opened again."""
+        self._prepare()
+        try:
+            while self._read != most:
+                is_there, pixels = self._recorder.read()
+                if is_there:
+                    yield self._picture(pixels)
+                elif self._may_go_on():
+                    self._missed += 1
+                elif not self._read:
+                    raise DataError(f"{self._name}: no frame could be read; check that the source is not damaged")
+                elif not self._reconnect():
+                    self._count_lost_end()
+                    return
+        finally:
+            self._recorder.release()
+
+    def _prepare(self) -> None:
+        """Let a camera or a stream keep the newest frame alone, where it can, and give 16 bits as they are."""
+        cv2, recorder = self._cv2, self._recorder
+        recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        codes = {int(recorder.get(key)) for key in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC)}
+        if self._white is not None and codes & _SIXTEEN_BITS:
+            recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+
+    def _picture(self, pixels: NDArray[Any]) -> Picture:
+        """The frame that was read, by the clock of the stream."""
+        self._gaps["lost"] += self._missed
+        is_camera = isinstance(self._source, int)
+        position = self._cv2.CAP_PROP_POS_MSEC
+        stamp = time.monotonic() if is_camera else float(self._recorder.get(position)) / 1000
+        passed = min(self._clock.passed(stamp, self._missed) + self._waited, _LONGEST)
+        name = f"{self._name}, frame {self._read + self._gaps['lost']}"
+        picture = Picture(name, _rgb(pixels, self._white), passed=passed)
+        self._read += 1
+        self._missed = 0
+        self._waited = 0.0
+        return picture
+
+    def _may_go_on(self) -> bool:
+        """Whether a file has frames left by the number that it states."""
+        is_before_end = self._read + self._gaps["lost"] + self._missed < self._total
+        return self._is_file and self._missed < _MOST_ATTEMPTS and is_before_end
+
+    def _reconnect(self) -> bool:
+        """Open a camera or a stream again; returns whether it is there."""
+        if self._is_file or isinstance(self._source, Path):
+            return False
+        began = time.monotonic()
+        if not _reopened(self._cv2, self._recorder, self._source):
+            return False
+        self._prepare()
+        self._gaps["reconnected"] += 1
+        self._waited = time.monotonic() - began
+        self._clock.stamp = math.inf
+        return True
+
+    def _count_lost_end(self) -> None:
+        """Count the frames that a file states, and that were not there at its end."""
+        if not isinstance(self._source, Path):
+            return
+        stated = frames_stated(self._source, self._container, self._total)
+        seen = self._read + self._gaps["lost"]
+        if self._container == "avi":
+            # AVI counts the frames that a film leaves out, too, over which its time stamps go.
+            seen = max(seen, self._clock.frames)
+        # The number of frames that a file states may be off by one.
+        if stated - seen > 1:
+            self._gaps["lost"] += stated - seen
 
 
 def _reopened(cv2: Any, recorder: Any, source: str | int) -> bool:
@@ -301,9 +463,10 @@ def _reopened(cv2: Any, recorder: Any, source: str | int) -> bool:
     recorder.release()
     for pause in _PAUSES:
         time.sleep(pause)
-        again = _recorder(cv2, source)
-        if again.isOpened():
-            again.release()
-            if recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG):
-                return True
+        probe = _recorder(cv2, source)
+        if not probe.isOpened():
+            continue
+        probe.release()
+        if recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG):
+            return True
     return False

@@ -157,7 +157,7 @@ def test_frames_pass_by_their_time_stamps(monkeypatch):
     for source, expected in ((Path("a.mp4"), [0.04, 0.04, 0.04, 1]), (0, [0.04, 0.1, 0.5, 0.1])):
         recorder = Recorder([[0, 40, 80, 1080], []])
         monkeypatch.setattr(recorder, "get", lambda key, of=recorder: of.now if key == cv2.CAP_PROP_POS_MSEC else 25.0)
-        taken = sources._record(cv2, recorder, source, "a", 4, Counter())
+        taken = sources._Recording(cv2, recorder, source, "a", Counter()).frames(4)
         assert [picture.passed for picture in taken] == pytest.approx(expected)
 
 
@@ -289,7 +289,7 @@ def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
     recorder, gaps = Recorder([[1, 2], [], [3, 4]]), Counter()
     monkeypatch.setattr(sources, "_PAUSES", (0.0, 0.0))
     monkeypatch.setattr(sources, "_recorder", lambda *_: recorder)
-    taken = list(sources._record(cv2, recorder, "rtsp://camera", "camera", None, gaps))
+    taken = list(sources._Recording(cv2, recorder, "rtsp://camera", "camera", gaps).frames(None))
     assert [int(picture.image[0, 0, 0]) for picture in taken] == [1, 2, 3, 4]
     assert gaps == {"reconnected": 1, "lost": 0}
     assert [picture.passed for picture in taken[:2]] == [0.04, 0.04]
