@@ -16,6 +16,9 @@ from semfov.io.schema import excerpt, is_number, is_plain
 Id = int | str
 """The id of an image or of a category."""
 
+Entry = dict[str, Any]
+"""An object of the file, by its fields."""
+
 ABSENT, PARTIAL = "neg_category_ids", "not_exhaustive_category_ids"
 """Fields of an image in LVIS: categories that it surely lacks, and those of which not every object is annotated."""
 
@@ -34,9 +37,9 @@ class Annotations:
         digest: sha256 of the file.
     """
 
-    images: dict[Id, dict[str, Any]]
-    categories: dict[Id, dict[str, Any]]
-    objects: dict[Id, list[dict[str, Any]]]
+    images: dict[Id, Entry]
+    categories: dict[Id, Entry]
+    objects: dict[Id, list[Entry]]
     digest: str
 
     def size(self, image: Id) -> tuple[int, int] | None:
@@ -79,7 +82,7 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
         "bbox": _BOX,
         "iscrowd": _CROWD,
     }
-    objects: dict[Id, list[dict[str, Any]]] = {image: [] for image in images}
+    objects: dict[Id, list[Entry]] = {image: [] for image in images}
     for entry in _checked(data, "annotations", name, fields):
         crowd = int(entry.get("iscrowd") or 0)
         box = {"category_id": _plain_id(entry["category_id"]), "bbox": entry["bbox"], "iscrowd": crowd}
@@ -123,7 +126,7 @@ _CROWD = _Field(lambda value: value is None or value in (0, 1), "0 or 1")
 _REMEDY = "correct or replace the file"
 
 
-def _checked(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> list[dict[str, Any]]:
+def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> list[Entry]:
     """The entries of a list, whose fields are as expected."""
     entries = data.get(key)
     if not isinstance(entries, list):
@@ -138,9 +141,9 @@ def _checked(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Fi
     return entries
 
 
-def _by_id(data: dict[str, Any], key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, dict[str, Any]]:
+def _by_id(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, Entry]:
     """The checked entries of a list by their ids, which are unique."""
-    entries: dict[Id, dict[str, Any]] = {}
+    entries: dict[Id, Entry] = {}
     for place, entry in enumerate(_checked(data, key, name, {"id": _ID, **fields})):
         if entry["id"] in entries:
             fault = f"expected unique ids, got id {_shown(entry, 'id')} more than once; {_REMEDY}"
@@ -165,7 +168,7 @@ def _plain_id(value: Any) -> Id:
     return int(value) if isinstance(value, float) else value
 
 
-def _shown(entry: dict[str, Any], key: str) -> str:
+def _shown(entry: Entry, key: str) -> str:
     return excerpt(entry[key]) if key in entry else "nothing"
 
 

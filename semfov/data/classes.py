@@ -197,8 +197,7 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
 def _checked_index(value: object, count: int, argument: str) -> int:
     """An index of one of `count` classes, which may be a number of NumPy or of a tensor."""
     number = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
-    is_whole = isinstance(number, Integral) and not isinstance(number, bool)
-    if not is_whole or not 1 <= int(number) <= count:
+    if not isinstance(number, Integral) or isinstance(number, bool) or not 1 <= int(number) <= count:
         raise InputError(f"{argument}: expected a name, or a whole number from 1 to {count}, got {number!r}")
     return int(number)
 

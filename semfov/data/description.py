@@ -12,21 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.images import warn_of_range
-from semfov.data.tone import White, black_and_white, bytes_between, stated_limits
+from semfov.data.tone import Values, White, black_and_white, bytes_between, stated_limits
 from semfov.data.windowed import Box, ChosenBands
 from semfov.errors import check
 
 _SAMPLES = 5  # windows in a row, and in a column, in which the values of a picture are looked at
 _SAMPLE_SIDE = 64  # pixels
-
-Values = NDArray[Any]
-"""Values of the channels in a window, `(h, w, C)`, in the type of the file."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ class Description:
 
         Args:
             white: as for `semfov.read_image`.
-            read: reads the values of the colours in a window.
+            read: reads the values of the colours in a window, `(h, w, C)`.
             nodata: the value of pixels without data, which percentiles leave out.
 
         Returns:

@@ -7,11 +7,12 @@ import math
 import re
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from semfov.data.images import check_proportion
+from semfov.data.tone import Values
 from semfov.errors import DataError, check_data
 from semfov.io.files import reading
 
@@ -37,6 +38,56 @@ _SIGNATURES = {
 """Drivers by the first bytes of the files that they read."""
 
 
+class Raster(Protocol):
+    """What is read of a raster: a dataset of rasterio, or a mosaic (`semfov.data.vrt.Mosaic`).
+
+    Attributes:
+        width, height: in pixels.
+        count: number of bands.
+        dtypes: of the bands.
+        nodatavals: values of pixels without data, of each band; None for none.
+        colorinterp: rasterio's meaning of each band.
+        mask_flag_enums: rasterio's flags of the mask of each band.
+        crs, transform, gcps: where the raster lies, as rasterio has it.
+    """
+
+    width: int
+    height: int
+    count: int
+    dtypes: tuple[str, ...]
+    nodatavals: tuple[float | None, ...]
+    colorinterp: tuple[Any, ...]
+    mask_flag_enums: tuple[Any, ...]
+    crs: Any
+    transform: Any
+    gcps: Any
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def close(self) -> None: ...
+
+    def overviews(self, band: int) -> list[int]: ...
+
+    def read(self, bands: Any, *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values: ...
+
+    def read_masks(self, bands: Any, *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values: ...
+
+
+class Dataset(Raster, Protocol):
+    """What is read of a dataset of rasterio alone."""
+
+    driver: str
+    block_shapes: list[tuple[int, int]]
+
+    def colormap(self, band: int) -> dict[int, tuple[int, int, int, int]]: ...
+
+    def tags(self, *, ns: str) -> dict[str, str]: ...
+
+    def get_tag_item(self, name: str, namespace: str, *, bidx: int) -> str | None: ...
+
+
 def raster_settings() -> Any:
     """Make a context with GDAL's settings for rasters of others, in which rasters are opened and windows are read."""
     import rasterio
@@ -54,7 +105,7 @@ def driver_of(path: Path) -> str | None:
     return None
 
 
-def open_file(path: str | PathLike[str], driver: str) -> Any:
+def open_file(path: str | PathLike[str], driver: str) -> Dataset:
     """Open a raster by one driver, inside `raster_settings`.
 
     Args:
@@ -71,7 +122,7 @@ def open_file(path: str | PathLike[str], driver: str) -> Any:
 
     path = Path(path)
     held = path.stat().st_size  # GDAL has many messages for a file that is not there
-    file = rasterio.open(path.absolute(), driver=driver)
+    file: Dataset = rasterio.open(path.absolute(), driver=driver)
     try:
         _check_opened(file, held, path)
     except DataError:
@@ -80,7 +131,7 @@ def open_file(path: str | PathLike[str], driver: str) -> Any:
     return file
 
 
-def _check_opened(file: Any, held: int, path: Path) -> None:
+def _check_opened(file: Dataset, held: int, path: Path) -> None:
     """Raise `DataError` for a dataset out of proportion to the `held` bytes of its file, or with files beside it."""
     check_size((file.width, file.height), held, path)
     check_data(file.count <= _MOST_BANDS, path, f"at most {_MOST_BANDS:,} bands", file.count)

@@ -9,7 +9,7 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +18,13 @@ from torch import Tensor
 
 from semfov.data.deep import deep_values, is_deep
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
-from semfov.data.tone import White, between, black_and_white
+from semfov.data.tone import Values, White, between, black_and_white
 from semfov.data.windowed import Box, LargePicture
 from semfov.errors import DataError, SemfovError, check_data, check_pixels
 from semfov.io.files import check_regular
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 MAX_PIXELS = 89_478_485
 """Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
@@ -186,7 +189,7 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
 
 
 @contextmanager
-def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
+def open_pillow(path: str | PathLike[str]) -> Iterator["Image"]:
     """Open a file in one of `_FORMATS` as a Pillow image that is not decoded yet.
 
     Raises:
@@ -208,7 +211,7 @@ def open_pillow(path: str | PathLike[str]) -> Iterator[Any]:
         yield image
 
 
-def _seek_full_page(image: Any) -> None:
+def _seek_full_page(image: "Image") -> None:
     """Go to the first page of a TIFF that is no reduced copy, such as a thumbnail; the first one if there is none."""
     if not TiffTags.of_image(image).is_reduced:
         return
@@ -263,7 +266,7 @@ def check_area(size: tuple[int, int], name: str) -> None:
     check_data(0 < math.prod(size) <= MAX_PIXELS, name, f"1 to {MAX_PIXELS:,} pixels", got)
 
 
-def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
+def from_pillow(image: "Image", name: str, white: White | None = None) -> Tensor:
     """Convert a Pillow image of any mode, as `semfov.read_image` would read its file.
 
     Args:
@@ -280,7 +283,7 @@ def from_pillow(image: Any, name: str, white: White | None = None) -> Tensor:
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
 
 
-def _orientation(image: Any) -> int:
+def _orientation(image: "Image") -> int:
     """The EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
     try:
         orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
@@ -289,7 +292,7 @@ def _orientation(image: Any) -> int:
     return int(orientation) if orientation in _ORIENTATIONS else _UPRIGHT
 
 
-def _loaded(image: Any, *, upright: bool) -> Any:
+def _loaded(image: "Image", *, upright: bool) -> "Image":
     """Decode a Pillow image, and turn it upright, or back to how it is stored."""
     from PIL.Image import Transpose
 
@@ -305,7 +308,7 @@ def _loaded(image: Any, *, upright: bool) -> Any:
     return image if orientation == _UPRIGHT else image.transpose(Transpose[_MOVES[orientation]])
 
 
-def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
+def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
     """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
     sixteen_bits = image.mode in SIXTEEN_BITS
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
@@ -324,7 +327,7 @@ def _pixels(image: Any, name: str, *, upright: bool, white: White | None) -> NDA
     return 1 - pixels if is_inverted else pixels
 
 
-def _grey_pixels(values: NDArray[Any], mode: str, name: str) -> NDArray[np.float32]:
+def _grey_pixels(values: Values, mode: str, name: str) -> NDArray[np.float32]:
     """Grey values of 16 bits, or floats, in [0, 1]; raises `DataError` for values whose white is not known."""
     most = 1.0 if mode == "F" else 65535.0
     low = values.min()
@@ -335,7 +338,7 @@ def _grey_pixels(values: NDArray[Any], mode: str, name: str) -> NDArray[np.float
     return values.astype(np.float32) / np.float32(most)
 
 
-def _over_white(image: Any) -> Any:
+def _over_white(image: "Image") -> "Image":
     """A Pillow image, whose transparent pixels are blended with white."""
     from PIL import Image
 
@@ -384,7 +387,7 @@ class PhotographPicture(LargePicture):
             return pixels
 
 
-def upright_size(image: Any) -> tuple[int, int]:
+def upright_size(image: "Image") -> tuple[int, int]:
     """Tell `(width, height)` of a Pillow image after it is turned upright."""
     width, height = image.size
     if _orientation(image) < 5:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.data.images import from_pillow
 from semfov.data.reading import read_image
-from semfov.data.tone import White, between, black_and_white, check_white
+from semfov.data.tone import Values, White, between, black_and_white, check_white
 from semfov.errors import InputError, check, check_pixels, lookup, values_known
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
     raise InputError(f"{argument}: expected {expected}, got {_other_kind(image)}")
 
 
-def _native(array: NDArray[Any], argument: str) -> Tensor:
+def _native(array: Values, argument: str) -> Tensor:
     """An array of a dtype that torch has, in the byte order of the machine, as a tensor."""
     name = f"{array.dtype.kind}{array.dtype.itemsize}"
     is_signed = array.dtype.kind == "i"

@@ -65,11 +65,10 @@ def open_large(
     if isinstance(source, LargePicture):
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
-    is_file = isinstance(source, str | PathLike)
-    has_bands = is_file and Path(source).suffix.lower() in BY_WINDOWS
+    has_bands = isinstance(source, str | PathLike) and Path(source).suffix.lower() in BY_WINDOWS
     expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
     check(bands is None or has_bands, "bands", expected, bands)
-    if is_file:
+    if isinstance(source, str | PathLike):
         return _open_file(source, white, bands)
     return ArrayPicture(_bytes_of(source, color, white))
 
@@ -93,8 +92,8 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
     else:
         picture = PhotographPicture(path, white)
     if white is not None or bands is not None:
-        is_stated = white is not None and not isinstance(white, str)
-        picture.shown = {"white": stated_limits(white) if is_stated else white, "bands": bands}
+        limits = white if white is None or isinstance(white, str) else stated_limits(white)
+        picture.shown = {"white": limits, "bands": bands}
     return picture
 
 

@@ -6,19 +6,18 @@ from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.description import Description, Values, as_rgb, named_colours
-from semfov.data.gdal import raster_settings
+from semfov.data.description import Description, as_rgb, named_colours
+from semfov.data.gdal import Raster, raster_settings
 from semfov.data.images import PhotographPicture, open_pillow, opening, quiet_decoders
 from semfov.data.tiff import TiffPicture
 from semfov.data.tiff_tags import JPEG, PALETTE, UPRIGHT, WHITE_IS_ZERO, YCBCR, TiffTags
-from semfov.data.tone import White
+from semfov.data.tone import Values, White
 from semfov.data.vrt import Mosaic, open_raster
 from semfov.data.windowed import RASTERS, Box, ChosenBands, LargePicture
 from semfov.errors import DataError, check, check_data, needing
@@ -46,7 +45,7 @@ class RasterPicture(LargePicture):
         self.path = Path(path)
         self._lock = Lock()  # GDAL's datasets are for one thread at a time
         with opening(self.path, "opened"), self._settings:
-            self._file: Any = open_raster(self.path)
+            self._file = open_raster(self.path)
         weakref.finalize(self, self._file.close)
         _check_kind(self._file, path, has_white=white is not None)
         self.size = self._file.width, self._file.height
@@ -131,7 +130,7 @@ def _window_options(box: Box, reduction: int, bands: int) -> Mapping[str, object
     return {"window": window, "out_shape": (bands, height, width), "resampling": Resampling.average}
 
 
-def _check_kind(file: Any, path: str | PathLike[str], *, has_white: bool) -> None:
+def _check_kind(file: Raster, path: str | PathLike[str], *, has_white: bool) -> None:
     """Raise `DataError` for a raster that is not shown; `has_white` if its values of black and white are stated."""
     is_palette = any(meaning.name == "palette" for meaning in file.colorinterp)
     check_data(not is_palette, path, "grey, RGB or bands", "a palette; convert it (gdal_translate)")
@@ -141,7 +140,7 @@ def _check_kind(file: Any, path: str | PathLike[str], *, has_white: bool) -> Non
     check_data(is_scaled or kinds <= {"uint8", "uint16"}, path, "bands of 8 or 16 bits", got)
 
 
-def _describe(path: Path, file: Any) -> Description:
+def _describe(path: Path, file: Raster) -> Description:
     """What a dataset of GDAL, or a mosaic, says of its values."""
     meanings = [meaning.name for meaning in file.colorinterp]
     numbers = {name: meanings.index(name) + 1 for name in meanings}

@@ -7,19 +7,18 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from types import MappingProxyType, ModuleType
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.animations import animation
 from semfov.data.containers import Container, container_of, frames_stated
 from semfov.data.inputs import FRAME, STREAMS
 from semfov.data.reading import read_image
-from semfov.data.tone import White, black_and_white, bytes_between, check_white
+from semfov.data.tone import Values, White, black_and_white, bytes_between, check_white
 from semfov.errors import DataError, SemfovError, check, check_data, needing, printable
 from semfov.io.files import MADE_HERE
 
@@ -320,7 +319,23 @@ class _Clock:
         return by_rate if follows_rate else seconds
 
 
-def _recorder(cv2: Any, source: str | Path | int) -> Any:
+class _Recorder(Protocol):
+    """What is used of `cv2.VideoCapture`."""
+
+    def isOpened(self) -> bool: ...  # as OpenCV names it
+
+    def open(self, source: str | int, *backend: int) -> bool: ...
+
+    def read(self) -> tuple[bool, Values]: ...
+
+    def get(self, key: int) -> float: ...
+
+    def set(self, key: int, value: float) -> bool: ...
+
+    def release(self) -> None: ...
+
+
+def _recorder(cv2: ModuleType, source: str | Path | int) -> _Recorder:
     """OpenCV's reader of a source."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised by the caller
@@ -335,7 +350,7 @@ def _recorder(cv2: Any, source: str | Path | int) -> Any:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _rgb(pixels: NDArray[Any], white: White | None) -> Tensor:
+def _rgb(pixels: Values, white: White | None) -> Tensor:
     """A frame of OpenCV, BGR or grey, as RGB bytes `(3, H, W)`."""
     if white is not None:
         pixels = bytes_between(pixels, black_and_white(white, pixels))
@@ -363,8 +378,8 @@ class _Recording:
 
     def __init__(
         self,
-        cv2: Any,
-        recorder: Any,
+        cv2: ModuleType,
+        recorder: _Recorder,
         source: str | Path | int,
         name: str,
         gaps: Counter[str],
@@ -412,7 +427,7 @@ class _Recording:
         if self._white is not None and codes & _SIXTEEN_BITS:
             recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
-    def _picture(self, pixels: NDArray[Any]) -> Picture:
+    def _picture(self, pixels: Values) -> Picture:
         """The frame that was read, by the clock of the stream."""
         self._gaps["lost"] += self._missed
         is_camera = isinstance(self._source, int)
@@ -458,7 +473,7 @@ class _Recording:
             self._gaps["lost"] += stated - seen
 
 
-def _reopened(cv2: Any, recorder: Any, source: str | int) -> bool:
+def _reopened(cv2: ModuleType, recorder: _Recorder, source: str | int) -> bool:
     """Open a camera or a stream again, after pauses that grow; returns whether it is there."""
     recorder.release()
     for pause in _PAUSES:

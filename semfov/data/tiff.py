@@ -11,16 +11,17 @@ import re
 import weakref
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from enum import IntEnum
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.description import Description, Values, as_rgb, named_colours
+from semfov.data.description import Description, as_rgb, named_colours
 from semfov.data.gdal import check_size
 from semfov.data.images import check_tile, opening
 from semfov.data.tiff_tags import (
@@ -35,9 +36,12 @@ from semfov.data.tiff_tags import (
     UNASSOCIATED,
     WHITE_IS_ZERO,
 )
-from semfov.data.tone import White, bytes_between
+from semfov.data.tone import Values, White, bytes_between
 from semfov.data.windowed import Box, ChosenBands, LargePicture
 from semfov.errors import DataError, check_data, needing
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile
 
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 """How GDAL writes the name of a band, counted from 0, into its tag."""
@@ -54,6 +58,40 @@ _INFLATERS: dict[int, Callable[[], Any]] = {
 """Decoders of compressions whose data may inflate a thousandfold, by their numbers in a TIFF."""
 
 _WITH_DECODER = (1, 8, 32946)  # compressions whose decoders are always there
+
+
+class _Layer(Protocol):
+    """What is read of any page of tifffile: its number, and where its tiles lie in the file."""
+
+    index: int
+    shape: tuple[int, ...]
+    dataoffsets: Sequence[int]
+    databytecounts: Sequence[int]
+
+
+class _Page(_Layer, Protocol):
+    """What is read of the page of a picture; sizes in pixels, kinds by the numbers of TIFF."""
+
+    tags: Any
+    dtype: np.dtype[Any]
+    imagewidth: int
+    imagelength: int
+    is_tiled: bool
+    tilewidth: int
+    tilelength: int
+    rowsperstrip: int
+    bitspersample: int
+    samplesperpixel: int
+    extrasamples: Sequence[int]
+    photometric: int
+    planarconfig: int
+    compression: IntEnum
+    predictor: int
+    fillorder: int
+    jpegtables: bytes | None
+    subifds: Sequence[int] | None
+
+    def decode(self, data: bytes, number: int, *, jpegtables: bytes | None) -> Any: ...
 
 
 class TiffPicture(LargePicture):
@@ -76,7 +114,7 @@ class TiffPicture(LargePicture):
         with opening(self.path, "opened"):
             self.file = tifffile.TiffFile(path)
             weakref.finalize(self, self.file.close)
-            self.page: Any = _first_page(self.file)
+            self.page = _first_page(self.file)
             layers = _layers_of(self.file, self.page)
             self.size = int(self.page.imagewidth), int(self.page.imagelength)
             _check_kind(self.page, self.path, has_white=white is not None)
@@ -169,7 +207,7 @@ class _Tiles:
     decode them again. `_lock` is held while the place in the file is moved.
     """
 
-    def __init__(self, path: Path, file: Any, page: Any, layers: Sequence[Any]) -> None:
+    def __init__(self, path: Path, file: "TiffFile", page: _Page, layers: Sequence[_Layer]) -> None:
         self._path = path
         self._file = file
         self._page = page
@@ -246,7 +284,7 @@ class _Tiles:
         # In a page, the tiles of a plane follow those of the planes before it.
         return self._decode(layer, (plane * self.rows + row) * self.columns + column)
 
-    def _decode(self, layer: Any, number: int) -> Values | None:
+    def _decode(self, layer: _Layer, number: int) -> Values | None:
         """Decode the tile of a number in a page, `(h, w, samples)`; None for one that is not stored in the file."""
         key = layer.index, number
         if key in self._decoded:
@@ -274,7 +312,7 @@ class _Tiles:
         got = "one that inflates to more; replace it"
         check_data(len(inflated) < most, f"image {self._path}", f"tiles of {size:,} bytes", got)
 
-    def _plain_rows(self, layer: Any, plane: int, part: int) -> Values:
+    def _plain_rows(self, layer: _Layer, plane: int, part: int) -> Values:
         """Rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""
         top = part * self.height
         rows = min(self.height, self._size[1] - top)
@@ -291,25 +329,25 @@ class _Tiles:
             return bytes(self._file.filehandle.read(count))
 
 
-def _first_page(file: Any) -> Any:
+def _first_page(file: "TiffFile") -> _Page:
     """The first page that is no reduced copy, such as a thumbnail, of another one."""
-    for number in range(min(len(file.pages), _MOST_PAGES)):
-        if not file.pages[number].is_reduced:
-            return file.pages[number]
-    return file.pages[0]
+    pages: Any = file.pages
+    first = next((number for number in range(min(len(pages), _MOST_PAGES)) if not pages[number].is_reduced), 0)
+    page: _Page = pages[first]
+    return page
 
 
-def _layers_of(file: Any, page: Any) -> Sequence[Any]:
+def _layers_of(file: "TiffFile", page: _Page) -> Sequence[_Layer]:
     """The pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
     for series in file.series[:1]:
-        pages = list(series.pages)
+        pages: list[Any] = list(series.pages)
         are_channels = series.axes == "CYX" and 2 <= len(pages) <= _MOST_LAYERS and page.samplesperpixel == 1
         if are_channels and all(layer is not None and layer.shape == page.shape for layer in pages):
             return pages
     return [page]
 
 
-def _check_kind(page: Any, path: Path, *, has_white: bool) -> None:
+def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
     """Raise `DataError` for a page that is left to other readers; `has_white` if its black and white are stated."""
     import tifffile
 
@@ -326,7 +364,7 @@ def _check_kind(page: Any, path: Path, *, has_white: bool) -> None:
         raise DataError(f"{path}: expected imagecodecs for {packing}; pip install imagecodecs")
 
 
-def _describe(path: Path, page: Any, layers: Sequence[Any]) -> Description:
+def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
     """What the tags of a page say of its values."""
     has_layers = len(layers) > 1
     count = len(layers) if has_layers else int(page.samplesperpixel)
@@ -354,7 +392,7 @@ def _describe(path: Path, page: Any, layers: Sequence[Any]) -> Description:
     )
 
 
-def _nodata_of(page: Any) -> float | None:
+def _nodata_of(page: _Page) -> float | None:
     """The value of pixels without data; None where the file states none that its type has."""
     tag = page.tags.get(GDAL_NODATA)
     try:

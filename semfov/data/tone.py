@@ -12,6 +12,9 @@ from semfov.io.schema import is_number
 White = float | tuple[float, float] | Literal["auto"]
 """The value that is white where 0 is black, the values that are black and white, or `auto` for percentiles."""
 
+Values = NDArray[Any]
+"""Numbers of a picture in the type of its file, of any shape."""
+
 _PERCENTILES = 1.0, 99.0  # of the values, which are black and white for `auto`
 _ROWS = 64  # of a picture that are converted at once: more leave the cache of the processor
 
@@ -46,7 +49,7 @@ def stated_limits(white: float | tuple[float, float]) -> tuple[float, float]:
     return float(black), float(most)
 
 
-def black_and_white(white: White, values: NDArray[Any], nodata: float | None = None) -> tuple[float, float]:
+def black_and_white(white: White, values: Values, nodata: float | None = None) -> tuple[float, float]:
     """Choose the values that are shown as black and as white.
 
     Args:
@@ -67,14 +70,14 @@ def black_and_white(white: White, values: NDArray[Any], nodata: float | None = N
     return low, high if high > low else low + 1.0
 
 
-def between(values: NDArray[Any], tone: tuple[float, float]) -> NDArray[np.float32]:
+def between(values: Values, tone: tuple[float, float]) -> NDArray[np.float32]:
     """Scale values to [0, 1] from black to white, `tone`, and cut what lies outside; NaN is black."""
     low, high = tone
     share = (values.astype(np.float64) - low) / (high - low)
     return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)
 
 
-def bytes_between(values: NDArray[Any], tone: tuple[float, float] | None) -> NDArray[np.uint8]:
+def bytes_between(values: Values, tone: tuple[float, float] | None) -> NDArray[np.uint8]:
     """Convert values to bytes, a few rows at a time.
 
     Args:

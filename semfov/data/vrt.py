@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.gdal import driver_of, open_file
+from semfov.data.gdal import Dataset, driver_of, open_file
+from semfov.data.tone import Values
 from semfov.data.vrt_text import Band, Source, read_mosaic
 from semfov.data.windowed import Box
 from semfov.errors import DataError
@@ -124,7 +125,7 @@ class Mosaic:
         """Tell whether a source lies in a window."""
         return any(len(_touching(band.places, box)) > 0 for band in self._bands)
 
-    def read(self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> NDArray[Any]:
+    def read(self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values:
         """Read a window of some bands.
 
         Args:
@@ -143,9 +144,7 @@ class Mosaic:
             values[row] = self._composed(self._bands[band - 1], window, (height, width), resampling)
         return values
 
-    def read_masks(
-        self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any
-    ) -> NDArray[Any]:
+    def read_masks(self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values:
         """Read a window of the mask, which is one for all bands; arguments and result are those of `read`."""
         # Asked for only where `mask_flag_enums` tells of a mask or an alpha.
         band = self._mask or next(band for band in self._bands if band.meaning == "alpha")
@@ -153,7 +152,7 @@ class Mosaic:
         mask = self._composed(band, window, (height, width), resampling)
         return np.broadcast_to(mask, (len(bands), *mask.shape))
 
-    def _composed(self, band: Band, window: Any, shape: tuple[int, int], resampling: Any) -> NDArray[Any]:
+    def _composed(self, band: Band, window: Any, shape: tuple[int, int], resampling: Any) -> Values:
         """Values of a band in a window, where a source covers the earlier ones, resampled to a shape `(h, w)`."""
         nothing = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
         canvas = np.full(shape, nothing, band.kind)
@@ -176,7 +175,7 @@ class Mosaic:
 
     def _values(
         self, source: Source, across: _Side, down: _Side, reduction: Any
-    ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    ) -> tuple[Values, NDArray[np.bool_] | None]:
         """Values of the covered part of a source, and where pixels are there.
 
         Args:
@@ -208,9 +207,7 @@ class Mosaic:
         return np.pad(values, borders, "edge"), None if present is None else np.pad(present, borders, "edge")
 
 
-def _presence(
-    source: Source, file: Any, stored: NDArray[Any], options: Mapping[str, object]
-) -> NDArray[np.bool_] | None:
+def _presence(source: Source, file: Dataset, stored: Values, options: Mapping[str, Any]) -> NDArray[np.bool_] | None:
     """Where the pixels of a source are there, `(h, w)`; None for all over."""
     if source.masked:
         return np.asarray(file.read_masks(source.band, **options) > 0)
@@ -219,7 +216,7 @@ def _presence(
     return ~np.isnan(stored) if np.isnan(source.nodata) else np.asarray(stored != source.nodata)
 
 
-def _converted(source: Source, file: Any, values: NDArray[Any]) -> NDArray[Any]:
+def _converted(source: Source, file: Dataset, values: Values) -> Values:
     """The values of a mosaic for those of a source's file: colours of a table, of a curve, and of a scale."""
     if source.component:
         colours = file.colormap(source.band)
@@ -233,14 +230,14 @@ def _converted(source: Source, file: Any, values: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-def open_raster(path: str | PathLike[str]) -> Any:
+def open_raster(path: str | PathLike[str]) -> Mosaic | Dataset:
     """Open a mosaic, or a raster by the driver of its name, inside `raster_settings`."""
     path = Path(path)
     kind = path.suffix.lower()
     return Mosaic(path) if kind == ".vrt" else open_file(path, _DRIVERS[kind])
 
 
-def _open_source(file: Path) -> Any:
+def _open_source(file: Path) -> Dataset:
     """Open the file of a source by the driver of its content."""
     driver = driver_of(file)
     if driver is None:
@@ -255,7 +252,7 @@ def _touching(places: NDArray[np.float64], box: tuple[float, float, float, float
     return np.flatnonzero(meets)
 
 
-def _as_kind(values: NDArray[Any], kind: str) -> NDArray[Any]:
+def _as_kind(values: Values, kind: str) -> Values:
     """Values in another type, rounded and limited to its range as GDAL does."""
     if values.dtype == kind:
         return values

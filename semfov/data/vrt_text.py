@@ -10,7 +10,7 @@ from xml.etree import ElementTree as XML
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.gdal import check_size, check_system, driver_of
+from semfov.data.gdal import Dataset, check_size, check_system, driver_of
 from semfov.errors import DataError, check_data
 from semfov.io.files import inside, read_bytes
 
@@ -126,7 +126,7 @@ class MosaicText:
     has_overviews: dict[Path, bool]
 
 
-def read_mosaic(path: Path, open_source: Callable[[Path], Any]) -> MosaicText:
+def read_mosaic(path: Path, open_source: Callable[[Path], Dataset]) -> MosaicText:
     """Read the text of a mosaic, and check its sources.
 
     Args:
@@ -173,7 +173,7 @@ class _Reader:
     Private attribute: `_files` has these files, which are checked, by the names in the text.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], open_source: Callable[[Path], Any]) -> None:
+    def __init__(self, path: Path, size: tuple[int, int], open_source: Callable[[Path], Dataset]) -> None:
         self._path = path
         self._size = size
         self._open_source = open_source
@@ -251,14 +251,14 @@ class _Reader:
             self.has_overviews[file] = bool(self._open_source(file).overviews(1))
         return self._files[place]
 
-    def _band_of(self, text: str, file: Path, raster: Any) -> tuple[int, bool]:
+    def _band_of(self, text: str, file: Path, raster: Dataset) -> tuple[int, bool]:
         """The number of a source's band, and whether its mask is taken: `2`, or `mask,2`."""
         word, _, number = text.rpartition(",")
         is_band = word in ("", "mask") and number.isdecimal() and 1 <= int(number) <= raster.count
         check_data(is_band, self._path, f"a band of {file.name} from 1 to {raster.count}", f"{text!r:.40}")
         return int(number), word == "mask"
 
-    def _rects(self, parts: dict[str, XML.Element], raster: Any) -> tuple[Rect, Rect]:
+    def _rects(self, parts: dict[str, XML.Element], raster: Dataset) -> tuple[Rect, Rect]:
         """The part of a source's file that is seen, cut to the file, and its place in the mosaic."""
         are_both = ("SrcRect" in parts) == ("DstRect" in parts)
         check_data(are_both, self._path, "both SrcRect and DstRect of a source, or neither", "one of them")

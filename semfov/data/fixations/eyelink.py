@@ -140,9 +140,9 @@ def read_eyelink(
 def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:
     """The screen as `(x, y, width, height)`, in the pixels in which points are counted; `size` overrides the file's."""
     frame = next((match for line in lines if (match := _FRAME.match(line))), None)
-    if frame is None and size is None:
-        raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
     if frame is None:
+        if size is None:
+            raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
         return 0.0, 0.0, *size
     left, top, right, bottom = map(float, frame.groups())
     # The message has the first and the last pixel.

@@ -97,7 +97,9 @@ def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str
     Raises:
         DataError: a file `.json` is none, or a table is not read.
     """
-    kind = Path(source).suffix.lower() if isinstance(source, str | PathLike) else ""
+    if not isinstance(source, str | PathLike):
+        return table_reader(source, columns)
+    kind = Path(source).suffix.lower()
     if kind == ".asc":
         return read_eyelink
     if kind != ".json":

@@ -97,9 +97,9 @@ class Letterbox:
 
 def _check_size(name: str, size: object) -> None:
     """Raise `InputError` for what is no `(width, height)`."""
-    is_pair = isinstance(size, tuple | list | np.ndarray) and len(size) == 2
-    are_sides = is_pair and all(isinstance(side, Real) and 0 < float(side) < np.inf for side in size)
-    check(are_sides, name, "a width and a height above 0", size)
+    sides = size if isinstance(size, tuple | list | np.ndarray) else ()
+    are_above_0 = all(isinstance(side, Real) and 0 < float(side) < np.inf for side in sides)
+    check(len(sides) == 2 and are_above_0, name, "a width and a height above 0", size)
 
 
 def as_array(values: object, argument: str, *, finite: bool = False) -> NDArray[np.float64]:
