@@ -246,9 +246,9 @@ class _Packed:
         bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
         limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
 
+        warn_of_form(bboxes, limits, path, stacklevel=5)
         corner, extent = bboxes.split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)
-        warn_of_form(bboxes, limits, path, stacklevel=5)
         cut = edges.clamp(min=0).minimum(limits)
         boxes = cut.float()
         has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
@@ -265,6 +265,7 @@ class _Packed:
             name = file.categories[entry["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
+        # Boxes of all categories count for the number of boxes of an image; those of the detector's are its objects.
         self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
         self._boxes = boxes[labelled]
         self._labels = label[labelled]

@@ -330,10 +330,10 @@ def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) ->
 def _grey_pixels(values: Values, mode: str, name: str) -> NDArray[np.float32]:
     """Grey values of 16 bits, or floats, in [0, 1]; raises `DataError` for values whose white is not known."""
     most = 1.0 if mode == "F" else 65535.0
-    low = values.min()
-    high = values.max()
-    got = f"{low:g} to {high:g}; give white='auto', or the values that are black and white"
-    inside = bool(low >= 0 and high <= most)  # false for NaN, too
+    least = values.min()
+    greatest = values.max()
+    got = f"{least:g} to {greatest:g}; give white='auto', or the values that are black and white"
+    inside = bool(least >= 0 and greatest <= most)  # false for NaN, too
     check_data(inside, name, f"values from 0 to {most:g} in mode {mode}", got)
     return values.astype(np.float32) / np.float32(most)
 

@@ -115,8 +115,8 @@ def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     """Drop the figures and crops that semfov has written, with a warning."""
     written = [path for path in files if _is_made_here(path)]
     if written:
-        what = f"{len(written)} pictures that semfov has written, such as {printable(str(written[0]))}, are left out"
-        warnings.warn(f"{source}: {what}; name them, or their folder, to look at them", stacklevel=3)
+        text = f"{len(written)} pictures that semfov has written, such as {printable(str(written[0]))}, are left out"
+        warnings.warn(f"{source}: {text}; name them, or their folder, to look at them", stacklevel=3)
     return [path for path in files if path not in written]
 
 
@@ -464,13 +464,13 @@ class _Recording:
         if not isinstance(self._source, Path):
             return
         stated = frames_stated(self._source, self._container, self._total)
-        seen = self._read + self._gaps["lost"]
+        counted = self._read + self._gaps["lost"]
         if self._container == "avi":
             # AVI counts the frames that a film leaves out, too, over which its time stamps go.
-            seen = max(seen, self._clock.frames)
+            counted = max(counted, self._clock.frames)
         # The number of frames that a file states may be off by one.
-        if stated - seen > 1:
-            self._gaps["lost"] += stated - seen
+        if stated - counted > 1:
+            self._gaps["lost"] += stated - counted
 
 
 def _reopened(cv2: ModuleType, recorder: _Recorder, source: str | int) -> bool:

@@ -369,27 +369,34 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
     has_layers = len(layers) > 1
     count = len(layers) if has_layers else int(page.samplesperpixel)
     extra = [int(kind) for kind in page.extrasamples]
-    without_extra = count - len(extra)
-    metadata = page.tags.get(GDAL_METADATA)
-    names = _NAMED.findall("" if metadata is None else str(metadata.value))
-    numbers = {name.lower(): int(sample) + 1 for sample, name in names}
+    first_extra = count - len(extra) + 1
+    numbers = _named_bands(page)
     colours = named_colours(numbers)
-    if colours is None and without_extra == 3 and (page.photometric == RGB or has_layers):
+    if colours is None and first_extra == 4 and (page.photometric == RGB or has_layers):
         colours = 1, 2, 3
-    place = next((place for place, kind in enumerate(extra) if kind in (PREMULTIPLIED, UNASSOCIATED)), None)
-    alpha = None if place is None else without_extra + place + 1
+    # The first of the further channels that is an alpha, unless GDAL names that band otherwise.
+    alphas = [first_extra + place for place, kind in enumerate(extra) if kind in (PREMULTIPLIED, UNASSOCIATED)]
+    alpha = alphas[0] if alphas else None
     if alpha in numbers.values() and "alpha" not in numbers:
-        alpha = None  # GDAL names that band otherwise
+        alpha = None
     return Description(
         path=path,
         size=(int(page.imagewidth), int(page.imagelength)),
         count=count,
         colours=colours,
         alpha=alpha,
-        premultiplied=place is not None and extra[place] == PREMULTIPLIED,
+        premultiplied=alpha is not None and extra[alpha - first_extra] == PREMULTIPLIED,
         white_is_zero=page.photometric == WHITE_IS_ZERO,
         sixteen_bits=page.dtype == np.uint16,
     )
+
+
+def _named_bands(page: _Page) -> dict[str, int]:
+    """The numbers of bands, from 1, by the names that GDAL has written into a tag, in lower case."""
+    metadata = page.tags.get(GDAL_METADATA)
+    if metadata is None:
+        return {}
+    return {name.lower(): int(sample) + 1 for sample, name in _NAMED.findall(str(metadata.value))}
 
 
 def _nodata_of(page: _Page) -> float | None:

@@ -66,14 +66,14 @@ def black_and_white(white: White, values: Values, nodata: float | None = None) -
     shown = values[with_data].astype(np.float64)
     if not shown.size:
         return 0.0, 1.0
-    low, high = np.percentile(shown, _PERCENTILES).tolist()
-    return low, high if high > low else low + 1.0
+    black, most = np.percentile(shown, _PERCENTILES).tolist()
+    return black, most if most > black else black + 1.0
 
 
 def between(values: Values, tone: tuple[float, float]) -> NDArray[np.float32]:
     """Scale values to [0, 1] from black to white, `tone`, and cut what lies outside; NaN is black."""
-    low, high = tone
-    share = (values.astype(np.float64) - low) / (high - low)
+    black, white = tone
+    share = (values.astype(np.float64) - black) / (white - black)
     return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)
 
 

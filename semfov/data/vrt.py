@@ -58,17 +58,20 @@ class _Side:
         """
         place = source.place[axis]
         reach = source.place[2 + axis]
-        seen_start = source.seen[axis]
-        seen_length = source.seen[2 + axis]
-        first = (place - origin) * scale
-        end = (place + reach - origin) * scale
-        covered = range(max(ceil(first - 0.5), 0), min(ceil(end - 0.5), pixels))
-        inner = range(max(ceil(first - _ROUNDING), 0), min(floor(end + _ROUNDING), pixels)) or covered
-        low = seen_start + (origin + inner.start / scale - place) * seen_length / reach
-        high = seen_start + (origin + inner.stop / scale - place) * seen_length / reach
-        low = max(low, seen_start)
-        high = min(high, seen_start + seen_length)
-        return cls(covered, inner, low, high - low)
+        window = source.window[axis]
+        length = source.window[2 + axis]
+        canvas_start = (place - origin) * scale
+        canvas_end = (place + reach - origin) * scale
+        covered = range(max(ceil(canvas_start - 0.5), 0), min(ceil(canvas_end - 0.5), pixels))
+        first = max(ceil(canvas_start - _ROUNDING), 0)
+        last = min(floor(canvas_end + _ROUNDING), pixels)
+        inner = range(first, last) or covered
+        # Back from pixels of the canvas to those of the source, without what rounding adds.
+        start = window + (origin + inner.start / scale - place) * length / reach
+        end = window + (origin + inner.stop / scale - place) * length / reach
+        start = max(start, window)
+        end = min(end, window + length)
+        return cls(covered, inner, start, end - start)
 
     @property
     def border(self) -> tuple[int, int]:
@@ -158,30 +161,30 @@ class Mosaic:
         canvas = np.full(shape, nothing, band.kind)
         box = window.col_off, window.row_off, window.col_off + window.width, window.row_off + window.height
         height, width = shape
-        across_scale = width / window.width
-        down_scale = height / window.height
-        is_reduced = max(across_scale, down_scale) < 1
+        x_scale = width / window.width
+        y_scale = height / window.height
+        is_reduced = max(x_scale, y_scale) < 1
         for number in _touching(band.places, box):
             source = band.sources[number]
-            across = _Side.of(source, 0, box[0], across_scale, width)
-            down = _Side.of(source, 1, box[1], down_scale, height)
-            if not across.covered or not down.covered:
+            columns = _Side.of(source, 0, box[0], x_scale, width)
+            rows = _Side.of(source, 1, box[1], y_scale, height)
+            if not columns.covered or not rows.covered:
                 continue
-            values, present = self._values(source, across, down, resampling if is_reduced else None)
+            values, present = self._values(source, columns, rows, resampling if is_reduced else None)
             values = _as_kind(values, band.kind)
-            part = slice(down.covered.start, down.covered.stop), slice(across.covered.start, across.covered.stop)
+            part = slice(rows.covered.start, rows.covered.stop), slice(columns.covered.start, columns.covered.stop)
             canvas[part] = values if present is None else np.where(present, values, canvas[part])
         return canvas
 
     def _values(
-        self, source: Source, across: _Side, down: _Side, reduction: Any
+        self, source: Source, columns: _Side, rows: _Side, reduction: Any
     ) -> tuple[Values, NDArray[np.bool_] | None]:
         """Values of the covered part of a source, and where pixels are there.
 
         Args:
             source: the source.
-            across: what is shown of its width.
-            down: what is shown of its height.
+            columns: what is shown of its width.
+            rows: what is shown of its height.
             reduction: resampling of a window that is reduced; None for that of the source.
 
         Returns:
@@ -192,8 +195,8 @@ class Mosaic:
 
         resampling = Resampling.nearest if source.discrete else (reduction or Resampling[source.resampling])
         options = {
-            "window": Window(across.start, down.start, across.length, down.length),
-            "out_shape": (len(down.inner), len(across.inner)),
+            "window": Window(columns.start, rows.start, columns.length, rows.length),
+            "out_shape": (len(rows.inner), len(columns.inner)),
             "resampling": resampling,
         }
         file = self._open(source.path)
@@ -201,7 +204,7 @@ class Mosaic:
         present = _presence(source, file, stored, options)
         values = _converted(source, file, stored)
         # What lies at the edge of the source shows what is beside it.
-        borders = down.border, across.border
+        borders = rows.border, columns.border
         if borders == ((0, 0), (0, 0)):
             return values, present
         return np.pad(values, borders, "edge"), None if present is None else np.pad(present, borders, "edge")

@@ -57,7 +57,7 @@ class Source:
         path: the file.
         band: of the file, from 1.
         of_mask: whether the band's mask is taken in its place.
-        seen: the part of the file.
+        window: the part of the file that is shown.
         place: where it lies in the mosaic.
         resampling: name of rasterio's method.
         nodata: value of pixels that are not there; None for none.
@@ -72,7 +72,7 @@ class Source:
     path: Path
     band: int
     of_mask: bool
-    seen: Rect
+    window: Rect
     place: Rect
     resampling: str
     nodata: float | None
@@ -216,7 +216,7 @@ class _Reader:
         file = self._file(parts["SourceFilename"])
         raster = self._open_source(file)
         band, of_mask = self._band_of(texts.get("SourceBand", "1"), file, raster)
-        seen, place = self._rects(parts, raster)
+        window, place = self._rects(parts, raster)
         component = texts.get("ColorTableComponent", "0")
         check_data(component in ("0", "1", "2", "3", "4"), path, "a component from 1 to 4", f"{component!r:.40}")
         nodata = self._number(texts["NODATA"]) if "NODATA" in texts else None
@@ -228,7 +228,7 @@ class _Reader:
             path=file,
             band=band,
             of_mask=of_mask,
-            seen=seen,
+            window=window,
             place=place,
             resampling=self._resampling(element),
             nodata=nodata,
@@ -259,17 +259,17 @@ class _Reader:
         return int(number), word == "mask"
 
     def _rects(self, parts: dict[str, XML.Element], raster: Dataset) -> tuple[Rect, Rect]:
-        """The part of a source's file that is seen, cut to the file, and its place in the mosaic."""
+        """The part of a source's file that is shown, cut to the file, and its place in the mosaic."""
         are_both = ("SrcRect" in parts) == ("DstRect" in parts)
         check_data(are_both, self._path, "both SrcRect and DstRect of a source, or neither", "one of them")
         if "SrcRect" in parts:
-            seen = _rect(parts["SrcRect"], self._path)
+            window = _rect(parts["SrcRect"], self._path)
             place = _rect(parts["DstRect"], self._path)
         else:
-            seen = place = (0.0, 0.0, float(raster.width), float(raster.height))
-        x, width, left, across = _cut_side(seen[0], seen[2], place[0], place[2], raster.width)
-        y, height, top, down = _cut_side(seen[1], seen[3], place[1], place[3], raster.height)
-        return (x, y, width, height), (left, top, across, down)
+            window = place = (0.0, 0.0, float(raster.width), float(raster.height))
+        x, width, left, place_width = _cut_side(window[0], window[2], place[0], place[2], raster.width)
+        y, height, top, place_height = _cut_side(window[1], window[3], place[1], place[3], raster.height)
+        return (x, y, width, height), (left, top, place_width, place_height)
 
     def _resampling(self, element: XML.Element) -> str:
         """The name of a source's resampling."""
@@ -375,7 +375,7 @@ def _cut_side(start: float, length: float, place: float, reach: float, most: int
     """Cut a side of a source to its file, and its place in proportion.
 
     Args:
-        start: of the part that is seen, in pixels of the file.
+        start: of the part that is shown, in pixels of the file.
         length: of that part.
         place: where it lies in the mosaic.
         reach: its length there.

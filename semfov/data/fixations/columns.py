@@ -139,6 +139,7 @@ def _table_of_file(path: Path, name: str) -> Table:
     preamble = _PREAMBLE.match(text)
     if preamble is not None:
         text = text[preamble.end() :]
+    # The separator is what the names of the columns have most of.
     separator = max(",;\t|", key=text.partition("\n")[0].count)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -149,13 +150,19 @@ def _table_of_file(path: Path, name: str) -> Table:
     _check_different(str(path), columns)
     rows = []
     for place, line in lines:
-        if None in line:
+        if None in line:  # the key of fields beyond the columns
             raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
-        texts = [(field or "").strip() for field in line.values()]
-        if separator != ",":
-            texts = [_with_point(text) for text in texts]
+        texts = [_field(field, separator) for field in line.values()]
         rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
     return Table(name, columns, rows)
+
+
+def _field(text: str | None, separator: str) -> str:
+    """A field of a line without spaces around it; a decimal comma is a point where commas do not separate fields."""
+    plain = (text or "").strip()
+    if separator != "," and _DECIMAL.fullmatch(plain):
+        return plain.replace(",", ".")
+    return plain
 
 
 def _check_text_file(path: Path) -> None:
@@ -167,11 +174,6 @@ def _check_text_file(path: Path) -> None:
     got = "a video" if kind in VIDEOS else "a picture"
     is_table = not is_picture and kind not in VIDEOS
     check_data(is_table, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
-
-
-def _with_point(text: str) -> str:
-    """A text in which the decimal comma of a number is a point."""
-    return text.replace(",", ".") if _DECIMAL.fullmatch(text) else text
 
 
 def _check_different(name: str, columns: Sequence[str]) -> None:

@@ -249,10 +249,10 @@ def _duration_column(program: Program, columns: Sequence[Column], name: str | No
 
 def _point_columns(program: Program, columns: Sequence[Column], table: str) -> tuple[Column, Column]:
     """The columns of x and y, in a unit that is read; fractions, which are not rounded to pixels, before pixels."""
-    across, down = (program.of_point(key, columns) for key in program.point)
-    pairs = [(x, y) for x in across for y in down if (x.frame, x.unit) == (y.frame, y.unit)]
+    x_columns, y_columns = (program.of_point(key, columns) for key in program.point)
+    pairs = [(x, y) for x in x_columns for y in y_columns if (x.frame, x.unit) == (y.frame, y.unit)]
     read = [(x, y) for x, y in pairs if not x.unit or x.unit in LENGTHS]
-    got = ", ".join(repr(column.name) for column in (*across, *down))
+    got = ", ".join(repr(column.name) for column in (*x_columns, *y_columns))
     check_data(bool(read), table, f"points of {program.name} in px or norm", f"the columns {got}; export them in px")
     return min(read, key=lambda pair: LENGTHS.get(pair[0].unit) != "fractions")
 

@@ -123,15 +123,15 @@ def read_eyelink(
     trials, fixations = _events(path, lines)
     views = [view for trial in trials for view in trial.viewed()]
     _share_out(fixations, views)
-    seen = [view for view in views if view.fixations]
-    check_data(bool(seen), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials))
+    viewed = [view for view in views if view.fixations]
+    check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials))
     screen = _screen(path, lines, size)
     person = path.stem if subject is None else subject
-    records = [record for view in seen if (record := _record(view, screen, person, eye)) is not None]
+    records = [record for view in viewed if (record := _record(view, screen, person, eye)) is not None]
     check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
     remarks = [*_lost(lines), *_outside_views(trials, fixations)]
-    if len(records) < len(seen):
-        remarks.append(f"{len(seen) - len(records)} of {len(seen)} pictures have no fixation of the {eye} eye")
+    if len(records) < len(viewed):
+        remarks.append(f"{len(viewed) - len(records)} of {len(viewed)} pictures have no fixation of the {eye} eye")
     if remarks:
         warnings.warn(f"{path}: {'; '.join(remarks)}", stacklevel=2)
     return warn_of_frames(path, records)

@@ -136,9 +136,9 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
     behind = 1 - np.quantile(share, 0.998, axis=0)
     for axis, (borders, coordinate) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
         bars = before[axis], behind[axis]
-        across = before[1 - axis], behind[1 - axis]
+        others = before[1 - axis], behind[1 - axis]
         are_bars = min(bars) > _BAR and max(bars) < _MOST_BAR and abs(bars[0] - bars[1]) < _LEVEL
-        if are_bars and max(across) < _LEVEL:
+        if are_bars and max(others) < _LEVEL:
             width = f"{100 * min(bars):.0f} % of the frame at the {borders}"
             return [f"no {coordinate} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
@@ -149,13 +149,13 @@ def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list
     pictures = len({record.picture for record in records})
     if len(points) < _ENOUGH or pictures < _ENOUGH_PICTURES or (sides != sides[0]).any():
         return []
-    low, high = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)
-    filled = high - low
-    if (filled > _MOST_FILLED).any() or (np.abs(low + high - 1) > 2 * _LEVEL).any():
+    start, end = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)
+    filled = end - start
+    if (filled > _MOST_FILLED).any() or (np.abs(start + end - 1) > 2 * _LEVEL).any():
         return []
-    across, down = (f"{100 * part:.0f} %" for part in filled)
+    width, height = (f"{100 * part:.0f} %" for part in filled)
     return [
-        f"fixations fill {across} × {down} of their frame, in the middle: were the pictures shown at their own size "
+        f"fixations fill {width} × {height} of their frame, in the middle: were the pictures shown at their own size "
         "(Fixations.in_picture with scale=1), or are the points in degrees?"
     ]
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.columns import DataFrame, Row, table_of
+from semfov.data.fixations.columns import DataFrame, Row, Table, table_of
 from semfov.data.fixations.programs import Origin, Units
 from semfov.data.fixations.record import Fixations
 from semfov.data.fixations.suspicions import warn_of_frames
@@ -84,26 +84,41 @@ def read_table(
     lookup(origin, get_args(Origin), "origin")
     named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     table = table_of(source)
-    by_lower = {column.lower(): column for column in reversed(table.columns)}
-    for name in (*_COLUMNS, *_SIZE, *_MORE):
-        if name not in named and name not in table.columns and name in by_lower:
-            named[name] = by_lower[name]
     needed = _COLUMNS if size is not None else (*_COLUMNS, *_SIZE)
-    missing = [named.get(name, name) for name in needed if named.get(name, name) not in table.columns]
-    if missing:
-        among = ", ".join(map(repr, table.columns))[:300]
-        text = (
-            f"{table.name}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
-            f"{among}; name them by columns={{…}}"
-        )
-        if {*missing} & {*_SIZE}:
-            raise FrameError(f"{text} or give size=")
-        raise DataError(text)
+    theirs = _column_names(table, named)
+    _check_columns(table, [theirs[name] for name in needed], needed)
     rows = []
     for row in table.rows:
-        fields = {name: row.fields.get(named.get(name, name), "") for name in (*needed, *_MORE)}
+        fields = {name: row.fields.get(theirs[name], "") for name in (*needed, *_MORE)}
         rows.append(row._replace(fields=fields))
     return records_of(table.name, rows, size, Coordinates(units, origin))
+
+
+def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
+    """The names of a table's columns by ours: those that a user gives, else ours in any case of letters."""
+    by_lower = {column.lower(): column for column in reversed(table.columns)}
+    names = {}
+    for name in (*_COLUMNS, *_SIZE, *_MORE):
+        if name in named:
+            names[name] = named[name]
+        else:
+            names[name] = name if name in table.columns else by_lower.get(name, name)
+    return names
+
+
+def _check_columns(table: Table, columns: Sequence[str], needed: Sequence[str]) -> None:
+    """Raise `DataError` for a table that lacks some of the needed columns; `columns` has its names for them."""
+    missing = [column for column in columns if column not in table.columns]
+    if not missing:
+        return
+    among = ", ".join(map(repr, table.columns))[:300]
+    text = (
+        f"{table.name}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
+        f"{among}; name them by columns={{…}}"
+    )
+    if {*missing} & {*_SIZE}:
+        raise FrameError(f"{text} or give size=")
+    raise DataError(text)
 
 
 class Coordinates(NamedTuple):
