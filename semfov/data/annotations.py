@@ -43,7 +43,7 @@ class Annotations:
     digest: str
 
     def size(self, image: Id) -> tuple[int, int] | None:
-        """`(width, height)` of an image; None if the file does not say."""
+        """Tell `(width, height)` of an image; None if the file does not say."""
         width = self.images[image].get("width")
         height = self.images[image].get("height")
         return None if width is None or height is None else (int(width), int(height))
@@ -127,7 +127,7 @@ _REMEDY = "correct or replace the file"
 
 
 def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> list[Entry]:
-    """The entries of a list, whose fields are as expected."""
+    """List the entries of the file under a key; raises `DataError` unless their fields are as expected."""
     entries = data.get(key)
     if not isinstance(entries, list):
         raise DataError(f"{name}: expected {key} to be a list, got {_shown(data, key)}; {_REMEDY}")
@@ -142,7 +142,7 @@ def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> 
 
 
 def _by_id(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, Entry]:
-    """The checked entries of a list by their ids, which are unique."""
+    """Index the checked entries under a key by their ids, which are unique."""
     entries: dict[Id, Entry] = {}
     for place, entry in enumerate(_checked(data, key, name, {"id": _ID, **fields})):
         if entry["id"] in entries:
@@ -159,12 +159,12 @@ def _check_one_kind(ids: Collection[Id], where: str) -> None:
 
 
 def _is_whole(value: object) -> bool:
-    """Whether a number is whole, also as tables with gaps write it, 7.0."""
+    """Tell whether a number is whole, also as tables with gaps write it, 7.0."""
     return type(value) is int or (type(value) is float and value.is_integer())
 
 
 def _plain_id(value: Any) -> Id:
-    """An id as an integer where it is a number, so that 7.0 is 7."""
+    """Convert an id that is a number to an integer, so that 7.0 is 7."""
     return int(value) if isinstance(value, float) else value
 
 

@@ -79,7 +79,7 @@ hair drier: hair dryer, blow dryer, hairdryer, dryer
 
 
 def _classes_by_synonym(table: str) -> dict[str, tuple[str, ...]]:
-    """Classes by each of their synonyms, which are written without spaces."""
+    """Group classes by each of their synonyms, which are written without spaces."""
     classes: dict[str, tuple[str, ...]] = {}
     for line in table.strip().splitlines():
         name, _, synonyms = line.partition(": ")
@@ -195,7 +195,7 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
 
 
 def _checked_index(value: object, count: int, argument: str) -> int:
-    """An index of one of `count` classes, which may be a number of NumPy or of a tensor."""
+    """Check an index of one of `count` classes, which may be a number of NumPy or of a tensor."""
     number = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
     if not isinstance(number, Integral) or isinstance(number, bool) or not 1 <= int(number) <= count:
         raise InputError(f"{argument}: expected a name, or a whole number from 1 to {count}, got {number!r}")
@@ -203,7 +203,7 @@ def _checked_index(value: object, count: int, argument: str) -> int:
 
 
 def _inflections(key: str) -> set[str]:
-    """The singular and the plurals of a class, in COCO's and in Darknet's spelling."""
+    """List the singular and the plurals of a class, in COCO's and in Darknet's spelling."""
     forms = _other_numbers(key)
     if key in _DARKNET:
         forms |= _other_numbers(_DARKNET[key])
@@ -211,7 +211,7 @@ def _inflections(key: str) -> set[str]:
 
 
 def _similar_keys(wanted: str, keys: Sequence[str]) -> list[str]:
-    """The classes that an unknown name may mean: those with it as a synonym, and those of a similar spelling."""
+    """Find the classes that an unknown name may mean: those with it as a synonym, and those of a similar spelling."""
     singular = [word for word in _SYNONYMS if wanted in _other_numbers(word)]
     meant = []
     for word in (wanted, *singular):
@@ -255,7 +255,7 @@ def class_numbers(
 
 
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:
-    """The message for an unknown class, with the classes that may be meant."""
+    """Write the message for an unknown class, with the classes that may be meant."""
     names = list(dict.fromkeys(meant))
     if names:
         hint = f"did you mean {' or '.join(map(repr, names))}?"
@@ -267,13 +267,13 @@ def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[s
 
 
 def _plain_key(name: str) -> str:
-    """A name in lower case, without spaces, underscores and hyphens, in COCO's spelling."""
+    """Write a name in lower case, without spaces, underscores and hyphens, in COCO's spelling."""
     plain = re.sub(r"[\s_-]+", "", name.lower())
     return re.sub(r"\s", "", _ALIASES.get(plain, plain))
 
 
 def _other_numbers(key: str) -> set[str]:
-    """Plural forms of a class name; for a name that is a plural, also its singular."""
+    """List the plural forms of a class name; for a name that is a plural, also its singular."""
     forms = {f"{key}s", f"{key}es", _IRREGULAR.get(key, f"{key}s")}
     for end, plural in (("y", "ies"), ("f", "ves"), ("fe", "ves")):
         if key.endswith(end):

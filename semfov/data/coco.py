@@ -111,7 +111,7 @@ class CocoScenes(Scenes):
         self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
 
     def _rows_of(self, ids: Collection[int | str] | None) -> list[int]:
-        """The places of the images to select from, ascending; raises `DataError` for ids of no image."""
+        """Find the rows of the images to select from, ascending; raises `DataError` for ids of no image."""
         image_ids = [str(image) for image in self._packed.ids]
         if ids is None:
             return list(range(len(image_ids)))
@@ -123,7 +123,7 @@ class CocoScenes(Scenes):
         return [row for row, image in enumerate(image_ids) if image in chosen]
 
     def _select(self, criteria: "_Criteria", rows: Sequence[int], limit: int | None) -> dict[int, list[int]]:
-        """The legal targets of the first images that meet the criteria, by the places of the images."""
+        """Select the first images that meet the criteria; returns their legal targets by their rows."""
         selected: dict[int, list[int]] = {}
         for row in rows:
             if len(selected) == limit:
@@ -197,7 +197,7 @@ class _Criteria:
 
 
 def _in_words(repairs: Counter[str]) -> str:
-    """The most frequent repairs with their numbers, and the sum of the others."""
+    """Name the most frequent repairs with their numbers, and the sum of the others."""
     counts = repairs.most_common()
     words = ", ".join(f"{repair}: {count}" for repair, count in counts[:_MOST_REPAIRS])
     others = [count for _, count in counts[_MOST_REPAIRS:]]
@@ -207,7 +207,7 @@ def _in_words(repairs: Counter[str]) -> str:
 
 
 def _files_of(root: str | PathLike[str], names: Sequence[str]) -> list[Path]:
-    """The files of images inside their folder; raises `DataError` unless all are there and regular."""
+    """Find the files of images inside their folder; raises `DataError` unless all are there and regular."""
     files = [inside(root, name) for name in names]
     for path in files:
         check_regular(path, f"image {path}")
@@ -287,7 +287,7 @@ class _Packed:
 
 
 def _size_of(file: Annotations, image: Id, path: object) -> tuple[int, int]:
-    """`(width, height)` of an image; raises `DataError` where the file does not say."""
+    """Tell `(width, height)` of an image; raises `DataError` where the file does not say."""
     size = file.size(image)
     if size is None:
         raise DataError(f"annotations {path}: expected width and height of image {image!r}, got none")
@@ -295,7 +295,7 @@ def _size_of(file: Annotations, image: Id, path: object) -> tuple[int, int]:
 
 
 def _labels_of(file: Annotations, classes: tuple[str, ...], name: str) -> dict[Id, int]:
-    """Index of the class by category id, 0 for categories that the detector does not have."""
+    """Find the index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
     labels = {category: indices.get(canonical_name(entry["name"]), 0) for category, entry in file.categories.items()}
     first = ", ".join(ascii(entry["name"]) for entry in list(file.categories.values())[:5]) or "none"

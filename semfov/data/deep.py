@@ -48,7 +48,7 @@ def deep_values(copies: tuple[Any, Any], load: Callable[[Any], Any]) -> tuple[ND
 
 
 def _ppm_values(image: Any) -> tuple[NDArray[np.uint16], int]:
-    """The values of a PPM, which are not packed, and the value that it says is white."""
+    """Read the values of a PPM, which are not packed, and the value that it says is white."""
     tile = image.tile[0]
     mode, white = tile.args
     shape = image.height, image.width, _CHANNELS[mode]

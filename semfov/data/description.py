@@ -91,7 +91,7 @@ class Description:
     def _limits(
         self, white: White | None, read: Callable[[Box], Values], nodata: float | None
     ) -> tuple[float, float] | None:
-        """The values that are black and white; None for those of the file's type."""
+        """Choose the values that are black and white; None for those of the file's type."""
         if white is None:
             if self.sixteen_bits:
                 self._warn_of_range(read)
@@ -113,7 +113,7 @@ class Description:
             warn_of_range(least, most, self.path)
 
     def _sample_boxes(self) -> list[Box]:
-        """Windows that are spread evenly over the picture."""
+        """Find windows that are spread evenly over the picture."""
         width, height = self.size
         lefts = [width * (1 + 2 * number) // (2 * _SAMPLES) for number in range(_SAMPLES)]
         tops = [height * (1 + 2 * number) // (2 * _SAMPLES) for number in range(_SAMPLES)]

@@ -79,7 +79,7 @@ def sheet(classes: Sequence[str]) -> Scene:
 
 
 def _single(scenes: EmbeddedScenes, index: int) -> Scene:
-    """A scene without the boxes of crowds."""
+    """Read a scene without the boxes of crowds."""
     scene = scenes[index]
     is_single = ~scenes.annotation(index).crowd
     return replace(scene, boxes=scene.boxes[is_single], labels=scene.labels[is_single])

@@ -86,7 +86,7 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
 def _deep_pixels(
     path: str | PathLike[str], *, upright: bool, white: White | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pixels `(H, W, 3)` in [0, 1] of a file with more than 8 bits a channel, over white, and its colours alone."""
+    """Read a file with more than 8 bits a channel: pixels `(H, W, 3)` in [0, 1] over white, and the colours alone."""
     with opening(Path(path), "decoded"), open_pillow(path) as image, open_pillow(path) as again:
         values, most = deep_values((image, again), partial(_loaded, upright=upright))
     samples = values.shape[-1]
@@ -175,7 +175,7 @@ def opening(source: Path | str, action: str) -> Iterator[None]:
 
 
 def _fault(error: Exception, source: Path | str, action: str) -> str:
-    """What is wrong with a picture by the error of a decoder, and the remedy (`opening`)."""
+    """Say what is wrong with a picture by the error of a decoder, and the remedy (`opening`)."""
     # By their names, as Pillow need not be imported yet.
     if type(error).__name__ == "DecompressionBombError":
         most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
@@ -284,7 +284,7 @@ def from_pillow(image: "Image", name: str, white: White | None = None) -> Tensor
 
 
 def _orientation(image: "Image") -> int:
-    """The EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
+    """Read the EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
     try:
         orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
     except Exception:  # of the kind that the damage has
@@ -309,7 +309,7 @@ def _loaded(image: "Image", *, upright: bool) -> "Image":
 
 
 def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
-    """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
+    """Decode an image to pixels `(H, W, 3)` in [0, 1], upright or as stored."""
     sixteen_bits = image.mode in SIXTEEN_BITS
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     is_inverted = sixteen_bits and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
@@ -328,7 +328,7 @@ def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) ->
 
 
 def _grey_pixels(values: Values, mode: str, name: str) -> NDArray[np.float32]:
-    """Grey values of 16 bits, or floats, in [0, 1]; raises `DataError` for values whose white is not known."""
+    """Scale grey values of 16 bits, or floats, to [0, 1]; raises `DataError` for values whose white is not known."""
     most = 1.0 if mode == "F" else 65535.0
     least = values.min()
     greatest = values.max()
@@ -339,7 +339,7 @@ def _grey_pixels(values: Values, mode: str, name: str) -> NDArray[np.float32]:
 
 
 def _over_white(image: "Image") -> "Image":
-    """A Pillow image, whose transparent pixels are blended with white."""
+    """Blend the transparent pixels of a Pillow image with white."""
     from PIL import Image
 
     if "transparency" not in image.info and image.mode not in _TRANSPARENT:
@@ -374,7 +374,7 @@ class PhotographPicture(LargePicture):
         return self._array[y1:y2, x1:x2]
 
     def _decoded_bytes(self) -> NDArray[np.uint8] | None:
-        """The bytes of a picture that has no more than 8 bits a channel, without floats in between; None for others."""
+        """Decode a picture of no more than 8 bits a channel, without floats in between; None for others."""
         with opening(self.path, "decoded"), open_pillow(self.path) as image:
             if image.mode not in _PLAIN or self._white is not None or is_deep(image):
                 return None

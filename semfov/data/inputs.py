@@ -120,7 +120,7 @@ def as_images(
 
 
 def _scaled(pixels: Tensor, white: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Whole numbers divided by that of white, on a device and in a dtype."""
+    """Divide whole numbers by that of white, on a device and in a dtype."""
     if dtype == torch.float32 and device.type == "cpu" and values_known(pixels):
         # Other than torch, NumPy converts and divides in one pass over memory.
         return torch.from_numpy(np.divide(pixels.cpu().numpy(), white, dtype=np.float32))
@@ -157,7 +157,7 @@ def as_batch(images: ImageLike) -> Tensor:
 
 
 def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
-    """The pixels of a picture; arrays and tensors keep their layout, without `white` also their dtype."""
+    """Convert a picture to a tensor; arrays and tensors keep their layout, without `white` also their dtype."""
     if white is not None and isinstance(image, Tensor | np.ndarray):
         values = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
         check(values.dtype.kind in "buif" and values.size > 0, argument, "numbers", f"{values.dtype} {values.shape}")
@@ -179,7 +179,7 @@ def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
 
 
 def _native(array: Values, argument: str) -> Tensor:
-    """An array of a dtype that torch has, in the byte order of the machine, as a tensor."""
+    """Convert an array to a tensor, in a dtype that torch has and in the byte order of the machine."""
     name = f"{array.dtype.kind}{array.dtype.itemsize}"
     is_signed = array.dtype.kind == "i"
     remedy = "; convert it to bytes, array.astype('uint8'), or give white=" if is_signed else ""
@@ -207,7 +207,7 @@ def check_local(path: str | PathLike[str], argument: str) -> None:
 
 
 def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
-    """Pixels in any layout that `as_image` accepts as `(B, 3, H, W)`; `choose` takes `(3, H, 3)` as channels first."""
+    """Move the channels to the front, `(B, 3, H, W)`; `choose` takes `(3, H, 3)` as channels first."""
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")
     check(pixels.numel() > 0, argument, "at least one pixel", f"shape {shape}")

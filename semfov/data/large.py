@@ -98,7 +98,7 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
 
 
 def _bytes_of(source: ImageLike, color: Color, white: White | None) -> NDArray[np.uint8]:
-    """The bytes of a picture in memory, `(H, W, 3)` or `(H, W)`; an array of them is not copied."""
+    """Convert a picture in memory to bytes, `(H, W, 3)` or `(H, W)`; an array of them is not copied."""
     if white is not None or not _is_of_bytes(source):
         return to_bytes(as_image(source, argument="picture", color=color, white=white).detach())
     if isinstance(source, np.ndarray) and _has_channels_last(source):
@@ -111,12 +111,12 @@ def _bytes_of(source: ImageLike, color: Color, white: White | None) -> NDArray[n
 
 
 def _is_of_bytes(source: ImageLike) -> bool:
-    """Whether a picture is an array or a tensor of bytes."""
+    """Tell whether a picture is an array or a tensor of bytes."""
     return isinstance(source, Tensor | np.ndarray) and source.dtype in (torch.uint8, np.dtype(np.uint8))
 
 
 def _has_channels_last(array: NDArray[np.uint8]) -> bool:
-    """Whether an array is grey, or has its three channels last beyond doubt."""
+    """Tell whether an array is grey, or has its three channels last beyond doubt."""
     if not array.size:
         return False
     return array.ndim == 2 or (array.shape[2:] == (3,) and array.shape[0] != 3)

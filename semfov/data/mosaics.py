@@ -86,7 +86,7 @@ class Mosaics(ComposedScenes):
         return [self._placed(slot, scene) for slot, scene in enumerate(order.tolist())]
 
     def _placed(self, slot: int, scene: int) -> _Tile:
-        """A photograph in the middle of its slot, as large as fits with its proportions."""
+        """Place a photograph in the middle of its slot, as large as fits with its proportions."""
         slot_width, slot_height = self.tile
         full_width, full_height = self.scenes.annotation(scene).size
         scale = min(slot_width / full_width, slot_height / full_height)

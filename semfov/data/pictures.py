@@ -61,5 +61,5 @@ class Pictures(Scenes):
         return []
 
     def _path(self, name: str) -> Path:
-        """The file of a name; one's own folder may hold links to photographs elsewhere."""
+        """Find the file of a name; one's own folder may hold links to photographs elsewhere."""
         return inside(self.root, name, links=True)

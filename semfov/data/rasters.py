@@ -80,7 +80,7 @@ class RasterPicture(LargePicture):
         return False
 
     def _reduced(self, box: Box, reduction: int) -> Tensor:
-        """A window from the overviews of the file, or from a copy where it has none."""
+        """Read a window from the overviews of the file, or from a copy where it has none."""
         if not self._has_overviews:
             return super()._reduced(box, reduction)
         x1, y1, x2, y2 = box
@@ -94,21 +94,21 @@ class RasterPicture(LargePicture):
         return torch.from_numpy(self.pixels(outwards, reduction)).permute(2, 0, 1)
 
     def _values(self, box: Box, reduction: int = 1) -> Values:
-        """The values of the bands, `(h, w, C)`."""
+        """Read the values of the bands, `(h, w, C)`."""
         options = _window_options(box, reduction, len(self._bands))
         with self._lock, opening(self.path, "decoded"), self._settings:
             values = self._file.read(self._bands, **options)
         return np.moveaxis(values, 0, -1)
 
     def _mask(self, box: Box, reduction: int) -> NDArray[np.uint8]:
-        """The mask of the bands, 255 where a pixel is there, `(h, w, 1)`."""
+        """Read the mask of the bands, 255 where a pixel is there, `(h, w, 1)`."""
         options = _window_options(box, reduction, 1)
         with self._lock, opening(self.path, "decoded"), self._settings:
             mask = self._file.read_masks([self._bands[0]], **options)
         return np.moveaxis(mask, 0, -1)
 
     def _colour_of_nothing(self, nodata: float | None) -> tuple[int, int, int] | None:
-        """The colour in which pixels without data are shown; None where the file does not tell them."""
+        """Find the colour in which pixels without data are shown; None where the file does not tell them."""
         if self._is_masked:
             return 255, 255, 255
         if nodata is None:
@@ -119,7 +119,7 @@ class RasterPicture(LargePicture):
 
 
 def _window_options(box: Box, reduction: int, bands: int) -> Mapping[str, object]:
-    """The arguments by which rasterio reads a window, reduced by a factor."""
+    """Write the arguments by which rasterio reads a window, reduced by a factor."""
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
@@ -141,7 +141,7 @@ def _check_kind(file: Raster, path: str | PathLike[str], *, has_white: bool) -> 
 
 
 def _describe(path: Path, file: Raster) -> Description:
-    """What a dataset of GDAL, or a mosaic, says of its values."""
+    """Describe the values of a dataset of GDAL, or of a mosaic."""
     meanings = [meaning.name for meaning in file.colorinterp]
     numbers = {name: meanings.index(name) + 1 for name in meanings}
     # GDAL leaves two things to those who show a picture: TIFFs whose 0 is white, and colours that are multiplied.
@@ -226,7 +226,7 @@ def _open_otherwise(path: str | PathLike[str], white: White | None, bands: Chose
 
 
 def _is_converted(path: str | PathLike[str]) -> bool:
-    """Whether a TIFF is turned, or of other colours than grey and RGB: Pillow converts these, or nobody reads them."""
+    """Tell whether a TIFF is turned, or of other colours than grey and RGB, which Pillow alone converts."""
     tags = _tags_of(path)
     is_turned = tags.orientation != UPRIGHT
     # Of others Pillow reads none, or the first band as grey.
@@ -239,7 +239,7 @@ def _is_converted(path: str | PathLike[str]) -> bool:
 
 
 def _tags_of(path: str | PathLike[str]) -> TiffTags:
-    """The tags of the first page of a TIFF; none where they cannot be read."""
+    """Read the tags of the first page of a TIFF; none where they cannot be read."""
     check_regular(path, f"image {Path(path)}")
     with quiet_decoders:
         # Decoders of damaged files raise errors of many kinds.

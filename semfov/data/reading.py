@@ -47,7 +47,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
 
 
 def _is_read_by_windows(path: str | PathLike[str]) -> bool:
-    """Whether a file is a TIFF or JPEG 2000 of which Pillow would lose masks, channels that are pages, or 16 bits.
+    """Tell whether a file is one of which Pillow would lose masks, channels that are pages, or 16 bits of colours.
 
     Grey pictures of 16 bits are Pillow's, as it keeps their precision, which bytes do not.
     """

@@ -201,11 +201,11 @@ class ComposedScenes(Scenes):
         self.ids = list(range(count))
 
     def _generator(self, index: int, *part: int) -> np.random.Generator:
-        """The random numbers of a scene, or of a part of it."""
+        """Make the random numbers of a scene, or of a part of it."""
         return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], *part]))
 
     def _scene(self, index: int, kind: str, image: Tensor) -> Scene:
-        """A composed image with its objects, named after its kind."""
+        """Join a composed image and its objects to a scene, named after its kind."""
         annotation = self.annotation(index)
         number = self.ids[index]
         return Scene(number, f"{kind} {number}, seed {self._seed}", image, annotation.boxes, annotation.labels)

@@ -39,7 +39,7 @@ class _Photograph(NamedTuple):
 
 
 def _photographs() -> tuple[tuple[str, ...], tuple[_Photograph, ...]]:
-    """The names of all classes in the photographs, and the photographs, as their file in COCO's format lists them."""
+    """Read the names of all classes in the photographs, and the photographs, from their file in COCO's format."""
     record = read_json(FOLDER / "photographs.json", name="photographs.json")
     labels_by_id = {category["id"]: label for label, category in enumerate(record["categories"], 1)}
     photographs = []
@@ -66,7 +66,7 @@ class _Part(NamedTuple):
     mirrored: bool = False
 
     def objects(self) -> Annotation:
-        """The objects of which at least half is seen, with what is seen of their boxes."""
+        """List the objects of which at least half is seen, with what is seen of their boxes."""
         objects = self.photograph.objects
         left, top, right, bottom = self.box
         corner = torch.tensor([left, top, left, top]).float()
@@ -80,7 +80,7 @@ class _Part(NamedTuple):
         return Annotation(visible, objects.labels[in_part], objects.crowd[in_part], (right - left, bottom - top))
 
     def image(self) -> Tensor:
-        """The pixels, `(3, H, W)`."""
+        """Cut out the pixels, `(3, H, W)`."""
         left, top, right, bottom = self.box
         image = _pixels(self.photograph.path)[:, top:bottom, left:right]
         return image.flip(-1) if self.mirrored else image.clone()
@@ -174,7 +174,7 @@ class EmbeddedScenes(ComposedScenes):
 
 
 def _drawn(photograph: _Photograph, generator: np.random.Generator) -> _Part:
-    """A random part of a photograph."""
+    """Draw a random part of a photograph."""
     # The numbers are drawn in this order, on which the scenes of a seed depend.
     full_width, full_height = photograph.objects.size
     width = round(full_width * generator.uniform(*_SIDES))
@@ -186,13 +186,13 @@ def _drawn(photograph: _Photograph, generator: np.random.Generator) -> _Part:
 
 
 def _areas(boxes: Tensor) -> Tensor:
-    """Areas of boxes `(M, 4)`."""
+    """Compute the areas of boxes `(M, 4)`."""
     return (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
 
 
 @cache
 def _pixels(path: Path) -> Tensor:
-    """A photograph, `(3, H, W)`, decoded once."""
+    """Decode a photograph once, `(3, H, W)`."""
     return read_image(path)
 
 

@@ -98,7 +98,7 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
 
 
 def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
-    """What is in a folder, without names that begin with a dot: notes of the system, such as ._a.jpg of Apple."""
+    """List what is in a folder, without names that begin with a dot: notes of the system, such as ._a.jpg of Apple."""
     paths = folder.rglob("*") if recursive else folder.iterdir()
     return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
@@ -222,7 +222,7 @@ def _open_recorder(
 
 
 def _cause(source: str | Path | int) -> str:
-    """What may keep a source from being opened, in words that tell what to check."""
+    """Say what to check of a source that cannot be opened."""
     if isinstance(source, int):
         return "it is connected and not in use"
     if isinstance(source, str):
@@ -231,7 +231,7 @@ def _cause(source: str | Path | int) -> str:
 
 
 def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
-    """Frames of files; one that cannot be read, or is not as large as the first, is skipped with a warning."""
+    """Read frames from files; one that cannot be read, or is not as large as the first, is skipped with a warning."""
     size: tuple[int, int] | None = None
     passed = FRAME
     for file in files:
@@ -261,7 +261,7 @@ def _check_frame_size(file: Path, size: tuple[int, int], first: tuple[int, int])
 def _animate(
     shown: Iterator[tuple[Tensor, float]], name: str, most: int | None, gaps: Counter[str]
 ) -> Iterator[Picture]:
-    """Frames of an animation, each after the seconds for which the one before is shown; a damaged one ends it."""
+    """Read the frames of an animation, each after the seconds for which the last one is shown; damage ends them."""
     passed = FRAME
     try:
         for number, (image, seconds) in enumerate(islice(shown, most)):
@@ -273,7 +273,7 @@ def _animate(
 
 
 def _name(address: str) -> str:
-    """An address without user, password and query; raises `InputError` where no stream has it."""
+    """Name a stream by its address without user, password and query; raises `InputError` where no stream has it."""
     kind, _, rest = address.partition("://")
     kinds = (*STREAMS, "http", "https")
     check(kind in kinds, "source", f"an address of a stream ({', '.join(kinds)})", f"{kind}://…")
@@ -336,7 +336,7 @@ class _Recorder(Protocol):
 
 
 def _recorder(cv2: ModuleType, source: str | Path | int) -> _Recorder:
-    """OpenCV's reader of a source."""
+    """Open OpenCV's reader of a source."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised by the caller
     try:
@@ -351,7 +351,7 @@ def _recorder(cv2: ModuleType, source: str | Path | int) -> _Recorder:
 
 
 def _rgb(pixels: Values, white: White | None) -> Tensor:
-    """A frame of OpenCV, BGR or grey, as RGB bytes `(3, H, W)`."""
+    """Convert a frame of OpenCV, BGR or grey, to RGB bytes `(3, H, W)`."""
     if white is not None:
         pixels = bytes_between(pixels, black_and_white(white, pixels))
         if pixels.ndim == 2:
@@ -428,7 +428,7 @@ class _Recording:
             recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
     def _picture(self, pixels: Values) -> Picture:
-        """The frame that was read, by the clock of the stream."""
+        """Note a frame that was read, and date it by the clock of the stream."""
         self._gaps["lost"] += self._missed
         is_camera = isinstance(self._source, int)
         position = self._cv2.CAP_PROP_POS_MSEC
@@ -442,7 +442,7 @@ class _Recording:
         return picture
 
     def _may_go_on(self) -> bool:
-        """Whether a file has frames left by the number that it states."""
+        """Tell whether a file has further frames by the number that it states."""
         is_before_end = self._read + self._gaps["lost"] + self._missed < self._total
         return self._is_file and self._missed < _MOST_ATTEMPTS and is_before_end
 

@@ -147,7 +147,7 @@ class TiffPicture(LargePicture):
             return not self.page.subifds and not any(kind & (REDUCED | MASK) for kind in kinds)
 
     def _values(self, box: Box) -> Values:
-        """The values of the channels in a window, the alpha last, `(h, w, C)`."""
+        """Read the values of the channels in a window, the alpha last, `(h, w, C)`."""
         x1, y1, x2, y2 = box
         # What is not stored is without data, or 0, as GDAL reads it.
         window = np.full((y2 - y1, x2 - x1, len(self._channels)), self._nodata or 0, self.page.dtype)
@@ -162,11 +162,11 @@ class TiffPicture(LargePicture):
         return window
 
     def _colour_values(self, box: Box) -> Values:
-        """The values in a window without the alpha, `(h, w, 1 or 3)`."""
+        """Read the values in a window without the alpha, `(h, w, 1 or 3)`."""
         return self._values(box)[..., : self._colours]
 
     def _shown(self, values: Values) -> NDArray[np.uint8]:
-        """The bytes of values with the alpha last, over white, `(h, w, 3)`."""
+        """Convert values with the alpha last to bytes over white, `(h, w, 3)`."""
         pixels = self._display.colours(values[..., : self._colours])
         if self._has_alpha:
             opaque = np.iinfo(values.dtype).max if values.dtype.kind in "ui" else 1.0
@@ -179,7 +179,7 @@ class TiffPicture(LargePicture):
         return len(self._channels) > self._colours
 
     def _colour_of_nothing(self) -> tuple[int, int, int] | None:
-        """The colour in which pixels without data are shown; None where the file does not tell them."""
+        """Find the colour in which pixels without data are shown; None where the file does not tell them."""
         if self._has_alpha:
             return 255, 255, 255
         if self._nodata is None:
@@ -276,7 +276,7 @@ class _Tiles:
                 yield rows_in_window, columns_in_window, tile[rows, columns]
 
     def _tile(self, row: int, column: int, channel: int) -> Values | None:
-        """A tile, `(h, w, samples)`; None for one that is not stored in the file."""
+        """Read a tile, `(h, w, samples)`; None for one that is not stored in the file."""
         layer = self._layers[channel] if self._has_layers else self._page
         plane = channel if self.separate and not self._has_layers else 0
         if self._has_plain_rows:
@@ -313,7 +313,7 @@ class _Tiles:
         check_data(len(inflated) < most, f"image {self._path}", f"tiles of {size:,} bytes", got)
 
     def _plain_rows(self, layer: _Layer, plane: int, part: int) -> Values:
-        """Rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""
+        """Read rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""
         top = part * self.height
         rows = min(self.height, self._size[1] - top)
         samples = 1 if self._page.planarconfig == PLANES else self._page.samplesperpixel
@@ -330,7 +330,7 @@ class _Tiles:
 
 
 def _first_page(file: "TiffFile") -> _Page:
-    """The first page that is no reduced copy, such as a thumbnail, of another one."""
+    """Find the first page that is no reduced copy, such as a thumbnail, of another one."""
     pages: Any = file.pages
     first = next((number for number in range(min(len(pages), _MOST_PAGES)) if not pages[number].is_reduced), 0)
     page: _Page = pages[first]
@@ -338,7 +338,7 @@ def _first_page(file: "TiffFile") -> _Page:
 
 
 def _layers_of(file: "TiffFile", page: _Page) -> Sequence[_Layer]:
-    """The pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
+    """List the pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
     for series in file.series[:1]:
         pages: list[Any] = list(series.pages)
         are_channels = series.axes == "CYX" and 2 <= len(pages) <= _MOST_LAYERS and page.samplesperpixel == 1
@@ -365,7 +365,7 @@ def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
 
 
 def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
-    """What the tags of a page say of its values."""
+    """Describe the values of a page by its tags."""
     has_layers = len(layers) > 1
     count = len(layers) if has_layers else int(page.samplesperpixel)
     extra = [int(kind) for kind in page.extrasamples]
@@ -392,7 +392,7 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
 
 
 def _named_bands(page: _Page) -> dict[str, int]:
-    """The numbers of bands, from 1, by the names that GDAL has written into a tag, in lower case."""
+    """Find the numbers of bands, from 1, by the names that GDAL has written into a tag, in lower case."""
     metadata = page.tags.get(GDAL_METADATA)
     if metadata is None:
         return {}
@@ -400,7 +400,7 @@ def _named_bands(page: _Page) -> dict[str, int]:
 
 
 def _nodata_of(page: _Page) -> float | None:
-    """The value of pixels without data; None where the file states none that its type has."""
+    """Read the value of pixels without data; None where the file states none that its type has."""
     tag = page.tags.get(GDAL_NODATA)
     try:
         value = float(str("" if tag is None else tag.value).strip("\0 "))

@@ -35,7 +35,7 @@ def check_white(white: White | None) -> None:
 
 
 def _plain(number: Any) -> Any:
-    """A number of Python's for one of NumPy or of a tensor, such as the largest value of a picture."""
+    """Convert a number of NumPy or of a tensor, such as the largest value of a picture, to one of Python's."""
     return number.item() if getattr(number, "ndim", None) == 0 else number
 
 

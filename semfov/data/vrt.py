@@ -156,7 +156,7 @@ class Mosaic:
         return np.broadcast_to(mask, (len(bands), *mask.shape))
 
     def _composed(self, band: Band, window: Any, shape: tuple[int, int], resampling: Any) -> Values:
-        """Values of a band in a window, where a source covers the earlier ones, resampled to a shape `(h, w)`."""
+        """Compose a band in a window, where a source covers the earlier ones, resampled to a shape `(h, w)`."""
         nothing = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
         canvas = np.full(shape, nothing, band.kind)
         box = window.col_off, window.row_off, window.col_off + window.width, window.row_off + window.height
@@ -179,7 +179,7 @@ class Mosaic:
     def _values(
         self, source: Source, columns: _Side, rows: _Side, reduction: Any
     ) -> tuple[Values, NDArray[np.bool_] | None]:
-        """Values of the covered part of a source, and where pixels are there.
+        """Read the values of the covered part of a source, and where pixels are there.
 
         Args:
             source: the source.
@@ -211,7 +211,7 @@ class Mosaic:
 
 
 def _presence(source: Source, file: Dataset, stored: Values, options: Mapping[str, Any]) -> NDArray[np.bool_] | None:
-    """Where the pixels of a source are there, `(h, w)`; None for all over."""
+    """Find where the pixels of a source are there, `(h, w)`; None for all over."""
     if source.masked:
         return np.asarray(file.read_masks(source.band, **options) > 0)
     if source.nodata is None:
@@ -220,7 +220,7 @@ def _presence(source: Source, file: Dataset, stored: Values, options: Mapping[st
 
 
 def _converted(source: Source, file: Dataset, values: Values) -> Values:
-    """The values of a mosaic for those of a source's file: colours of a table, of a curve, and of a scale."""
+    """Convert the values of a source's file to those of the mosaic: by a table of colours, a curve, and a scale."""
     if source.component:
         colours = file.colormap(source.band)
         component = [colours.get(number, (0, 0, 0, 255))[source.component - 1] for number in range(256)]
@@ -249,14 +249,14 @@ def _open_source(file: Path) -> Dataset:
 
 
 def _touching(places: NDArray[np.float64], box: tuple[float, float, float, float]) -> NDArray[np.intp]:
-    """Numbers of the places that meet a window."""
+    """List the numbers of the places that meet a window."""
     x1, y1, x2, y2 = box
     meets = (places[:, 0] < x2) & (places[:, 2] > x1) & (places[:, 1] < y2) & (places[:, 3] > y1)
     return np.flatnonzero(meets)
 
 
 def _as_kind(values: Values, kind: str) -> Values:
-    """Values in another type, rounded and limited to its range as GDAL does."""
+    """Convert values to another type, rounded and limited to its range as GDAL does."""
     if values.dtype == kind:
         return values
     if np.dtype(kind).kind not in "ui":

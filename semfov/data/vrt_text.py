@@ -241,7 +241,7 @@ class _Reader:
         )
 
     def _file(self, name: XML.Element) -> Path:
-        """The path of a source, which is a picture in the folder of the mosaic or below."""
+        """Find the file of a source, which is a picture in the folder of the mosaic or below."""
         text = name.text or ""
         is_relative = name.attrib.get("relativeToVRT") == "1"
         place = text if is_relative else str(Path(text).absolute())
@@ -252,14 +252,14 @@ class _Reader:
         return self._files[place]
 
     def _band_of(self, text: str, file: Path, raster: Dataset) -> tuple[int, bool]:
-        """The number of a source's band, and whether its mask is taken: `2`, or `mask,2`."""
+        """Read the number of a source's band, and whether its mask is taken: `2`, or `mask,2`."""
         word, _, number = text.rpartition(",")
         is_band = word in ("", "mask") and number.isdecimal() and 1 <= int(number) <= raster.count
         check_data(is_band, self._path, f"a band of {file.name} from 1 to {raster.count}", f"{text!r:.40}")
         return int(number), word == "mask"
 
     def _rects(self, parts: dict[str, XML.Element], raster: Dataset) -> tuple[Rect, Rect]:
-        """The part of a source's file that is shown, cut to the file, and its place in the mosaic."""
+        """Read the part of a source's file that is shown, cut to the file, and its place in the mosaic."""
         are_both = ("SrcRect" in parts) == ("DstRect" in parts)
         check_data(are_both, self._path, "both SrcRect and DstRect of a source, or neither", "one of them")
         if "SrcRect" in parts:
@@ -272,7 +272,7 @@ class _Reader:
         return (x, y, width, height), (left, top, place_width, place_height)
 
     def _resampling(self, element: XML.Element) -> str:
-        """The name of a source's resampling."""
+        """Read the name of a source's resampling."""
         if element.tag == "AveragedSource":
             return "average"
         name = element.attrib.get("resampling", "nearest")
@@ -281,7 +281,7 @@ class _Reader:
         return name
 
     def _table(self, text: str) -> tuple[tuple[float, float], ...]:
-        """Values and what stands for them: `0:0,255:1`."""
+        """Read values and what stands for them: `0:0,255:1`."""
         pairs = []
         for pair in text.split(","):
             if pair:
@@ -304,7 +304,7 @@ def _root(path: Path) -> XML.Element:
 
 
 def _known_parts(element: XML.Element, known: tuple[str, ...], path: Path) -> list[XML.Element]:
-    """The known parts of an element, without those that are not needed; others are refused."""
+    """List the known parts of an element, without those that are not needed; others are refused."""
     subclasses = [value for name, value in element.attrib.items() if name.lower() == "subclass"]
     kind = subclasses[0] if subclasses else element.tag
     is_plain = kind in (element.tag, "VRTSourcedRasterBand")
@@ -320,7 +320,7 @@ def _text(element: XML.Element) -> str:
 
 
 def _picture(path: Path, name: str) -> Path:
-    """The file of a source by the name in a mosaic."""
+    """Find the file of a source by its name in a mosaic."""
     try:
         file = inside(path.parent, name).resolve()
     except DataError:
@@ -332,7 +332,7 @@ def _picture(path: Path, name: str) -> Path:
 
 
 def _system(element: XML.Element, path: Path) -> Any:
-    """The reference system of a mosaic; other words than a number or WKT may be files and addresses."""
+    """Read the reference system of a mosaic; other words than a number or WKT may be files and addresses."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
@@ -349,7 +349,7 @@ def _system(element: XML.Element, path: Path) -> Any:
 
 
 def _numbers(text: str | None, count: int, path: Path) -> tuple[float, ...]:
-    """Numbers with commas between them."""
+    """Read numbers with commas between them."""
     try:
         numbers = tuple(float(number) for number in (text or "").split(","))
     except ValueError:
@@ -359,7 +359,7 @@ def _numbers(text: str | None, count: int, path: Path) -> tuple[float, ...]:
 
 
 def _pixels(element: XML.Element, name: str, path: Path) -> float:
-    """An attribute of an element that is a number of pixels."""
+    """Read an attribute of an element that is a number of pixels."""
     (number,) = _numbers(element.attrib.get(name), 1, path)
     check_data(bool(np.isfinite(number)) and abs(number) < 2**31, path, f"a number of pixels as {name}", number)
     return number

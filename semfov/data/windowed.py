@@ -75,7 +75,7 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _shortened(canvas: Tensor, height: int) -> Tensor:
-    """The columns of bytes `(h, w, 3)` resampled to a height, with the layout of `(height, w, 3)` in memory.
+    """Resample the columns of bytes `(h, w, 3)` to a height, with the layout of `(height, w, 3)` in memory.
 
     torch shortens rows first. Columns first takes half of the time: that step is the faster one, and still faster if
     four bytes are a pixel.
@@ -87,7 +87,7 @@ def _shortened(canvas: Tensor, height: int) -> Tensor:
 
 
 def _bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
-    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared; they are not to be written to."""
+    """View bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared; not to be written to."""
     try:
         # Other than `from_numpy`, it takes arrays that may not be written to.
         shared = from_dlpack(pixels if min(pixels.strides) >= 0 else pixels.copy())
@@ -179,7 +179,7 @@ class LargePicture(ABC):
         return _bytes_of(self._checked_pixels(box))
 
     def _checked_pixels(self, box: Box) -> NDArray[np.uint8]:
-        """The pixels of a window; raises `InputError` where a reader gives others."""
+        """Read the pixels of a window; raises `InputError` where a reader gives others."""
         x1, y1, x2, y2 = box
         pixels = self.pixels(box)
         shape = y2 - y1, x2 - x1, 3
@@ -200,7 +200,7 @@ class LargePicture(ABC):
         return reduction
 
     def _reduced(self, box: Box, reduction: int) -> Tensor:
-        """A window of a copy, `(3, h, w)`."""
+        """Cut a window out of a copy, `(3, h, w)`."""
         copy = self._copy(reduction)
         height, width = copy.shape[1:]
         x1, y1, x2, y2 = box
@@ -217,7 +217,7 @@ class LargePicture(ABC):
         return {}
 
     def _copy(self, reduction: int) -> Tensor:
-        """A copy, without what is left of sides that are no multiples of the reduction, less than one of its pixels."""
+        """Find or make a copy, without the rest of sides that are no multiples of the reduction."""
         if reduction not in self._copies:
             if reduction == self._least_reduction:
                 self._copies[reduction] = self._largest_copy()
@@ -228,7 +228,7 @@ class LargePicture(ABC):
         return self._copies[reduction]
 
     def _largest_copy(self) -> Tensor:
-        """The largest copy, made strip by strip; what is not stored is not read."""
+        """Make the largest copy strip by strip; what is not stored is not read."""
         width, height = self._copy_size
         rows = max(1, _STRIP // self.size[0] // self._least_reduction)
         copy = torch.empty(height, width, 3, dtype=torch.uint8)
@@ -247,7 +247,7 @@ class LargePicture(ABC):
         return max(1, width // self._least_reduction), max(1, height // self._least_reduction)
 
     def _runs(self, top: int, bottom: int) -> Iterator[tuple[int, int, bool]]:
-        """Runs of columns of a strip of the largest copy, `(left, right, stored)`, that are stored or are not."""
+        """Find runs of columns of a strip of the largest copy, `(left, right, stored)`, that are stored or are not."""
         width, _ = self._copy_size
         step = max(1, _PIECE // self._least_reduction)
         pieces = []
@@ -260,19 +260,19 @@ class LargePicture(ABC):
             yield columns[0][0], columns[-1][1], stored
 
     def _with_border(self, box: Box) -> Box:
-        """A part of the largest copy with what the filter reaches, less than one pixel at each side."""
+        """Widen a part of the largest copy by what the filter reaches, less than one pixel at each side."""
         x1, y1, x2, y2 = box
         width, height = self._copy_size
         return max(x1 - 1, 0), max(y1 - 1, 0), min(x2 + 1, width), min(y2 + 1, height)
 
     def _around(self, box: Box) -> Box:
-        """The window of the picture of which a part of the largest copy is made."""
+        """Find the window of the picture of which a part of the largest copy is made."""
         left, top, right, bottom = (side * self._least_reduction for side in self._with_border(box))
         width, height = self.size
         return left, top, min(right, width), min(bottom, height)
 
     def _part(self, box: Box) -> Tensor:
-        """A part of the largest copy, `(h, w, 3)`."""
+        """Make a part of the largest copy, `(h, w, 3)`."""
         x1, y1, x2, y2 = box
         left, top, right, bottom = self._with_border(box)
         pixels = _bytes_of(self._checked_pixels(self._around(box)))

@@ -114,7 +114,7 @@ class WordVectors:
 
 
 def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
-    """The vectors of some words in a file, `(D,)` by word; raises `DataError` for a line without one."""
+    """Read the vectors of some words in a file, `(D,)` by word; raises `DataError` for a line without one."""
     vectors: dict[str, Tensor] = {}
     size: int | None = None  # of the vectors, which the first one determines unless word2vec's first line tells it
     with reading(path), path.open(encoding="utf-8", errors="replace", newline="\n") as file:
@@ -137,13 +137,13 @@ def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
 
 
 def _lines(file: IO[str]) -> Iterator[str]:
-    """The lines of a file, longer ones in pieces: a file that is no text may be one line."""
+    """Read the lines of a file, longer ones in pieces: a file that is no text may be one line."""
     while line := file.readline(_LONGEST):
         yield line
 
 
 def _numbers(text: str) -> list[float]:
-    """Numbers with spaces between them; none where there is something else."""
+    """Read numbers with spaces between them; none where there is something else."""
     try:
         return [float(word) for word in text.split()]
     except ValueError:

@@ -125,7 +125,7 @@ def _table_of_frame(frame: DataFrame) -> Table:
 
 
 def _text_of(value: object) -> str:
-    """A value of a data frame as a file would have it."""
+    """Write a value of a data frame as a file would have it."""
     # A column of whole numbers in which one is missing is one of floats.
     if isinstance(value, float) and value.is_integer():
         value = int(value)
@@ -158,7 +158,7 @@ def _table_of_file(path: Path, name: str) -> Table:
 
 
 def _field(text: str | None, separator: str) -> str:
-    """A field of a line without spaces around it; a decimal comma is a point where commas do not separate fields."""
+    """Strip a field, and make a decimal comma a point where commas do not separate fields."""
     plain = (text or "").strip()
     if separator != "," and _DECIMAL.fullmatch(plain):
         return plain.replace(",", ".")

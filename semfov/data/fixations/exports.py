@@ -116,7 +116,7 @@ _PAIR = ("location_x", "location_y")  # columns that are made of one of pairs
 
 
 def _with_pairs(table: Table) -> Table:
-    """A table in which a column `location` of pairs, `[x, y]`, has become two columns."""
+    """Make two columns of a column `location` of pairs, `[x, y]`, if a table has one."""
     names = {Column.of(name).key: name for name in table.columns}
     if "location" not in names or "locationx" in names:
         return table
@@ -201,14 +201,14 @@ class _Layout:
         return fixations
 
     def _is_fixation(self, stored: Mapping[str, str]) -> bool:
-        """Whether a row is that of a fixation on the picture."""
+        """Tell whether a row is that of a fixation on the picture."""
         if self.filter is None or self.program.keep is None:
             return True
         _, beginnings = self.program.keep
         return stored[self.filter].lower().startswith(beginnings)
 
     def _fields_of(self, stored: Mapping[str, str]) -> dict[str, str]:
-        """The fields of a row by our names; those that hold nothing are empty."""
+        """Take the fields of a row by our names; those that hold nothing are empty."""
         fields = dict.fromkeys(("target", *_OTHERS), "")
         for name, column in self.names.items():
             fields[name] = "" if column is None else stored.get(column, "")
@@ -221,7 +221,7 @@ class _Layout:
 
 
 def _scaled(text: str, factor: float) -> str:
-    """A number multiplied by a factor; what is no number becomes one that is refused with its place."""
+    """Multiply a number by a factor; what is none becomes NaN, which is refused with its place later."""
     try:
         return repr(float(text) * factor)
     except ValueError:
@@ -229,7 +229,7 @@ def _scaled(text: str, factor: float) -> str:
 
 
 def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
-    """The name of the first column with one of some keys, of which the first counts most."""
+    """Find the name of the first column with one of some keys, of which the first counts most."""
     for key in keys:
         for column in columns:
             if column.key == key:
@@ -238,7 +238,7 @@ def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
 
 
 def _duration_column(program: Program, columns: Sequence[Column], name: str | None) -> Column | None:
-    """The column of durations in a unit that is read: that of a name, which a user gives, or of the program."""
+    """Find the column of durations in a unit that is read: that of a user's `name`, or of the program."""
     if name is not None:
         candidates = [Column.of(name)]
     else:
@@ -248,7 +248,7 @@ def _duration_column(program: Program, columns: Sequence[Column], name: str | No
 
 
 def _point_columns(program: Program, columns: Sequence[Column], table: str) -> tuple[Column, Column]:
-    """The columns of x and y, in a unit that is read; fractions, which are not rounded to pixels, before pixels."""
+    """Find the columns of x and y in a unit that is read; fractions, which are not rounded, before pixels."""
     x_columns, y_columns = (program.of_point(key, columns) for key in program.point)
     pairs = [(x, y) for x in x_columns for y in y_columns if (x.frame, x.unit) == (y.frame, y.unit)]
     read = [(x, y) for x, y in pairs if not x.unit or x.unit in LENGTHS]
@@ -258,7 +258,7 @@ def _point_columns(program: Program, columns: Sequence[Column], table: str) -> t
 
 
 def _unread(columns: Sequence[Column]) -> str:
-    """A sentence on columns that may be durations of fixations, but are not read; empty where there is none."""
+    """Say which columns may be durations of fixations, but are not read; empty where there is none."""
     names = ", ".join(repr(column.name) for column in columns if _LASTING.search(column.key))
     return names and f"no duration is read, although there is {names}; name it by columns={{'duration': …}}, in ms or s"
 
@@ -284,7 +284,7 @@ def _name_pictures(rows: Sequence[Row], picture: str | None, table: str) -> None
 
 
 def _viewings(rows: Sequence[Row]) -> list[Row]:
-    """The rows with the number of their viewing in `trial`, and one row for each number of a fixation."""
+    """Write the number of their viewing into `trial` of rows, and keep one row for each number of a fixation."""
     fixations: dict[object, Row] = {}
     viewing = 0
     previous = None
@@ -299,7 +299,7 @@ def _viewings(rows: Sequence[Row]) -> list[Row]:
 
 
 def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
-    """The rows of an eye, of the right one in viewings of both; rows that name no eye, or both, are kept."""
+    """Take the rows of an eye, of the right one in viewings of both; rows that name no eye, or both, stay."""
     sides = [_side(row.fields.pop("eye")) for row in rows]
     with_right = {row.fields["trial"] for row, side in zip(rows, sides, strict=True) if side == "right"}
     chosen = []
@@ -311,7 +311,7 @@ def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
 
 
 def _side(text: str) -> str:
-    """The side of an eye, `left` or `right`, in a field; empty where it tells none."""
+    """Find the side of an eye, `left` or `right`, in a field; empty where it tells none."""
     for word in re.split(r"[\W_]", text.lower()):
         if word in _EYES:
             return _EYES[word]
@@ -319,7 +319,7 @@ def _side(text: str) -> str:
 
 
 def _with_picture(rows: Sequence[Row], layout: _Layout, table: str) -> list[Row]:
-    """The rows that name a picture; those that do not are left out with a warning."""
+    """Take the rows that name a picture, with a warning of those that do not."""
     with_picture = [row for row in rows if row.fields["picture"]]
     if not with_picture:
         expected = f"the name of the picture, which {layout.program.name} does not give"

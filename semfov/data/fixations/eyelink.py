@@ -73,7 +73,7 @@ class _Trial:
         self.end = min(self.end, time)
 
     def viewed(self) -> list[_View]:
-        """The views of its pictures; the whole trial where no picture was loaded."""
+        """List the views of its pictures; the whole trial is one where no picture was loaded."""
         return self.views or [_View(self.name, self.start, self.end)]
 
 
@@ -138,7 +138,7 @@ def read_eyelink(
 
 
 def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:
-    """The screen as `(x, y, width, height)`, in the pixels in which points are counted; `size` overrides the file's."""
+    """Find the screen, `(x, y, width, height)`, in the pixels of the points; `size` overrides that of the file."""
     frame = next((match for line in lines if (match := _FRAME.match(line))), None)
     if frame is None:
         if size is None:
@@ -151,7 +151,7 @@ def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _
 
 
 def _record(view: _View, screen: _Place, person: str, eye: str | None) -> Fixations | None:
-    """The fixations of an eye in a view, from the corner of the picture, or of the screen; None without any."""
+    """Make the record of an eye in a view, from the corner of the picture, or of the screen; None without fixations."""
     fixations = _of_one_eye(view.fixations, eye)
     if not fixations:
         return None
@@ -162,7 +162,7 @@ def _record(view: _View, screen: _Place, person: str, eye: str | None) -> Fixati
 
 
 def _events(path: Path, lines: Iterable[str]) -> tuple[list[_Trial], list[_Fixation]]:
-    """The trials of a recording with the pictures in them, and all fixations that have a place."""
+    """Read the trials of a recording with the pictures in them, and all fixations that have a place."""
     trials: list[_Trial] = []
     fixations: list[_Fixation] = []
     for number, line in enumerate(lines, start=1):
@@ -215,7 +215,7 @@ def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
 
 
 def _loaded(mode: str, rest: str) -> tuple[str, _Place | None]:
-    """The picture of a message `IMGLOAD`, and its place on the screen where the message tells it with its size.
+    """Read the picture of a message `IMGLOAD`, and its place on the screen where the message has it with its size.
 
     Args:
         mode: how the picture is placed, such as `FILL`, `TOP_LEFT` or `CENTER`.
@@ -253,19 +253,19 @@ def _share_out(fixations: Iterable[_Fixation], views: Sequence[_View]) -> None:
 
 
 def _of_one_eye(fixations: Sequence[_Fixation], eye: str | None) -> list[_Fixation]:
-    """The fixations of an eye; None takes the right one where it has any."""
+    """Take the fixations of an eye; None takes the right one where it has any."""
     sides = {fixation.eye for fixation in fixations}
     side = eye[0].upper() if eye is not None else "R" if "R" in sides else "L"
     return [fixation for fixation in fixations if fixation.eye == side]
 
 
 def _lack_of_fixations(trials: Sequence[_Trial]) -> str:
-    """What is there instead of fixations in trials."""
+    """Say what is there instead of fixations in trials."""
     return "none in the time of a picture" if trials else "none; convert the events, too"
 
 
 def _lost(lines: Sequence[str]) -> list[str]:
-    """A sentence on messages and data that the recording says were lost, with their lines."""
+    """Say which messages and data the recording says were lost, with their lines."""
     lost = [number for number, line in enumerate(lines, start=1) if _LOST.search(line)]
     if not lost:
         return []
@@ -274,7 +274,7 @@ def _lost(lines: Sequence[str]) -> list[str]:
 
 
 def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> list[str]:
-    """A sentence on trials whose fixations all lie outside the time of their pictures."""
+    """Say of how many trials all fixations lie outside the time of their pictures."""
     starts = np.sort([fixation.start for fixation in fixations])
     missed = []
     for trial in trials:

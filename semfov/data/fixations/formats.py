@@ -340,20 +340,20 @@ def coco_name(name: str) -> str:
 
 
 def _read(path: Path, kind: Json) -> Any:
-    """The content of a JSON file; errors name the file, the record and the field."""
+    """Read a JSON file; errors name the file, the record and the field."""
     value = read_json(path)
     check_content(path, value, kind)
     return value
 
 
 def _flag(name: str, value: object) -> bool | None:
-    """A boolean of a file, or 1 or 0 in its place."""
+    """Read a boolean of a file, or 1 or 0 in its place."""
     check_data(value is None or value in (True, False), name, "true or false", repr(value))
     return None if value is None else bool(value)
 
 
 def _edges_of(box: Sequence[float] | None) -> _Edges | None:
-    """The edges x1, y1, x2 and y2 of a box `[x, y, width, height]`."""
+    """Find the edges x1, y1, x2 and y2 of a box `[x, y, width, height]`."""
     if box is None:
         return None
     x, y, width, height = box
@@ -361,7 +361,7 @@ def _edges_of(box: Sequence[float] | None) -> _Edges | None:
 
 
 def _box_of_rows(box: Sequence[float] | None, is_in_cells: bool) -> _Edges | None:
-    """The edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`."""
+    """Find the edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`."""
     if box is None:
         return None
     top, left, bottom, right = box
@@ -369,14 +369,14 @@ def _box_of_rows(box: Sequence[float] | None, is_in_cells: bool) -> _Edges | Non
 
 
 def _in_pictures(scanpaths: list[Fixations], sizes: Mapping[str, tuple[int, int]] | None) -> list[Fixations]:
-    """Scanpaths in pixels of their pictures, without those of other pictures; None leaves all as they are."""
+    """Convert scanpaths to pixels of their pictures, without those of other pictures; None leaves all as they are."""
     if sizes is None:
         return scanpaths
     return [scanpath.in_picture(sizes[scanpath.picture]) for scanpath in scanpaths if scanpath.picture in sizes]
 
 
 def _frame(name: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) -> tuple[int, int]:
-    """The frame of a trial of COCO-Search18: its own, else the screen."""
+    """Find the frame of a trial of COCO-Search18: its own, else the screen."""
     width = trial.get("width")
     height = trial.get("height")
     if width is None and height is None:
@@ -392,7 +392,7 @@ def _frame(name: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) 
 def _points_and_durations(
     name: str, trial: Mapping[str, Any], keys: tuple[str, str, str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """The points and durations of a trial.
+    """Read the points and durations of a trial.
 
     Args:
         name: of the trial, for messages.

@@ -46,7 +46,7 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
 
 
 def _onsets(record: Fixations) -> NDArray[np.float64]:
-    """When each fixation begins, in seconds; its number where durations are not known, `(n,)`."""
+    """Tell when each fixation begins, in seconds; its number where durations are not known, `(n,)`."""
     if record.durations is None:
         return np.arange(len(record), dtype=np.float64)
     return (np.cumsum(record.durations) - record.durations) / 1000

@@ -159,7 +159,7 @@ def as_path(points: object, argument: str, *, least: int = 0) -> NDArray[np.floa
 
 
 def _box(corners: _Values) -> tuple[float, float, float, float]:
-    """The box of two corners `(2, 2)`."""
+    """Take the corners of a box, `(2, 2)`, to pieces."""
     x1, y1, x2, y2 = corners.reshape(-1).tolist()
     return x1, y1, x2, y2
 
@@ -215,7 +215,7 @@ class Fixations:
             check(ordered, "box", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", self.box)
 
     def __len__(self) -> int:
-        """Number of fixations, the first included."""
+        """Count the fixations, the first included."""
         return len(self.points)
 
     def resized(self, size: tuple[int, int]) -> "Fixations":
@@ -265,7 +265,7 @@ class Fixations:
     def _placement(
         self, size: tuple[int, int], scale: float | None, place: tuple[float, float, float, float] | None
     ) -> tuple[_Values, _Values]:
-        """The corner of a picture on the frame, and screen pixels per picture pixel along x and y, `(2,)` both."""
+        """Find the corner of a picture on the frame, and screen pixels per picture pixel along x and y, `(2,)` both."""
         letterbox = Letterbox(self.size, size)
         if scale is not None:
             check_number(scale, "scale", 1e-6, 1e6)

@@ -76,7 +76,7 @@ def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
 def _of_frames(
     records: Sequence[Fixations], points: _Array, sides: _Array, sizes: Mapping[str, tuple[int, int]] | None
 ) -> list[str]:
-    """What is suspicious in the frames of points `(n, 2)`, with `sides` `(n, 2)`."""
+    """Say what is suspicious in the frames of points `(n, 2)`, with `sides` `(n, 2)`."""
     other_frame = _looks_like(records)
     if other_frame is not None:
         return [f"points look like {other_frame}"]
@@ -89,7 +89,7 @@ def _of_frames(
 
 
 def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
-    """What fixations look like that do not look like those of their frame; None if they do."""
+    """Say what fixations look like that do not look like those of their frame; None if they do."""
     points, sides = _joined(fixations)
     if len(points) < 3:
         return None
@@ -110,24 +110,24 @@ def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | 
 
 
 def _are_fractions(points: _Array) -> bool:
-    """Whether all points lie in [0, 1], and not all at its ends."""
+    """Tell whether all points lie in [0, 1], and not all at its ends."""
     return bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
 
 
 def _joined(fixations: Sequence[Fixations]) -> tuple[_Array, _Array]:
-    """The points of all records, and the sizes of their frames, `(n, 2)` both."""
+    """Join the points of all records, and the sizes of their frames, `(n, 2)` both."""
     points = np.concatenate([record.points for record in fixations])
     sides = np.concatenate([np.tile(np.array(record.size, np.float64), (len(record), 1)) for record in fixations])
     return points, sides
 
 
 def _outside(points: _Array, sides: _Array) -> NDArray[np.bool_]:
-    """Whether points lie outside their frame, `(n,)`."""
+    """Tell whether points lie outside their frame, `(n,)`."""
     return np.asarray(~((points >= -0.5) & (points < sides - 0.5)).all(1))
 
 
 def _letterbox(points: _Array, sides: _Array) -> list[str]:
-    """Bars without fixations at two opposite sides of one frame, while the other sides have none."""
+    """Find bars without fixations at two opposite sides of one frame, while the other sides have none."""
     if len(points) < _ENOUGH or (sides != sides[0]).any():
         return []
     share = (points + 0.5) / sides
@@ -145,7 +145,7 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
 
 
 def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list[str]:
-    """Bars without fixations at all sides of one frame, whatever the picture."""
+    """Find bars without fixations at all sides of one frame, whatever the picture."""
     pictures = len({record.picture for record in records})
     if len(points) < _ENOUGH or pictures < _ENOUGH_PICTURES or (sides != sides[0]).any():
         return []
@@ -161,7 +161,7 @@ def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list
 
 
 def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Fixations that keep to their pictures' own size in the middle of frames that would hold them much larger."""
+    """Find fixations that keep to their pictures' own size in frames that would hold them much larger."""
     smaller = [
         record
         for record in records
@@ -182,7 +182,7 @@ def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]
 
 
 def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
-    """What is suspicious beside the sizes of the pictures."""
+    """Say what is suspicious beside the sizes of the pictures."""
     pictures = {record.picture for record in records}
     unknown = sorted(picture for picture in pictures if picture not in sizes)
     lines = []
@@ -192,7 +192,7 @@ def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
 
 
 def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Pictures with other proportions than their frames."""
+    """Find pictures with other proportions than their frames."""
     frames = sorted({(record.picture, record.size) for record in records if record.picture in sizes})
     stretched = [(picture, frame) for picture, frame in frames if not _alike(frame, sizes[picture])]
     if not stretched:
@@ -208,7 +208,7 @@ def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[i
 
 
 def _smaller_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Fixations in larger frames that lie within the pixels of their pictures."""
+    """Find fixations in larger frames that lie within the pixels of their pictures."""
     in_larger = [record for record in records if record.size > sizes.get(record.picture, record.size)]
     beyond = any((record.points > sizes[record.picture]).any() for record in in_larger)
     if beyond or sum(map(len, in_larger)) < _MANY:
@@ -222,12 +222,12 @@ def _smaller_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[in
 
 
 def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two `(width, height)` have the same proportions, but for rounding to whole pixels."""
+    """Tell whether two `(width, height)` have the same proportions, but for rounding to whole pixels."""
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= _STRETCH
 
 
 def _of_repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
-    """What repeats: points, records, one place, and scanpaths of a single fixation."""
+    """Say what repeats: points, records, one place, and scanpaths of a single fixation."""
     lines = []
     repeats = np.concatenate([(record.points[1:] == record.points[:-1]).all(1) for record in records])
     if len(repeats) >= _MANY and repeats.mean() > _MOST_REPEATED:
@@ -242,7 +242,7 @@ def _of_repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
 
 
 def _twice(records: Sequence[Fixations]) -> list[str]:
-    """Records of more than one fixation that occur more than once."""
+    """Find records of more than one fixation that occur more than once."""
     counts = Counter((record.picture, record.subject, record.target, record.points.tobytes()) for record in records)
     one_point = np.zeros((1, 2)).nbytes
     repeated = [key for key, count in counts.items() if count > 1 and len(key[3]) > one_point]
@@ -253,7 +253,7 @@ def _twice(records: Sequence[Fixations]) -> list[str]:
 
 
 def _at_one_place(records: Sequence[Fixations], points: _Array) -> list[str]:
-    """Many fixations at one same point, but for those at which scanpaths begin."""
+    """Find many fixations at one same point, but for those at which scanpaths begin."""
     place, count = Counter(map(tuple, points.tolist())).most_common(1)[0]
     first = sum(tuple(record.points[0].tolist()) == place for record in records)
     if len(points) < _MANY or count - first <= max(5.0, _MOST_ALIKE * len(points)):
@@ -263,7 +263,7 @@ def _at_one_place(records: Sequence[Fixations], points: _Array) -> list[str]:
 
 
 def _of_durations(records: Sequence[Fixations]) -> list[str]:
-    """What is suspicious in durations: their unit, their being alike, and their length."""
+    """Say what is suspicious in durations: their unit, their being alike, and their length."""
     durations = [record.durations for record in records if record.durations is not None]
     if not durations:
         return []
@@ -363,6 +363,6 @@ def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, sta
 
 
 def _is_far_outside(fixations: Fixations) -> NDArray[np.bool_]:
-    """Whether each fixation lies farther than `_FAR` outside its frame, `(n,)`."""
+    """Tell whether each fixation lies farther than `_FAR` outside its frame, `(n,)`."""
     distance = np.maximum(-fixations.points, fixations.points - fixations.size).max(1)
     return np.asarray(distance > _FAR * max(fixations.size))

@@ -95,7 +95,7 @@ def read_table(
 
 
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
-    """The names of a table's columns by ours: those that a user gives, else ours in any case of letters."""
+    """Find the names of a table's columns by ours: those that a user gives, else ours in any case of letters."""
     by_lower = {column.lower(): column for column in reversed(table.columns)}
     names = {}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
@@ -146,7 +146,7 @@ class Coordinates(NamedTuple):
         return x1, y1, x2, y2
 
     def _from_corner(self, places: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
-        """Places `(n, 2)` in pixels from the top left corner of a frame, where 0 is its edge."""
+        """Convert places `(n, 2)` to pixels from the top left corner of a frame, where 0 is its edge."""
         sides = np.array(frame, dtype=np.float64)
         places = places * (sides if self.units == "fractions" else 1.0)
         if self.origin in _UPWARDS:
@@ -241,7 +241,7 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
 
 
 def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> Fixations:
-    """The record of the rows of a scanpath."""
+    """Make the record of the rows of a scanpath."""
     first = rows[0]
     fields = first.fields
     check_data(fields["picture"] != "", f"{first}, picture", "the name of a picture", "nothing")
@@ -278,7 +278,7 @@ def _check_same(rows: Sequence[Row], name: str) -> None:
 
 
 def _durations(rows: Sequence[Row]) -> NDArray[np.float64] | None:
-    """Durations of the fixations of a scanpath in ms, `(n,)`; None where no row has one."""
+    """Read the durations of the fixations of a scanpath in ms, `(n,)`; None where no row has one."""
     times = [row.number_or_none("duration") for row in rows]
     if all(time is None for time in times):
         return None
@@ -289,7 +289,7 @@ def _durations(rows: Sequence[Row]) -> NDArray[np.float64] | None:
 
 
 def _box(row: Row, frame: tuple[int, int], coordinates: Coordinates) -> tuple[float, float, float, float] | None:
-    """The box of the target, in pixels of the frame; None where a row has none."""
+    """Read the box of the target, in pixels of the frame; None where a row has none."""
     edges = [row.number_or_none(name) for name in _EDGES]
     numbers = [edge for edge in edges if edge is not None]
     check_data(len(numbers) in (0, len(_EDGES)), row, "all of x1, y1, x2 and y2, or none", "some")
@@ -297,7 +297,7 @@ def _box(row: Row, frame: tuple[int, int], coordinates: Coordinates) -> tuple[fl
 
 
 def _frame(row: Row, size: Size | None) -> tuple[int, int]:
-    """Size of the frame of a scanpath."""
+    """Find the size of the frame of a scanpath."""
     sides: Sequence[float]
     if size is None:
         sides = [row.number(name) for name in _SIZE]
