@@ -70,6 +70,7 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
     images = _by_id(data, "images", name, {"width": _SIDE, "height": _SIDE, ABSENT: _IDS, PARTIAL: _IDS})
     for image in images.values():
+        # LVIS names images by their addresses alone.
         if image.get("file_name") is None and isinstance(image.get("coco_url"), str):
             image["file_name"] = PurePosixPath(image["coco_url"]).name
     _checked(data, "images", name, {"file_name": _NAME})
@@ -185,6 +186,7 @@ def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, sta
         return
     are_ordered = (boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)
     leaves_picture = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1)
+    # A picture of one or two pixels may have such boxes in pixels.
     if float(boxes.max()) <= 1 and float(limits.min()) > 2:
         form = "fractions of the picture"
     elif bool(are_ordered.all()) and float(leaves_picture.double().mean()) >= _BEYOND:

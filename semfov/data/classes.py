@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.errors import InputError, check
 
+# COCO's classes, each with words that people use for it; a word may stand for several classes.
 _TABLE = """
 person: man, men, woman, women, boy, girl, child, children, kid, baby, human, pedestrian, face, player, rider
 bicycle: bike, cycle, push bike, mountain bike, tricycle
@@ -243,6 +244,7 @@ def class_numbers(
     if names is None:
         return ()
     if isinstance(names, str) or not isinstance(names, Sequence):
+        # One name; a text with commas is often meant as several.
         try:
             return (class_index(names, classes, argument),)
         except InputError as error:
@@ -274,6 +276,7 @@ def _plain_key(name: str) -> str:
 
 def _other_numbers(key: str) -> set[str]:
     """List the plural forms of a class name; for a name that is a plural, also its singular."""
+    # More forms than are words, as each is only compared with what was asked for.
     forms = {f"{key}s", f"{key}es", _IRREGULAR.get(key, f"{key}s")}
     for end, plural in (("y", "ies"), ("f", "ves"), ("fe", "ves")):
         if key.endswith(end):

@@ -107,6 +107,7 @@ class CocoScenes(Scenes):
         self.ids = [self._packed.ids[row] for row in self._rows]
         names = [self._packed.names[row] for row in self._rows]
         self._files = _files_of(root, names)
+        # Names and sizes tell another copy of the images apart without reading them.
         settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
         self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
 
@@ -142,6 +143,7 @@ class CocoScenes(Scenes):
         width, height = annotation.size
         image = read_image(path)
         if image.shape[-2:] != (height, width):
+            # Some data sets are annotated on the pixels as they are stored.
             got = f"{image.shape[-1]} × {image.shape[-2]}; use the image that the annotations were made for"
             image = read_image(path, oriented=False)
             is_annotated = image.shape[-2:] == (height, width)
@@ -246,6 +248,7 @@ class _Packed:
         bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
         limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
 
+        # In float64, in which a box that ends at the border of its image is not beyond it.
         warn_of_form(bboxes, limits, path, stacklevel=5)
         corner, extent = bboxes.split(2, -1)
         edges = torch.cat([corner, corner + extent], -1)

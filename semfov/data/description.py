@@ -69,6 +69,7 @@ class Description:
             return [*self.colours]
         without_alpha = self.count - (self.alpha is not None)
         numbers = [1, 2, 3] if without_alpha >= 3 else [1]
+        # One band is grey and three are colours; of other numbers nobody knows.
         if without_alpha not in (1, 3):
             words = "1 is shown as grey" if len(numbers) == 1 else "1, 2 and 3 are shown as red, green and blue"
             text = f"image {self.path}: of {self.count} bands without names {words}; choose by bands="
@@ -145,6 +146,7 @@ class Display:
 
     def over_white(self, colours: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Blend colours `(h, w, C)` with white paper where their alpha `(h, w, 1)` is below 255."""
+        # In 16 bits, as the product of two bytes needs them; 127 rounds.
         opacity = alpha.astype(np.uint16)
         shown = colours if self.premultiplied else (colours * opacity + 127) // 255
         return np.minimum(shown + (255 - opacity), 255).astype(np.uint8)

@@ -7,7 +7,7 @@ import math
 import re
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TypedDict
 
 import numpy as np
 
@@ -36,6 +36,14 @@ _SIGNATURES = {
     b"\xff\xd8\xff": "JPEG",
 }
 """Drivers by the first bytes of the files that they read."""
+
+
+class WindowOptions(TypedDict):
+    """The arguments by which a window of a raster is read: where, in which shape, and how it is resampled."""
+
+    window: Any
+    out_shape: tuple[int, ...]
+    resampling: Any
 
 
 class Raster(Protocol):

@@ -245,6 +245,7 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
         array = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{argument}: expected numbers (x, y), or several such pairs, got {points!r:.80}") from None
+    # A copy, as the caller may go on writing to the array.
     check(array.shape[-1:] == (2,), argument, "(x, y), or several such pairs", points)
     return torch.from_numpy(array.copy())
 

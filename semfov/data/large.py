@@ -92,6 +92,7 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
     else:
         picture = PhotographPicture(path, white)
     if white is not None or bands is not None:
+        # With which a record can open the file again; percentiles stay a word.
         limits = white if white is None or isinstance(white, str) else stated_limits(white)
         picture.shown = {"white": limits, "bands": bands}
     return picture
@@ -141,7 +142,7 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
     if isinstance(source, str | PathLike):
         path = Path(source)
         if path.suffix.lower() in BY_WINDOWS:
-            with suppress(DataError):
+            with suppress(DataError):  # a file of another kind than its name says
                 return open_large(path).size
         with opening(path, "opened"), open_pillow(path) as image:
             return upright_size(image)

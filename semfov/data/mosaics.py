@@ -63,7 +63,7 @@ class Mosaics(ComposedScenes):
         self.size = columns * tile[0], rows * tile[1]
         self._alike = alike
         settings: list[object] = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill]
-        if alike:
+        if alike:  # left out otherwise, as the fingerprints of stored results are without it
             settings.append(alike)
         self.fingerprint = json_sha256(settings)
 
@@ -81,6 +81,7 @@ class Mosaics(ComposedScenes):
         photographs = np.arange(len(self.scenes))
         if self._alike and self._sharing:
             photographs = self._sharing[int(generator.integers(len(self._sharing)))]
+        # A photograph comes again only after all others.
         rounds = -(-slots // len(photographs))
         order = np.concatenate([generator.permutation(photographs) for _ in range(rounds)])[:slots]
         return [self._placed(slot, scene) for slot, scene in enumerate(order.tolist())]

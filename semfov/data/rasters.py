@@ -1,7 +1,6 @@
 """TIFFs and rasters, which are read window by window: by tifffile, by GDAL, or by Pillow where both leave them."""
 
 import weakref
-from collections.abc import Mapping
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.description import Description, as_rgb, named_colours
-from semfov.data.gdal import Raster, raster_settings
+from semfov.data.gdal import Raster, WindowOptions, raster_settings
 from semfov.data.images import PhotographPicture, open_pillow, opening, quiet_decoders
 from semfov.data.tiff import TiffPicture
 from semfov.data.tiff_tags import JPEG, PALETTE, UPRIGHT, WHITE_IS_ZERO, YCBCR, TiffTags
@@ -65,7 +64,7 @@ class RasterPicture(LargePicture):
         return as_rgb(pixels)
 
     def holds(self, box: Box) -> bool:
-        if isinstance(self._file, Mosaic):
+        if isinstance(self._file, Mosaic):  # which knows its sources
             return self._file.holds(box)
         if self._file.driver != "GTiff":
             return True
@@ -83,6 +82,7 @@ class RasterPicture(LargePicture):
         """Read a window from the overviews of the file, or from a copy where it has none."""
         if not self._has_overviews:
             return super()._reduced(box, reduction)
+        # Edges at multiples of the reduction, so that neighbouring windows meet.
         x1, y1, x2, y2 = box
         width, height = self.size
         outwards = (
@@ -118,7 +118,7 @@ class RasterPicture(LargePicture):
         return grey, grey, grey
 
 
-def _window_options(box: Box, reduction: int, bands: int) -> Mapping[str, object]:
+def _window_options(box: Box, reduction: int, bands: int) -> WindowOptions:
     """Write the arguments by which rasterio reads a window, reduced by a factor."""
     from rasterio.enums import Resampling
     from rasterio.windows import Window
@@ -220,7 +220,7 @@ def _open_otherwise(path: str | PathLike[str], white: White | None, bands: Chose
     if bands is None:
         with suppress(DataError):
             photograph = PhotographPicture(path, white)
-            photograph.read((0, 0, 1, 1))
+            photograph.read((0, 0, 1, 1))  # raises where Pillow cannot decode it
             return photograph
     return None
 

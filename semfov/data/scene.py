@@ -155,7 +155,7 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum
         # Which of the columns and of the rows between these edges each box covers.
         columns = (x1[:, None] <= xs[:-1]) & (xs[1:] <= x2[:, None])
         rows = (y1[:, None] <= ys[:-1]) & (ys[1:] <= y2[:, None])
-        covered = (rows.double().T @ columns.double() > 0).double()
+        covered = (rows.double().T @ columns.double() > 0).double()  # by any box
         area = ys.diff() @ covered @ xs.diff()
     return float(area) / (size[0] * size[1])
 

@@ -4,7 +4,7 @@ GDAL's own reader of mosaics opens whatever is named, by any driver. Here a sour
 mosaic or below, read by the driver of its kind, and what a mosaic may say is listed (`semfov.data.vrt_text`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil, floor
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.gdal import Dataset, driver_of, open_file
+from semfov.data.gdal import Dataset, WindowOptions, driver_of, open_file
 from semfov.data.tone import Values
 from semfov.data.vrt_text import Band, Source, read_mosaic
 from semfov.data.windowed import Box
@@ -106,7 +106,7 @@ class Mosaic:
         self.mask_flag_enums = ([MaskFlags.per_dataset if is_masked else MaskFlags.all_valid],) * self.count
         self.crs = text.system
         self.transform = Affine.identity() if text.transform is None else Affine.from_gdal(*text.transform)
-        self.gcps: tuple[list[Any], None] = [], None
+        self.gcps: tuple[list[Any], None] = [], None  # a mosaic has no ground control points here
 
     def __enter__(self) -> "Mosaic":
         return self
@@ -122,6 +122,7 @@ class Mosaic:
         """List factors of reduced copies: some where all files of a band have them and their values have averages."""
         sources = self._bands[band - 1].sources
         are_reduced = all(self._has_overviews[source.path] and not source.discrete for source in sources)
+        # The factor does not matter: only whether there are some is asked.
         return [2] if sources and are_reduced else []
 
     def holds(self, box: Box) -> bool:
@@ -194,7 +195,7 @@ class Mosaic:
         from rasterio.windows import Window
 
         resampling = Resampling.nearest if source.discrete else (reduction or Resampling[source.resampling])
-        options = {
+        options: WindowOptions = {
             "window": Window(columns.start, rows.start, columns.length, rows.length),
             "out_shape": (len(rows.inner), len(columns.inner)),
             "resampling": resampling,
@@ -210,7 +211,7 @@ class Mosaic:
         return np.pad(values, borders, "edge"), None if present is None else np.pad(present, borders, "edge")
 
 
-def _presence(source: Source, file: Dataset, stored: Values, options: Mapping[str, Any]) -> NDArray[np.bool_] | None:
+def _presence(source: Source, file: Dataset, stored: Values, options: WindowOptions) -> NDArray[np.bool_] | None:
     """Find where the pixels of a source are there, `(h, w)`; None for all over."""
     if source.masked:
         return np.asarray(file.read_masks(source.band, **options) > 0)
@@ -224,7 +225,7 @@ def _converted(source: Source, file: Dataset, values: Values) -> Values:
     if source.component:
         colours = file.colormap(source.band)
         component = [colours.get(number, (0, 0, 0, 255))[source.component - 1] for number in range(256)]
-        values = np.array(component)[values.astype(np.uint8)]
+        values = np.array(component)[values.astype(np.uint8)]  # numbers of a table are bytes
     if source.table:
         stored, shown = zip(*source.table, strict=True)
         values = np.interp(values, stored, shown)

@@ -152,6 +152,7 @@ def read_mosaic(path: Path, open_source: Callable[[Path], Dataset]) -> MosaicTex
     mask_bands = [band for mask in masks for band in _known_parts(mask, ("VRTRasterBand",), path)]
     mask = reader.band(mask_bands[0]) if mask_bands else None
     check_data(bool(bands), path, "at least one band", "none")
+    # In proportion to all files of the mosaic, as its own text is short.
     held = path.stat().st_size + sum(file.stat().st_size for file in reader.has_overviews)
     check_size((width, height), held, path)
     return MosaicText(
@@ -244,6 +245,7 @@ class _Reader:
         """Find the file of a source, which is a picture in the folder of the mosaic or below."""
         text = name.text or ""
         is_relative = name.attrib.get("relativeToVRT") == "1"
+        # Other names are relative to the working folder, or absolute.
         place = text if is_relative else str(Path(text).absolute())
         if place not in self._files:
             file = _picture(self._path, place)
@@ -276,6 +278,7 @@ class _Reader:
         if element.tag == "AveragedSource":
             return "average"
         name = element.attrib.get("resampling", "nearest")
+        # GDAL writes it without, rasterio with an underscore.
         name = "cubic_spline" if name == "cubicspline" else name
         check_data(name in _RESAMPLINGS, self._path, f"a resampling of {', '.join(_RESAMPLINGS)}", f"{name!r:.40}")
         return name
@@ -305,6 +308,7 @@ def _root(path: Path) -> XML.Element:
 
 def _known_parts(element: XML.Element, known: tuple[str, ...], path: Path) -> list[XML.Element]:
     """List the known parts of an element, without those that are not needed; others are refused."""
+    # Other subclasses compute their pixels, or read them from files of any kind.
     subclasses = [value for name, value in element.attrib.items() if name.lower() == "subclass"]
     kind = subclasses[0] if subclasses else element.tag
     is_plain = kind in (element.tag, "VRTSourcedRasterBand")

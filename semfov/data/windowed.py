@@ -230,6 +230,7 @@ class LargePicture(ABC):
     def _largest_copy(self) -> Tensor:
         """Make the largest copy strip by strip; what is not stored is not read."""
         width, height = self._copy_size
+        # Rows of the copy whose pixels in the picture fit into memory at once.
         rows = max(1, _STRIP // self.size[0] // self._least_reduction)
         copy = torch.empty(height, width, 3, dtype=torch.uint8)
         for top in range(0, height, rows):

@@ -254,6 +254,7 @@ def _point_columns(program: Program, columns: Sequence[Column], table: str) -> t
     read = [(x, y) for x, y in pairs if not x.unit or x.unit in LENGTHS]
     got = ", ".join(repr(column.name) for column in (*x_columns, *y_columns))
     check_data(bool(read), table, f"points of {program.name} in px or norm", f"the columns {got}; export them in px")
+    # The first of several pairs in one unit.
     return min(read, key=lambda pair: LENGTHS.get(pair[0].unit) != "fractions")
 
 
@@ -265,6 +266,7 @@ def _unread(columns: Sequence[Column]) -> str:
 
 def _name_people(rows: Sequence[Row], subject: str | None, table: Table) -> None:
     """Write the name of the person into rows: that of a user, else that of the table, else of the file."""
+    # Exports of one person often have the name in that of the file alone.
     is_file = bool(table.columns) and "." in table.name
     file = Path(table.name).stem if is_file else "1"
     for row in rows:
@@ -304,6 +306,7 @@ def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
     with_right = {row.fields["trial"] for row, side in zip(rows, sides, strict=True) if side == "right"}
     chosen = []
     for row, side in zip(rows, sides, strict=True):
+        # Samples of both eyes would count each fixation twice.
         preferred = eye or ("right" if row.fields["trial"] in with_right else "left")
         if side in ("", preferred):
             chosen.append(row)

@@ -119,7 +119,7 @@ def read_eyelink(
     """
     path = Path(path)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
-    lines = read_text(path, "cp1252").splitlines()
+    lines = read_text(path, "cp1252").splitlines()  # of Windows, where it is not UTF-8
     trials, fixations = _events(path, lines)
     views = [view for trial in trials for view in trial.viewed()]
     _share_out(fixations, views)
@@ -197,6 +197,7 @@ def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
     if text.startswith("TRIALID"):
         if trials:
             trials[-1].close(time)
+        # Some experiments give a trial no name.
         trials.append(_Trial(text[7:].strip() or f"trial {len(trials) + 1}", time))
         return
     if not trials:

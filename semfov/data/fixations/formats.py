@@ -16,7 +16,7 @@ from semfov.errors import DataError, InputError, check, check_data
 from semfov.io.files import read_json, write_text
 from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_content
 
-_COORDINATE = Number(low=-1e6, high=1e6)
+_COORDINATE = Number(low=-1e6, high=1e6)  # far outside any screen, but finite
 _COORDINATES = Array(_COORDINATE)
 _PIXELS = Array(_COORDINATE, least=1)
 _MILLISECONDS = Array(Number(low=0, high=1e9))
@@ -145,7 +145,7 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
             "bbox": None if scanpath.box is None else [x1, y1, x2 - x1, y2 - y1],
             "X": scanpath.points[:, 0].tolist(),
             "Y": scanpath.points[:, 1].tolist(),
-            "length": len(scanpath),
+            "length": len(scanpath),  # which programs for this data set read
             "T": None if scanpath.durations is None else scanpath.durations.tolist(),
             "fixOnTarget": scanpath.found,
         }
@@ -294,6 +294,7 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
     ...     len(read_ruarte(Path(folder, "scanpaths.json"))[0])
     3
     """
+    # The file has one trial for each picture.
     trials = {}
     for scanpath in fixations:
         expected = "one scanpath for each picture"
@@ -334,6 +335,7 @@ def coco_name(name: str) -> str:
     >>> coco_name("100000298773.jpg"), coco_name("000000000164.jpg")
     ('000000298773.jpg', '000000000164.jpg')
     """
+    # COCO's own names begin with 0.
     if not re.fullmatch(r"\d{12}\.jpg", name):
         raise InputError(f"name: expected twelve digits and .jpg, such as '100000298773.jpg', got {name!r}")
     return "0" + name[1:]

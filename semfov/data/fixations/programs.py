@@ -158,6 +158,7 @@ _CLOUD = Program(
 )
 _PLAYER = Program("Pupil Player", point=("normposx", "normposy"), units="fractions", origin="bottom left")
 
+# From the particular to the general: a table of pictures or surfaces has the columns of a plain one, too.
 PROGRAMS = (
     _PRO_LAB._replace(
         frames=("mcs",),

@@ -69,6 +69,7 @@ def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: M
         InputError: the reader has no such argument.
         DataError: the content is not of its form.
     """
+    # A file of OSIE has the size of its pictures; others have that of the screen, or of each trial.
     if "size" in options and reader in (read_cocosearch, read_ruarte):
         expected = f"none for {source}, a file of {DATA_SETS[reader]}, whose frame is that of each trial"
         check(reader is read_cocosearch, "size", expected, options["size"])

@@ -59,6 +59,7 @@ class Letterbox:
         Returns:
             `(n, 2)` in picture pixels.
         """
+        # Edges of pixels correspond, and lie half a pixel before the centres.
         return np.asarray((points + 0.5 - self.offset) / self.scale - 0.5)
 
     def to_screen(self, points: _Values) -> _Values:
@@ -152,7 +153,7 @@ def as_path(points: object, argument: str, *, least: int = 0) -> NDArray[np.floa
         InputError: there is something else, or too few points.
     """
     path = as_array(points, argument, finite=True)
-    path = path.reshape(0, 2) if path.shape == (0,) else path
+    path = path.reshape(0, 2) if path.shape == (0,) else path  # an empty list has no second dimension
     check(path.ndim == 2 and path.shape[1] == 2, argument, "fixations of shape (n, 2)", path.shape)
     check(len(path) >= least, argument, "at least one fixation", "none")
     return path
@@ -198,6 +199,7 @@ class Fixations:
 
     def __post_init__(self) -> None:
         """Check that the arrays belong together; lists and tensors become arrays."""
+        # The only way to set an attribute of a frozen dataclass.
         object.__setattr__(self, "points", as_array(self.points, "points"))
         if self.durations is not None:
             object.__setattr__(self, "durations", as_array(self.durations, "durations"))

@@ -96,6 +96,7 @@ def read_table(
 
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
     """Find the names of a table's columns by ours: those that a user gives, else ours in any case of letters."""
+    # Reversed, so that the first of several such columns counts.
     by_lower = {column.lower(): column for column in reversed(table.columns)}
     names = {}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
@@ -141,7 +142,7 @@ class Coordinates(NamedTuple):
         if self != ("pixels", "top left"):
             corners = self._from_corner(corners, frame)
         if self.origin in _UPWARDS:
-            corners[:, 1] = corners[::-1, 1]
+            corners[:, 1] = corners[::-1, 1]  # y1 is the upper edge
         x1, y1, x2, y2 = corners.flatten().tolist()
         return x1, y1, x2, y2
 
@@ -178,6 +179,7 @@ def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: 
     for row in rows:
         fields = row.fields
         scanpath = tuple(fields[name] for name in ("picture", "subject", "target", "trial"))
+        # Without a trial, two viewings of a picture by one person would be taken for one.
         if scanpath in groups and scanpath != previous and not fields["trial"]:
             raise DataError(
                 f"{row}: expected the lines of a scanpath to follow each other, got those of "
