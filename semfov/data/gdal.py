@@ -5,9 +5,10 @@ GDAL would choose a driver by the content of a file, and some of its drivers sen
 
 import math
 import re
+from contextlib import AbstractContextManager
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, Self, TypedDict
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypedDict, Unpack
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from semfov.data.images import check_proportion
 from semfov.data.tone import Values
 from semfov.errors import DataError, check_data
 from semfov.io.files import reading
+
+if TYPE_CHECKING:
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window
 
 MOST_SIDE = 2**20  # longest side in pixels of a picture that is read by windows
 _MOST_BLOCK = 2**28  # bytes of a tile or a strip, which GDAL decodes as a whole
@@ -41,9 +46,9 @@ _SIGNATURES = {
 class WindowOptions(TypedDict):
     """The arguments by which a window of a raster is read: where, in which shape, and how it is resampled."""
 
-    window: Any
+    window: "Window"
     out_shape: tuple[int, ...]
-    resampling: Any
+    resampling: "Resampling"
 
 
 class Raster(Protocol):
@@ -78,9 +83,9 @@ class Raster(Protocol):
 
     def overviews(self, band: int) -> list[int]: ...
 
-    def read(self, bands: Any, *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values: ...
+    def read(self, bands: Any, **options: Unpack[WindowOptions]) -> Values: ...
 
-    def read_masks(self, bands: Any, *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values: ...
+    def read_masks(self, bands: Any, **options: Unpack[WindowOptions]) -> Values: ...
 
 
 class Dataset(Raster, Protocol):
@@ -96,11 +101,12 @@ class Dataset(Raster, Protocol):
     def get_tag_item(self, name: str, namespace: str, *, bidx: int) -> str | None: ...
 
 
-def raster_settings() -> Any:
+def raster_settings() -> AbstractContextManager[object]:
     """Make a context with GDAL's settings for rasters of others, in which rasters are opened and windows are read."""
     import rasterio
 
-    return rasterio.Env(**_SETTINGS)
+    settings: AbstractContextManager[object] = rasterio.Env(**_SETTINGS)
+    return settings
 
 
 def driver_of(path: Path) -> str | None:

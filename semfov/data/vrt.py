@@ -10,7 +10,7 @@ from functools import lru_cache
 from math import ceil, floor
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from semfov.data.tone import Values
 from semfov.data.vrt_text import Band, Source, read_mosaic
 from semfov.data.windowed import Box
 from semfov.errors import DataError
+
+if TYPE_CHECKING:
+    from rasterio.enums import Resampling
 
 _DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".jp2": "JP2OpenJPEG"}
 _ROUNDING = 1e-6  # of a pixel
@@ -129,39 +132,38 @@ class Mosaic:
         """Tell whether a source lies in a window."""
         return any(len(_touching(band.places, box)) > 0 for band in self._bands)
 
-    def read(self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values:
+    def read(self, bands: Sequence[int], **options: Unpack[WindowOptions]) -> Values:
         """Read a window of some bands.
 
         Args:
             bands: their numbers, from 1.
-            window: of rasterio.
-            out_shape: shape of the result, whose last two sizes count.
-            resampling: of rasterio, for a window that is reduced.
+            **options: of rasterio: the `window`, the last two sizes of the `out_shape` of the result, and a
+                `resampling` for a window that is reduced.
 
         Returns:
             `(C, h, w)`.
         """
-        height, width = out_shape[-2:]
+        height, width = options["out_shape"][-2:]
         kind = np.result_type(*(self.dtypes[band - 1] for band in bands))
         values = np.empty((len(bands), height, width), kind)
         for row, band in enumerate(bands):
-            values[row] = self._composed(self._bands[band - 1], window, (height, width), resampling)
+            values[row] = self._composed(self._bands[band - 1], options)
         return values
 
-    def read_masks(self, bands: Sequence[int], *, window: Any, out_shape: tuple[int, ...], resampling: Any) -> Values:
+    def read_masks(self, bands: Sequence[int], **options: Unpack[WindowOptions]) -> Values:
         """Read a window of the mask, which is one for all bands; arguments and result are those of `read`."""
         # Asked for only where `mask_flag_enums` tells of a mask or an alpha.
         band = self._mask or next(band for band in self._bands if band.meaning == "alpha")
-        height, width = out_shape[-2:]
-        mask = self._composed(band, window, (height, width), resampling)
+        mask = self._composed(band, options)
         return np.broadcast_to(mask, (len(bands), *mask.shape))
 
-    def _composed(self, band: Band, window: Any, shape: tuple[int, int], resampling: Any) -> Values:
-        """Compose a band in a window, where a source covers the earlier ones, resampled to a shape `(h, w)`."""
+    def _composed(self, band: Band, options: WindowOptions) -> Values:
+        """Compose a band in a window, where a source covers the earlier ones, `(h, w)`."""
+        window = options["window"]
+        height, width = options["out_shape"][-2:]
         nothing = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
-        canvas = np.full(shape, nothing, band.kind)
+        canvas = np.full((height, width), nothing, band.kind)
         box = window.col_off, window.row_off, window.col_off + window.width, window.row_off + window.height
-        height, width = shape
         x_scale = width / window.width
         y_scale = height / window.height
         is_reduced = max(x_scale, y_scale) < 1
@@ -171,14 +173,14 @@ class Mosaic:
             rows = _Side.of(source, 1, box[1], y_scale, height)
             if not columns.covered or not rows.covered:
                 continue
-            values, present = self._values(source, columns, rows, resampling if is_reduced else None)
+            values, present = self._values(source, columns, rows, options["resampling"] if is_reduced else None)
             values = _as_kind(values, band.kind)
             part = slice(rows.covered.start, rows.covered.stop), slice(columns.covered.start, columns.covered.stop)
             canvas[part] = values if present is None else np.where(present, values, canvas[part])
         return canvas
 
     def _values(
-        self, source: Source, columns: _Side, rows: _Side, reduction: Any
+        self, source: Source, columns: _Side, rows: _Side, reduction: "Resampling | None"
     ) -> tuple[Values, NDArray[np.bool_] | None]:
         """Read the values of the covered part of a source, and where pixels are there.
 
