@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
+from semfov.detection.onnx_cells import STRIDES, cells
 from semfov.detection.onnx_check import check_file
-from semfov.detection.onnx_heads import STRIDES, cells
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check
 from semfov.io.files import read_text, sha256, write_bytes

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from semfov.detection.class_names import keep_classes
 from semfov.detection.modules import ModuleDetector, module_digest
-from semfov.detection.onnx_heads import decode_yolov8
+from semfov.detection.onnx_decoding import decode_yolov8
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError, check
 

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.detection import onnx_heads as heads
-from semfov.detection.onnx_heads import HEADS, Signature
+from semfov.detection import onnx_decoding as decoding
+from semfov.detection.onnx_heads import HEADS, misplaced, recognise
+from semfov.detection.onnx_signature import Signature
 from semfov.errors import InputError
 from tests.refusals import refused
 
@@ -81,7 +82,7 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     strides = (8, 16, 32, 64)
     cells = cell_list(canvas, strides)
     classes, distances = noise(1, len(cells), 3, dtype=dtype), 2 * noise(1, len(cells), 4 * bins, dtype=dtype)
-    found = heads._decode_distances(classes, distances, canvas, strides=strides, offset=offset)
+    found = decoding.decode_distances(classes, distances, canvas, strides=strides, offset=offset)
     close(found.boxes, [distance_boxes(distances[0], cells, offset)])
     assert torch.equal(found.classes, classes)
     assert found.objectness is None
@@ -94,12 +95,12 @@ def test_decoders_are_differentiable_and_compile():
     check = torch.autograd.gradcheck
     raw, boxes = noise(1, 5, 7).requires_grad_(), noise(1, 5, 4, seed=1).sigmoid().requires_grad_()
     assert check(lambda x: numbers(decode("yolox", (32, 16), x)), noise(1, 11, 7).requires_grad_())
-    assert check(lambda x: numbers(heads._decode_yolov5(x)), raw)
-    assert check(lambda x: numbers(heads.decode_yolov8(x)), raw)
-    assert check(lambda x, y: numbers(heads._decode_detr(x, y, (16, 8))), (raw, boxes))
+    assert check(lambda x: numbers(decoding.decode_yolov5(x)), raw)
+    assert check(lambda x: numbers(decoding.decode_yolov8(x)), raw)
+    assert check(lambda x, y: numbers(decoding.decode_detr(x, y, (16, 8))), (raw, boxes))
     assert check(lambda x, y: numbers(decode("rtdetr", (16, 8), x, y)), (raw, boxes))
     distances = noise(1, 5, 12).requires_grad_()
-    assert check(lambda x, y: numbers(heads._decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
+    assert check(lambda x, y: numbers(decoding.decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
     raw = noise(1, 84, 8)
     compiled = torch.compile(lambda x: decode("yolox", (64, 64), x).boxes, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(raw), decode("yolox", (64, 64), raw).boxes)
@@ -166,7 +167,7 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
     ],
 )
 def test_unambiguous_signatures_are_recognised(expected, given):
-    assert given.head() == expected
+    assert recognise(given) == expected
 
 
 @pytest.mark.parametrize(
@@ -186,40 +187,40 @@ def test_unambiguous_signatures_are_recognised(expected, given):
 )
 def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
     with pytest.raises(InputError, match=fits) as error:
-        given.head()
+        recognise(given)
     assert all(head in str(error.value) for head in HEADS)
 
 
 def test_models_without_score_vectors_or_of_other_tasks_are_refused():
-    refused("export", signature((1, 300, 7)).head)
+    refused("export", recognise, signature((1, 300, 7)))
     for task in ["segment", "pose", "obb", "classify"]:
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
-            signature((1, 116, 8400), classes=80, task=task).head()
+            recognise(signature((1, 116, 8400), classes=80, task=task))
     refused("84 rows, one for each cell of a 64 x 64 canvas", decode, "yolox", (64, 64), noise(1, 83, 8))
-    refused("bins", heads._decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
-    refused("boxes", heads._decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
+    refused("bins", decoding.decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
+    refused("boxes", decoding.decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
 
 def test_places_of_a_pass_tell_heads_of_one_shape_apart():
     """Boxes that the other head would put outside the canvas, or into one pixel of it."""
     raw, pixels = noise(1, 84, 8), torch.cat([64 * noise(1, 84, 4).sigmoid(), noise(1, 84, 4).sigmoid()], -1)
     both = signature(("output", (1, 84, 8)), canvas=(64, 64), classes=3)
-    assert both.head(lambda: {"output": raw}) == "yolox"
-    assert both.head(lambda: {"output": pixels}) == "yolox-decoded"
+    assert recognise(both, lambda: {"output": raw}) == "yolox"
+    assert recognise(both, lambda: {"output": pixels}) == "yolox-decoded"
     rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 1.0], [3.0, 2.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
     two = signature((1, 3, 6), canvas=(64, 64), classes=2)
-    assert two.head(lambda: {"output0": rows}) == "end2end"
-    assert two.head(lambda: {"output0": noise(1, 3, 6).sigmoid()}) == "rtdetr"
+    assert recognise(two, lambda: {"output0": rows}) == "end2end"
+    assert recognise(two, lambda: {"output0": noise(1, 3, 6).sigmoid()}) == "rtdetr"
 
 
 def test_end_to_end_rows_are_one_hot_vectors():
     rows = torch.tensor([[[4.0, 8.0, 40.0, 30.0, 0.9, 2.0], [1.0, 1.0, 9.0, 9.0, 0.2, 0.0], [0.0] * 6]])
-    found = heads._decode_end_to_end(rows, 3)
+    found = decoding.decode_end_to_end(rows, 3)
     assert torch.equal(found.boxes, rows[..., :4])
     assert torch.equal(found.classes, torch.tensor([[[0, 0, 0.9], [0.2, 0, 0], [0, 0, 0]]]))
     with pytest.raises(InputError, match="classes: expected a name for each class of the rows, got 2, and class 2"):
-        heads._decode_end_to_end(rows, 2)
-    refused("rows: expected a whole number", heads._decode_end_to_end, rows + 0.5, 9)
+        decoding.decode_end_to_end(rows, 2)
+    refused("rows: expected a whole number", decoding.decode_end_to_end, rows + 0.5, 9)
 
 
 def test_selected_outputs_are_one_hot_vectors():
@@ -249,17 +250,17 @@ def test_selected_outputs_are_one_hot_vectors():
     ],
 )
 def test_boxes_of_another_head_are_told_by_their_places(box, message):
-    found = heads.misplaced(torch.tensor([[box]]), (64, 64))
+    found = misplaced(torch.tensor([[box]]), (64, 64))
     assert found is None if message is None else re.search(message, found)
 
 
 def test_corners_that_were_read_as_centres_and_sizes_are_told():
     low, size = 64 * noise(1, 84, 2).sigmoid(), 20 * noise(1, 84, 2, seed=1).sigmoid()
     rows = torch.cat([low, low + size, noise(1, 84, 3).sigmoid()], -1)
-    assert heads.misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
-    assert "corners" in heads.misplaced(heads.decode_yolov8(rows.mT).boxes, (64, 64))
-    assert "comes first" in heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
-    assert heads.misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
+    assert misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
+    assert "corners" in misplaced(decoding.decode_yolov8(rows.mT).boxes, (64, 64))
+    assert "comes first" in misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
+    assert misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
 
 
 def test_boxes_with_y_before_x_are_told():
@@ -268,8 +269,8 @@ def test_boxes_with_y_before_x_are_told():
         cells = torch.tensor(cell_list(canvas, (8, 16, 32)), dtype=torch.float32)
         middle = (cells[:, :2] + 0.5) * cells[:, 2:] + noise(len(cells), 2, dtype=torch.float32)
         boxes = torch.cat([middle - 9, middle + 9], -1)[None]
-        assert heads.misplaced(boxes, canvas) is None
-        assert "y comes before x; export" in heads.misplaced(boxes[..., [1, 0, 3, 2]], canvas)
+        assert misplaced(boxes, canvas) is None
+        assert "y comes before x; export" in misplaced(boxes[..., [1, 0, 3, 2]], canvas)
     wide = torch.tensor([[[200.0, 8.0, 220.0, 30.0], [150.0, 1.0, 170.0, 9.0]]])
-    assert heads.misplaced(wide, (240, 32)) is None
-    assert "y comes before x" in heads.misplaced(wide[..., [1, 0, 3, 2]], (240, 32))
+    assert misplaced(wide, (240, 32)) is None
+    assert "y comes before x" in misplaced(wide[..., [1, 0, 3, 2]], (240, 32))

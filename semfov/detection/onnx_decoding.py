@@ -1,0 +1,209 @@
+"""Formulas by which heads of ONNX models place boxes: tensors in, `Candidates` out.
+
+In shapes, B are images, N boxes, Q queries and K classes. Decoded boxes are `(x1, y1, x2, y2)` in canvas pixels, edges
+between pixels (0 is the left edge of the canvas).
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from semfov.detection.onnx_cells import Canvas, cell_grid
+from semfov.detection.onnx_signature import selected_outputs
+from semfov.detection.scores import Candidates
+from semfov.errors import InputError, check, check_shape, values_known
+
+
+def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candidates:
+    """Decode offsets from cells and logarithms of sizes (YOLOX, Ge et al. 2021).
+
+    For the cell (i, j) of a level with stride s, centre and size of the box are
+
+        c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
+
+    Args:
+        raw: `(B, N, 5 + K)`: `t_x t_y t_w t_h`, objectness, class scores, for the cells of all levels.
+        canvas: `(width, height)` in pixels.
+        strides: strides s of the levels in pixels.
+
+    Returns:
+        The boxes, with objectness.
+
+    Raises:
+        InputError: there is not a row for each cell, or the rows hold decoded boxes.
+    """
+    check_shape(raw, "raw", None, None, None)
+    if values_known(raw) and raw.numel():
+        low, high = map(float, raw[..., :4].detach().aminmax())
+        form = "offsets from cells and logarithms of sizes, some of them below 0"
+        as_fractions = "numbers from 0 to 1, as fractions of the canvas"
+        check(not 0 <= low < high <= 1, "output of the head", form, as_fractions)
+    grid = cell_grid(raw.shape[1], canvas, strides, 0.0, raw.dtype, raw.device)
+    cell = grid[:, :2]
+    stride = grid[:, 2:]
+    centre = (raw[..., 0:2] + cell) * stride
+    size = raw[..., 2:4].exp() * stride
+    return Candidates(corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
+
+
+def decode_yolov5(rows: Tensor) -> Candidates:
+    """Decode rows whose boxes the network itself has placed.
+
+    Args:
+        rows: `(B, N, 5 + K)`: centre and size of the box in canvas pixels, objectness, class scores.
+
+    Returns:
+        The boxes, with objectness.
+    """
+    check_shape(rows, "rows", None, None, None)
+    return Candidates(corners(rows[..., :4]), rows[..., 5:], rows[..., 4])
+
+
+def decode_yolov8(columns: Tensor) -> Candidates:
+    """Decode columns whose boxes the network itself has placed.
+
+    Args:
+        columns: `(B, 4 + K, N)`: centre and size of the box in canvas pixels, class scores.
+
+    Returns:
+        The boxes, without objectness.
+    """
+    check_shape(columns, "columns", None, None, None)
+    rows = columns.transpose(1, 2)
+    return Candidates(corners(rows[..., :4]), rows[..., 4:])
+
+
+def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
+    """Decode rows that a network has selected itself: the score of the class of a box, and 0 for all other classes.
+
+    Args:
+        rows: `(B, N, 6)`: corners of the box in canvas pixels, score, number of the class from 0.
+        classes: number of classes K.
+
+    Returns:
+        The boxes, without objectness.
+
+    Raises:
+        InputError: K is unknown, or the rows number other classes.
+    """
+    if classes is None:
+        expected = "the names of the model's classes, which its rows only number"
+        raise InputError(f"classes: expected {expected}, got None; give them by classes=cat,dog")
+    check_shape(rows, "rows", None, None, 6)
+    scores = rows[..., 4]
+    numbers = rows[..., 5]
+    if values_known(rows):
+        _check_numbers_of_classes(numbers[scores > 0], classes)
+    index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
+    vectors = scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
+    return Candidates(rows[..., :4], vectors)
+
+
+def _check_numbers_of_classes(numbers: Tensor, classes: int) -> None:
+    """Raise `InputError` unless numbers `(M,)` of classes are whole, from 0 to `classes - 1`."""
+    whole = bool((numbers == numbers.round()).all())
+    check(whole, "rows", "a whole number of a class in the last column", numbers[:3].tolist())
+    if len(numbers):
+        inside = float(numbers.min()) >= 0 and float(numbers.max()) < classes
+        check(inside, "classes", "a name for each class of the rows", f"{classes}, and class {numbers.max():g}")
+
+
+def decode_selected(outputs: Mapping[str, Tensor], classes: int | None) -> Candidates:
+    """Decode the outputs of a network that selects boxes itself, as rows of `decode_end_to_end`.
+
+    Args:
+        outputs: boxes `(B, N, 4)`, corners in canvas pixels; scores `(B, N)`, or the fifth column of the boxes; labels
+            `(B, N)`, numbers of classes from 0; and perhaps the number of boxes of each image, `(B,)` or `(B, 1)`,
+            after which boxes are padding.
+        classes: number of classes K.
+
+    Returns:
+        The boxes, without objectness; padding has scores of 0.
+    """
+    selected = selected_outputs(outputs)
+    boxes = selected["boxes"]
+    labels = selected["labels"]
+    check_shape(labels, "labels", None, None)
+    scores = selected["scores"] if "scores" in selected else boxes[..., 4]
+    if "count" in selected:
+        place = torch.arange(scores.shape[1], device=scores.device)
+        scores = scores * (place < selected["count"].reshape(-1, 1))
+    rows = torch.cat([boxes[..., :4], scores[..., None], labels[..., None]], -1)
+    return decode_end_to_end(rows, classes)
+
+
+def decode_distances(
+    scores: Tensor, distances: Tensor, canvas: Canvas, *, strides: tuple[int, ...], offset: float = 0.5
+) -> Candidates:
+    r"""Decode boxes given as distributions over the distance to each side (distribution focal loss, Li et al. 2020).
+
+    The distance from the point `p = (cell + offset) s` to the left, upper, right or lower side is
+    `d = s Σ_b b softmax(t)_b`.
+
+    Args:
+        scores: class scores `(B, N, K)` of the cells of all levels.
+        distances: `t`, `(B, N, 4 bins)`.
+        canvas: `(width, height)` in pixels.
+        strides: strides s of the levels in pixels.
+        offset: where a cell is anchored, in cells.
+
+    Returns:
+        The boxes, without objectness.
+    """
+    check_shape(scores, "classes", None, None, None)
+    check_shape(distances, "distances", None, scores.shape[1], None)
+    bins = distances.shape[-1] // 4
+    divisible = bins > 0 and distances.shape[-1] == 4 * bins
+    shape = tuple(distances.shape)
+    check(divisible, "distances", "4 · bins channels, the same number of bins for each side", shape)
+    grid = cell_grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
+    stride = grid[:, 2:]
+    point = grid[:, :2] * stride
+    expected_bin = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
+    distance = expected_bin * stride
+    return Candidates(torch.cat([point - distance[..., :2], point + distance[..., 2:]], -1), scores)
+
+
+def decode_detr(logits: Tensor, boxes: Tensor, canvas: Canvas) -> Candidates:
+    """Decode the queries of a DETR with a softmax over the classes and "no object".
+
+    Args:
+        logits: `(B, Q, K + 1)`, "no object" last.
+        boxes: `(B, Q, 4)`, centre and size as fractions of the canvas.
+        canvas: `(width, height)` in pixels.
+
+    Returns:
+        The boxes, with "no object" as their background.
+    """
+    check_shape(logits, "logits", None, None, None)
+    scores = logits.softmax(-1)
+    return Candidates(fraction_corners(boxes, canvas), scores[..., :-1], background=scores[..., -1])
+
+
+def corners(boxes: Tensor) -> Tensor:
+    """Convert boxes from centre and size to corners.
+
+    Args:
+        boxes: `(..., 4)`, `(c_x, c_y, width, height)`.
+
+    Returns:
+        `(..., 4)`, `(x1, y1, x2, y2)`, in the same unit.
+    """
+    centre = boxes[..., :2]
+    half = boxes[..., 2:] / 2
+    return torch.cat([centre - half, centre + half], -1)
+
+
+def fraction_corners(boxes: Tensor, canvas: Canvas) -> Tensor:
+    """Convert boxes from centre and size, as fractions of a canvas, to corners in pixels.
+
+    Args:
+        boxes: `(..., 4)`, `(c_x, c_y, width, height)` as fractions.
+        canvas: `(width, height)` in pixels.
+
+    Returns:
+        `(..., 4)`, `(x1, y1, x2, y2)` in canvas pixels.
+    """
+    check_shape(boxes, "boxes", None, None, 4)
+    return corners(boxes) * boxes.new_tensor(canvas * 2)

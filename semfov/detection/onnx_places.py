@@ -1,0 +1,85 @@
+"""Where the boxes of a pass lie, which shows that a head does not belong to a model."""
+
+import torch
+from torch import Tensor
+
+from semfov.detection.onnx_cells import STRIDES, Canvas, box_counts, cells
+
+_LARGEST_FRACTION = 2.0  # coordinates up to here, of all boxes of a canvas, are no pixels
+_ALONG_CELLS = 0.8  # correlation of places with cells from which on boxes follow them
+_MOST_BOXES = 100_000  # number of boxes whose places are looked at
+_CROWD = 20  # number of boxes from which on all of them do not begin in the upper left corner
+_MISPLACED_SHARE = 0.5  # share of the boxes of a pass that may lie elsewhere
+
+_AXES_EXCHANGED = [1, 0, 3, 2]  # coordinates of boxes with y before x
+
+
+def misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
+    """Describe why the boxes of one pass cannot be in their places.
+
+    Args:
+        boxes: `(B, N, 4)`, corners in canvas pixels.
+        canvas: `(width, height)` in pixels.
+
+    Returns:
+        The reason in words; None for boxes that can be where they are.
+    """
+    rows = boxes.detach().reshape(-1, 4).double()
+    rows = rows[(rows != 0).any(-1)][:_MOST_BOXES]  # a network that selects boxes itself pads them with empty rows
+    if not len(rows):
+        return None
+    if not bool(rows.isfinite().all()):
+        return "boxes that are not finite"
+    low = rows[:, :2]
+    high = rows[:, 2:]
+    size = rows.new_tensor(canvas)
+    middle = (low + high) / 2
+    crossed = (high < low).any(-1).double().mean()
+    outside = ((middle - size / 2).abs() > size).any(-1).double().mean()
+    reason = None
+    if float(rows.abs().max()) <= _LARGEST_FRACTION < min(canvas):
+        reason = "fractions of the canvas instead of pixels"
+    elif float(crossed) >= _MISPLACED_SHARE:
+        reason = "boxes whose right or lower edge comes first"
+    elif _spread_out(middle, size) and bool((high >= 3 * low).all()):
+        reason = "corners of boxes that were read as their centres and sizes"
+    elif float(outside) >= _MISPLACED_SHARE:
+        place = middle.median(0).values.round().long().tolist()
+        reason = f"boxes around {place}, outside the canvas"
+    return reason
+
+
+def axes_exchanged(boxes: Tensor, canvas: Canvas) -> bool:
+    """Tell whether the boxes of one pass have y before x.
+
+    Args:
+        boxes: `(B, N, 4)`, corners in canvas pixels.
+        canvas: `(width, height)` in pixels.
+
+    Returns:
+        True for boxes that lie elsewhere, and in their places with their coordinates exchanged. On a square canvas
+        boxes can lie in their places in both readings; there, true if they run down where their cells run right.
+    """
+    if misplacement(boxes, canvas) is None:
+        return _down_along_rows(boxes, canvas)
+    return misplacement(boxes[..., _AXES_EXCHANGED], canvas) is None
+
+
+def _spread_out(middle: Tensor, size: Tensor) -> bool:
+    """Tell whether the middles `(N, 2)` of boxes are many, and lie over more than a quarter of a canvas `(2,)`."""
+    if len(middle) < _CROWD:
+        return False
+    spread = middle.quantile(0.9, 0) - middle.quantile(0.1, 0)
+    return bool((spread > size / 4).all())
+
+
+def _down_along_rows(boxes: Tensor, canvas: Canvas) -> bool:
+    """Tell whether the middles of boxes in the order of cells go down where the finest level's cells go right."""
+    # Boxes of a network that selects them are in no order.
+    if boxes.shape[1] not in box_counts(canvas):
+        return False
+    columns, rows = cells(canvas, STRIDES[0])
+    cell = torch.arange(columns * rows)
+    places = torch.stack([(boxes[0, cell, side] + boxes[0, cell, side + 2]).detach().cpu() for side in (0, 1)])
+    correlation = torch.corrcoef(torch.cat([places.double(), torch.stack([cell % columns, cell // columns])]))
+    return bool((correlation[0, 3] > _ALONG_CELLS) & (correlation[1, 2] > _ALONG_CELLS))

@@ -1,0 +1,158 @@
+"""What an ONNX model shows of its head before it runs: names and shapes of its outputs, classes and metadata."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, TypeVar
+
+from semfov.detection.onnx_cells import Canvas, CellBoxes, box_counts
+
+Layout = Literal["queries", "dets", "selection", "candidates", "levels", "rows", "unknown"]
+"""How a model divides its result into outputs; `Signature.layout` describes them."""
+
+_Output = TypeVar("_Output")
+
+_QUERY_LOGITS = ("logits", "pred_logits", "labels")
+_SELECTED = {
+    "boxes": ("boxes", "dets", "det_boxes", "bboxes", "nmsed_boxes"),
+    "scores": ("scores", "det_scores", "nmsed_scores"),
+    "labels": ("labels", "det_classes", "nmsed_classes", "classes"),
+    "count": ("num_dets", "num_detections"),
+}
+"""Names of the outputs of networks that select boxes themselves: RT-DETR's, mmdeploy's and those of TensorRT."""
+
+# Numbers of COCO's scores: its classes, and its category ids with their gaps.
+_COCO_COUNTS = (80, 91)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The only output of a model, `(1, rows, columns)`, of which one side are boxes and the other their channels.
+
+    Attributes:
+        sides: `(rows, columns)`.
+        cells: anchors and levels of the cells that there are as many boxes for; zeros where no cells fit.
+        across: whether the columns are boxes, as in YOLOv8's export.
+        classes: number of classes; None where it is unknown.
+    """
+
+    sides: tuple[int, int]
+    cells: CellBoxes
+    across: bool
+    classes: int | None
+
+    @staticmethod
+    def of(sides: tuple[int, int], canvas: Canvas, classes: int | None) -> "Rows":
+        """Find which side of an output are boxes, by the numbers of boxes that cells of a canvas have."""
+        counts = box_counts(canvas)
+        rows, columns = sides
+        across = columns in counts and rows not in counts
+        boxes = columns if across else rows
+        return Rows(sides, counts.get(boxes, CellBoxes(0, 0)), across, classes)
+
+    @property
+    def channels(self) -> int:
+        """Numbers for each box."""
+        return self.sides[0] if self.across else self.sides[1]
+
+    def hold_scores_and(self, others: int) -> bool:
+        """Tell whether channels hold some other numbers and a score for each class; at least one, if unknown."""
+        return self.channels > others and self.classes in (None, self.channels - others)
+
+    @property
+    def lack_objectness(self) -> bool:
+        """Whether the boxes of cells have class scores alone."""
+        if self.cells.anchors != 1 or not self.hold_scores_and(4):
+            return False
+        # Without names, rows have an objectness unless their scores are as many as COCO's.
+        return self.across or self.classes is not None or self.channels - 4 in _COCO_COUNTS
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Properties of a model that are known before it runs on an image.
+
+    Attributes:
+        image: name of the input for images.
+        outputs: name and shape of each output for one image, in order.
+        canvas: `(width, height)` in pixels.
+        producer: the program that exported the model, `""` if it does not say.
+        classes: number of the classes; None where it is unknown.
+        metadata: texts by key, as exporters write them.
+    """
+
+    image: str
+    outputs: tuple[tuple[str, tuple[int, ...]], ...]
+    canvas: Canvas
+    producer: str = ""
+    classes: int | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the outputs by name."""
+        return dict(self.outputs)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The layout of the outputs, by their names, else by their number.
+
+        - `queries`: DETR's boxes `(1, Q, 4)` and logits.
+        - `dets`: RF-DETR's boxes `dets` `(1, Q, 4)` and logits `labels` `(1, Q, K)`.
+        - `selection`: boxes that the network selects itself, with a score and a class each.
+        - `candidates`: boxes, scores, and whatever a `Candidates` holds besides.
+        - `levels`: several outputs, a few for each level of cells.
+        - `rows`: one output `(1, rows, columns)`.
+        """
+        selected = selected_outputs(self.shapes)
+        if "pred_boxes" in self.shapes and any(name in self.shapes for name in _QUERY_LOGITS):
+            return "queries"
+        if {"dets", "labels"} <= self.shapes.keys() and len(self.shapes["labels"]) == 3:
+            return "dets"
+        if "boxes" in selected and len(selected.get("labels", ())) == 2:
+            return "selection"
+        if "boxes" in self.shapes and self.shapes.keys() & {"classes", "scores"}:
+            return "candidates"
+        if len(self.shapes) > 1:
+            return "levels"
+        return "rows" if len(self.outputs[0][1]) == 3 else "unknown"
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The only output of the layout `rows`."""
+        _, rows, columns = self.outputs[0][1]
+        return Rows.of((rows, columns), self.canvas, self.classes)
+
+    @property
+    def selects(self) -> bool:
+        """Whether Ultralytics' metadata says that the network selects boxes itself."""
+        return self.metadata.get("end2end") == "True" or "'nms': True" in self.metadata.get("args", "")
+
+
+def query_logits(outputs: Mapping[str, _Output]) -> _Output:
+    """Return the output with the logits of queries.
+
+    Args:
+        outputs: outputs of a DETR, or their shapes, by name.
+
+    Returns:
+        The one of the logits.
+    """
+    return outputs[next(name for name in _QUERY_LOGITS if name in outputs)]
+
+
+def selected_outputs(outputs: Mapping[str, _Output]) -> dict[str, _Output]:
+    """Name the outputs of a network that selects boxes itself by what they are.
+
+    Args:
+        outputs: the outputs, or their shapes, by the names of the exporter.
+
+    Returns:
+        Those that are there, by `boxes`, `scores`, `labels` and `count`.
+    """
+    selected = {}
+    for what, names in _SELECTED.items():
+        name = next((name for name in names if name in outputs), None)
+        if name is not None:
+            selected[what] = outputs[name]
+    return selected
