@@ -2,11 +2,11 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -14,10 +14,12 @@ from torch import Tensor
 from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, landmarks
+from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file
-from semfov.detection.onnx_file import check_canvas, names_beside, read_settings, with_input_size
-from semfov.detection.onnx_heads import HEADS, Signature, misplaced
-from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.onnx_file import OnnxSettings, check_canvas, names_beside, read_settings, with_input_size
+from semfov.detection.onnx_heads import HEADS, misplaced, recognise
+from semfov.detection.onnx_session import OnnxSession, Provider
+from semfov.detection.onnx_signature import Signature
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.weights import WEIGHTS, fetch
@@ -31,10 +33,25 @@ _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.e
 
 _ROUNDING = 0.02  # how far beyond 0 and 1 the scores of networks of 8 and 16 bits may lie
 _MOST_BOXES = 2**20  # largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px
+_MOST_LISTED = 300  # largest number of characters of the outputs that a message lists
 
 
 class OnnxDetector(Detector):
-    """A model in onnxruntime as a `Detector`; gradients do not flow through it; input_size `(width, height)`."""
+    """A model in onnxruntime as a `Detector`; gradients do not flow through it; input_size `(width, height)`.
+
+    Attributes:
+        session: the model.
+        head: name of its head, in `HEADS`.
+        preprocessing: what the network expects of its input.
+        logits: whether the head returns scores before their sigmoid.
+
+    Private attributes: `_places` are the scores of the head that stand for a class, among `_scores` of them.
+    `_first_checked` becomes true after the first pass whose values could be read, and `_rounding_told` with the
+    warning of scores a little outside [0, 1]; either happens once. `_tensors` names, by layer, the tensors inside the
+    model that are maps (None before the first call that asks for maps), and `_named_layers` are those of them that have
+    a name by their place. `_map_session` is `session`, or one of the same model that also returns the maps asked for
+    last.
+    """
 
     def __init__(
         self,
@@ -50,30 +67,35 @@ class OnnxDetector(Detector):
         background: BackgroundPolicy | None = None,
         digest: str = "",
     ) -> None:
-        family = HEADS[lookup(head, HEADS, "head")]
+        kind = HEADS[lookup(head, HEADS, "head")]
         names, places = named_outputs(classes)
-        preprocessing = family.preprocessing if preprocessing is None else preprocessing
+        preprocessing = kind.preprocessing if preprocessing is None else preprocessing
         super().__init__(
             name,
             names,
             _canvas_size(session, input_size),
-            background=family.background if background is None else background,
+            background=kind.background if background is None else background,
             fill=preprocessing.fill,
             stride=stride,
             stretch=preprocessing.stretch,
             corner=preprocessing.corner,
-            faint=family.faint,
-            least=family.least,
+            faint=kind.faint,
+            least=kind.least,
             digest=digest,
         )
         fixed = None not in session.shape[2:]
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
-        self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
-        self._places, self._scores = places, len(classes)
-        self._placed = self._rounded = False
-        self._layers: dict[str, str] | None = None
+        self.session = session
+        self.head = head
+        self.preprocessing = preprocessing
+        self.logits = logits
+        self._places = places
+        self._scores = len(classes)
+        self._first_checked = False
+        self._rounding_told = False
+        self._tensors: dict[str, str] | None = None
         self._named_layers: tuple[str, ...] = ()
-        self._wide = session
+        self._map_session = session
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
@@ -89,111 +111,133 @@ class OnnxDetector(Detector):
     def propose_with_features(
         self, canvas: Tensor, layers: Sequence[str] | None = None
     ) -> tuple[Candidates, dict[str, Tensor]]:
-        outputs, maps = self._outputs(canvas, layers)
-        own = {name: outputs[name] for name, _ in self.session.outputs}
-        return self.decode(own, (canvas.shape[-1], canvas.shape[-2])), maps
+        outputs, maps = self._outputs_and_maps(canvas, layers)
+        head_outputs = {name: outputs[name] for name, _ in self.session.outputs}
+        return self.decode(head_outputs, (canvas.shape[-1], canvas.shape[-2])), maps
 
     def feature_maps(self, canvas: Tensor, layers: Sequence[str] | None = None) -> dict[str, Tensor]:
-        return self._outputs(canvas, layers)[1]
+        _, maps = self._outputs_and_maps(canvas, layers)
+        return maps
 
-    def _outputs(self, canvas: Tensor, layers: Sequence[str] | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The outputs and the maps by name, in one run of a session that has the maps as further outputs."""
+    def _outputs_and_maps(
+        self, canvas: Tensor, layers: Sequence[str] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Compute outputs and maps, by name, in one run of a session that has the maps as further outputs."""
         self._check_canvas(canvas)
-        if self._layers is None:
+        tensors = self._map_tensors(canvas, layers)
+        if not set(tensors.values()) <= {name for name, _ in self._map_session.outputs}:
+            self._map_session = self.session.widened([*tensors.values()])
+        outputs = self._map_session(self.preprocessing(canvas.detach()))
+        return outputs, {layer: outputs[tensor] for layer, tensor in tensors.items()}
+
+    def _map_tensors(self, canvas: Tensor, layers: Sequence[str] | None) -> dict[str, str]:
+        """Find the tensors inside the model that are the maps of layers, all named ones if None; by layer."""
+        if self._tensors is None:
             steps = self.session.steps((canvas.shape[-1], canvas.shape[-2]))
-            inside = {step.name: step.name for step in steps if step.stride is not None}
-            self._layers, self._named_layers = inside | landmarks(steps), tuple(landmarks(steps))
+            named = landmarks(steps)
+            self._tensors = {step.name: step.name for step in steps if step.stride is not None} | named
+            self._named_layers = tuple(named)
         wanted = self._named_layers if layers is None else layers
-        tensors = {layer: self._layers[layer] for layer in chosen(wanted, [*self._layers], self.name)}
-        if not set(tensors.values()) <= {name for name, _ in self._wide.outputs}:
-            self._wide = self.session.widened([*tensors.values()])
-        outputs = self._wide(self.preprocessing(canvas.detach()))
-        return outputs, {layer: outputs[name] for layer, name in tensors.items()}
+        return {layer: self._tensors[layer] for layer in chosen(wanted, [*self._tensors], self.name)}
 
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""
         check_shape(canvas, "canvas", None, 3, None, None)
-        (height, width), (high, wide) = self.session.shape[2:], canvas.shape[-2:]
-        way = "a sensor with crops needs crops of that side, or a network that takes pictures of any size"
-        fits = height in (None, high) and width in (None, wide)
+        height, width = self.session.shape[2:]
+        rows, columns = canvas.shape[-2:]
         fixed = f"{width} × {height} px, the fixed input of {self.name}"
-        check(fits, "canvas", fixed, f"{wide} × {high} px; {way}")
+        remedy = "a sensor with crops needs crops of that side, or a network that takes pictures of any size"
+        same = height in (None, rows) and width in (None, columns)
+        check(same, "canvas", fixed, f"{columns} × {rows} px; {remedy}")
 
     def _run(self, image: Tensor) -> Candidates:
         """Run the network on its input `(B, 3, H, W)`, and decode what it returns."""
         return self.decode(self.session(image), (image.shape[-1], image.shape[-2]))
 
-    def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
-        """Decode the outputs of the network, given by name, for a canvas of `(width, height)`."""
+    def decode(self, outputs: dict[str, Tensor], size: Canvas) -> Candidates:
+        """Decode the outputs of the network.
+
+        Args:
+            outputs: the outputs by name.
+            size: `(width, height)` of the canvas.
+
+        Returns:
+            All boxes, with the scores of the classes.
+
+        Raises:
+            DataError: the numbers cannot be those of this head.
+        """
         candidates = HEADS[self.head].decode(outputs, size, self._scores)
         count = candidates.boxes.shape[1]
         check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
-        first = not self._placed and values_known(candidates.boxes, candidates.classes)
+        first = not self._first_checked and values_known(candidates.boxes, candidates.classes)
         if first:
             self._check_first(outputs, candidates, size)
         if self.logits:
-            objectness = None if candidates.objectness is None else candidates.objectness.sigmoid()
-            candidates = replace(candidates, classes=candidates.classes.sigmoid(), objectness=objectness)
+            candidates = _with_scores(candidates, Tensor.sigmoid)
         if values_known(candidates.boxes):
-            named = f"with head {self.head!r}; check that head= names the model's head"
-            check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", f"others {named}")
+            remedy = f"others with head {self.head!r}; check that head= names the model's head"
+            check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", remedy)
             candidates = self._rounded_scores(candidates)
-        self._placed |= first
+        self._first_checked |= first
         return keep_classes(candidates, self._places, self._scores)
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
-        scores = [each for each in (candidates.classes, candidates.objectness) if each is not None]
-        lows, highs = zip(*map(_range, scores), strict=True)
-        low, high = min(lows), max(highs)
-        way = "set logits=True if the model returns them before the sigmoid"
-        got = f"[{low:.3g}, {high:.3g}]; {way}, and check that its head is {self.head!r}"
+        low, high = _range(candidates.classes)
+        if candidates.objectness is not None:
+            lowest, highest = _range(candidates.objectness)
+            low = min(low, lowest)
+            high = max(high, highest)
+        remedy = "set logits=True if the model returns them before the sigmoid"
+        got = f"[{low:.3g}, {high:.3g}]; {remedy}, and check that its head is {self.head!r}"
         check_data(low >= -_ROUNDING and high <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
         if low >= 0 and high <= 1:
             return candidates
-        if not self._rounded:
+        if not self._rounding_told:
             warnings.warn(
                 f"{self.name}: scores from {low:.7g} to {high:.7g}, which rounding explains, are taken as 0 to 1",
                 stacklevel=2,
             )
-        self._rounded = True
-        objectness = None if candidates.objectness is None else candidates.objectness.clamp(0, 1)
-        return replace(candidates, classes=candidates.classes.clamp(0, 1), objectness=objectness)
+        self._rounding_told = True
+        return _with_scores(candidates, lambda scores: scores.clamp(0, 1))
 
-    def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: tuple[int, int]) -> None:
+    def _check_first(self, outputs: dict[str, Tensor], candidates: Candidates, size: Canvas) -> None:
         """Raise `DataError` where the numbers of the first pass show another head or scores after their sigmoid."""
-        logits = [each for name, each in outputs.items() if name.endswith("logits")]
-        before, way = "softmax or sigmoid", "export the model without it"
+        for name, output in outputs.items():
+            # With logits=True, what is taken as logits are the scores of the head.
+            if name.endswith("logits") and not self.logits:
+                self._check_logits(output, "softmax or sigmoid", "export the model without it")
         if self.logits:
-            logits, before, way = [candidates.classes], "sigmoid", "set logits=False"
-        for each in logits:
-            low, high = _range(each)
-            got = f"[{low:.3g}, {high:.3g}]; {way}"
-            check_data(not 0 <= low < high <= 1, self.name, f"scores before the {before}", got)
-        wrong = misplaced(candidates.boxes, size)
+            self._check_logits(candidates.classes, "sigmoid", "set logits=False")
+        reason = misplaced(candidates.boxes, size)
         expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
-        check_data(wrong is None, self.name, expected, wrong)
+        check_data(reason is None, self.name, expected, reason)
+
+    def _check_logits(self, logits: Tensor, function: str, remedy: str) -> None:
+        """Raise `DataError` for numbers that a function has brought into [0, 1] already."""
+        low, high = _range(logits)
+        got = f"[{low:.3g}, {high:.3g}]; {remedy}"
+        check_data(not 0 <= low < high <= 1, self.name, f"scores before the {function}", got)
 
     def settings(self) -> dict[str, object]:
-        own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
-        providers = self.session.providers
-        return super().settings() | own | ({} if providers is None else {"providers": list(providers)})
+        settings = super().settings()
+        settings |= {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
+        if self.session.providers is not None:
+            settings["providers"] = list(self.session.providers)
+        return settings
+
+
+def _with_scores(candidates: Candidates, function: Callable[[Tensor], Tensor]) -> Candidates:
+    """Apply a function to class scores and objectness."""
+    objectness = None if candidates.objectness is None else function(candidates.objectness)
+    return replace(candidates, classes=function(candidates.classes), objectness=objectness)
 
 
 def _range(numbers: Tensor) -> tuple[float, float]:
-    """Least and greatest number in one pass, which are NaN where one of them is."""
+    """Find the least and greatest number in one pass; both are NaN where one of them is."""
     low, high = numbers.aminmax() if numbers.numel() else (0.0, 0.0)
     return float(low), float(high)
-
-
-def _model_digest(path: Path) -> str:
-    """sha256 of a model's file; with weights in other files, of all of them."""
-    import onnx
-
-    stored = onnx.load(path, load_external_data=False).graph.initializer
-    others = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
-    digests = [sha256(path), *(sha256(inside(path.parent, name)) for name in sorted(others))]
-    return digests[0] if len(digests) == 1 else json_sha256(digests)
 
 
 def load_onnx(
@@ -208,101 +252,174 @@ def load_onnx(
     logits: bool | None = None,
     threads: int | None = None,
     device: torch.device | str = "cpu",
-    providers: Sequence[str | tuple[str, Mapping[str, Any]]] | None = None,
+    providers: Sequence[Provider] | None = None,
 ) -> OnnxDetector:
-    """Load a detector from an ONNX file, or a published one by its name."""
-    name = fspath(name_or_path)
-    file = Path(name if weights is None else weights)
-    if name in _ONNX_MODELS:
-        file = fetch(name) if weights is None else file
-    elif weights is not None or not name.endswith(".onnx"):
-        lookup(name, _ONNX_MODELS, "ONNX model")
-    published_name = name if name in _ONNX_MODELS else NETWORKS.get(sha256(file) if file.is_file() else "")
+    """Load a detector from an ONNX file, or a published one by its name.
+
+    What an option does not say is taken from `model.json` beside the file, then from the metadata of the model, and
+    then found out: the head by names and shapes of the outputs, and names of classes in `classes.txt` or `data.yaml`
+    beside the file.
+
+    Args:
+        name_or_path: the ONNX file, or the name of a published model.
+        weights: the ONNX file of a published model that is given by its name; None fetches it.
+        head: name of the head, in `HEADS`.
+        classes: names of the classes in the order of the scores, without background.
+        input_size: side, or `(width, height)`, of the canvas in pixels; for models that take any size, and for
+            published ones, of which a copy is made.
+        stride: pad the canvas only to a multiple of this number of pixels, for models that take any size.
+        preprocessing: what the network expects of its input, or settings that replace some of the head's.
+        logits: whether the head returns scores before their sigmoid.
+        threads: threads of onnxruntime; None takes as many as PyTorch has.
+        device: where onnxruntime computes, where no providers say it.
+        providers: execution providers of onnxruntime, each alone or with its options.
+
+    Returns:
+        The detector.
+
+    Raises:
+        InputError: an option does not fit the model, or something that nothing says cannot be found out.
+        DataError: the file is damaged, or takes too much memory or work.
+    """
+    file, published_name = _find_file(fspath(name_or_path), weights)
     path = file
     if published_name in _ONNX_MODELS and input_size is not None:
         path = with_input_size(file, _sides(input_size))
     session = OnnxSession(path, threads=threads, device=device, providers=providers)
-    stored = read_settings(file, session.metadata)
-    options = {"head": head, "classes": classes, "input_size": input_size, "stride": stride, "logits": logits}
-    options["name"] = published_name
-    chosen = stored | {key: value for key, value in options.items() if value is not None}
-    size = _canvas_size(session, chosen.get("input_size"))
+    settings = _overridden(
+        read_settings(file, session.metadata),
+        name=published_name,
+        head=head,
+        classes=classes,
+        input_size=input_size,
+        stride=stride,
+        logits=logits,
+    )
+    size = _canvas_size(session, settings.get("input_size"))
     if None in session.shape[2:]:
-        check_file(path, size)
+        check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
-    names = chosen.get("classes")
-    beside = names_beside(file) if names is None and published_name is None else None
-    if "head" not in chosen:
-        # A pass tells apart heads whose shapes are alike.
-        shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
-        count = len(COCO_CLASSES if names is None else names) if names or published_name else None
-        grey = torch.full((1, 3, size[1], size[0]), 0.5)
-        signature = Signature(session.image, shapes, size, session.producer, count, session.metadata)
-        chosen["head"] = signature.head(lambda: session(grey))
-    head_kind = HEADS[lookup(chosen["head"], HEADS, "head")]
+
+    names = settings.get("classes")
+    names_nearby = names_beside(file) if names is None and published_name is None else None
+    if "head" not in settings:
+        count = _class_count(names, published=published_name is not None)
+        settings["head"] = _recognised_head(session, outputs, size, count)
+    head = lookup(settings["head"], HEADS, "head")
     if not isinstance(preprocessing, Preprocessing):
-        default = head_kind.preprocessing.merged(stored["preprocessing"])
-        preprocessing = default.merged({} if preprocessing is None else preprocessing)
-    if names is None and chosen["head"].startswith("end2end") and beside is not None:
-        names = beside[1]  # its outputs do not tell how many classes there are
-    try:
-        scores = head_kind.decode(outputs, size, None if names is None else len(names)).classes.shape[-1]
-    except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
-        listed = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
-        raise InputError(
-            f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
-        ) from error
-    check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
-    if chosen["head"].startswith("end2end"):
+        stored = HEADS[head].preprocessing.merged(settings.get("preprocessing", {}))
+        preprocessing = stored.merged({} if preprocessing is None else preprocessing)
+    if names is None and HEADS[head].selects:
+        names = names_nearby  # its outputs do not tell how many classes there are
+    scores = _score_count(head, outputs, size, names)
+    if HEADS[head].selects:
         warnings.warn(
             f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
             "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
             stacklevel=2,
         )
     if names is None:
-        names = beside[1] if beside is not None and len(beside[1]) == scores else _coco_names(scores, file)
+        found = names_nearby is not None and len(names_nearby) == scores
+        names = names_nearby if found else _coco_names(scores, file)
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
+
     detector = OnnxDetector(
         session,
-        chosen["head"],
+        head,
         names,
-        name=chosen.get("name") or file.stem,
+        name=settings.get("name") or file.stem,
         input_size=size,
-        stride=chosen.get("stride"),
+        stride=settings.get("stride"),
         preprocessing=preprocessing,
-        logits=chosen.get("logits", False),
-        background=chosen.get("background"),
+        logits=settings.get("logits", False),
+        background=settings.get("background"),
         digest=_model_digest(file),
     )
-    detector.selection = replace(detector.selection, per_class=chosen.get("per_class", False))
+    detector.selection = replace(detector.selection, per_class=settings.get("per_class", False))
     return detector
 
 
-def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> tuple[int, int]:
-    """`(width, height)` of a model's canvas: its fixed size, or the wanted size of a model that takes any."""
+def _find_file(name: str, weights: str | PathLike[str] | None) -> tuple[Path, str | None]:
+    """Find the file of a model by its path, or by the name of a published one; with the name, if it is published."""
+    if name in _ONNX_MODELS:
+        return (fetch(name) if weights is None else Path(weights)), name
+    if weights is not None or not name.endswith(".onnx"):
+        lookup(name, _ONNX_MODELS, "ONNX model")
+    file = Path(name)
+    return file, NETWORKS.get(sha256(file)) if file.is_file() else None
+
+
+def _overridden(settings: OnnxSettings, **options: object) -> OnnxSettings:
+    """Override settings of a model by the options of `load_onnx` that are not None."""
+    chosen_options = {name: option for name, option in options.items() if option is not None}
+    return cast(OnnxSettings, {**settings, **chosen_options})
+
+
+def _class_count(names: Sequence[str] | None, *, published: bool) -> int | None:
+    """Count the classes of a model: those of its names, or COCO's if it is published; None where neither is known."""
+    if names is None:
+        return len(COCO_CLASSES) if published else None
+    return len(names) if names or published else None
+
+
+def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: Canvas, classes: int | None) -> str:
+    """Recognise the head of a model by the shapes of its outputs, and by a pass where several heads fit them."""
+    shapes = tuple((name, tuple(output.shape)) for name, output in outputs.items())
+    signature = Signature(session.image, shapes, size, session.producer, classes, session.metadata)
+    grey = torch.full((1, 3, size[1], size[0]), 0.5)
+    return recognise(signature, lambda: session(grey))
+
+
+def _score_count(head: str, outputs: Mapping[str, Tensor], size: Canvas, names: Sequence[str] | None) -> int:
+    """Count the scores of a box by decoding outputs of one canvas; raises `InputError` where the head does not fit."""
+    try:
+        candidates = HEADS[head].decode(outputs, size, None if names is None else len(names))
+    except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
+        listed = ", ".join(f"{name} {tuple(output.shape)}" for name, output in outputs.items())
+        raise InputError(
+            f"head: expected the model's head, got {head!r}, which does not fit the outputs {listed[:_MOST_LISTED]}"
+        ) from error
+    count = candidates.classes.shape[-1]
+    check(count > 0, "outputs", "at least one score", f"{count} with head {head!r}")
+    return count
+
+
+def _model_digest(path: Path) -> str:
+    """Compute the sha256 of a model's file; with weights in other files, of all of them."""
+    import onnx
+
+    tensors = onnx.load(path, load_external_data=False).graph.initializer
+    places = {entry.value for tensor in tensors for entry in tensor.external_data if entry.key == "location"}
+    if not places:
+        return sha256(path)
+    return json_sha256([sha256(path), *(sha256(inside(path.parent, place)) for place in sorted(places))])
+
+
+def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> Canvas:
+    """Choose `(width, height)` of a model's canvas: its fixed size, or the wanted size of a model that takes any."""
     height, width = session.shape[2:]
     if input_size is None:
         if height is None or width is None:
             raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
         check_canvas(session.path.name, (width, height))
         return width, height
-    sizes = _sides(input_size)
-    check_canvas("input_size", sizes)
-    fits = width in (None, sizes[0]) and height in (None, sizes[1])
-    check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)
-    return sizes
+    size = _sides(input_size)
+    check_canvas("input_size", size)
+    same = width in (None, size[0]) and height in (None, size[1])
+    check(same, "input_size", f"the model's fixed size, {width} x {height}", size)
+    return size
 
 
-def _sides(input_size: int | Sequence[int]) -> tuple[int, int]:
-    """`(width, height)` of one side or two."""
-    sizes = (input_size, input_size) if isinstance(input_size, int) else tuple(input_size)
-    whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
-    check(whole, "input_size", "(width, height) in pixels", excerpt(sizes))
-    return sizes[0], sizes[1]
+def _sides(input_size: int | Sequence[int]) -> Canvas:
+    """Complete one side, or two, to `(width, height)`."""
+    size = (input_size, input_size) if isinstance(input_size, int) else tuple(input_size)
+    valid = len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)
+    check(valid, "input_size", "(width, height) in pixels", excerpt(size))
+    return size[0], size[1]
 
 
 def _coco_names(count: int, file: Path) -> Sequence[str]:
-    """Names of 80 scores (COCO's classes) or of 91 scores (COCO's category ids with their gaps)."""
+    """Name 80 scores (COCO's classes) or 91 scores (COCO's category ids with their gaps)."""
     if count == 80:
         return COCO_CLASSES
     if count == 91:

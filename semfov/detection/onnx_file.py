@@ -1,20 +1,26 @@
 """ONNX files of detectors: their settings, and copies with another input size."""
 
+from __future__ import annotations
+
 import ast
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import yaml
 
-from semfov.detection.onnx_cells import STRIDES, cells
+from semfov.detection.onnx_cells import STRIDES, Canvas, cells
 from semfov.detection.onnx_check import check_file
+from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.weights import cache_folder
-from semfov.errors import DataError, check
+from semfov.errors import DataError, check, check_data
 from semfov.io.files import read_text, sha256, write_bytes
 from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, check_content, is_plain
+
+if TYPE_CHECKING:
+    import onnx
 
 _MOST_BYTES = 2**20  # largest number of bytes of a settings file
 _MOST_PIXELS = 89_478_485  # largest number of pixels of a canvas, the same as for pictures that are read
@@ -36,29 +42,83 @@ _SETTINGS = Object(
 )
 
 
-def check_canvas(name: str, size: tuple[int, int]) -> None:
-    """Raise `DataError` for a canvas `(width, height)` of more than `_MOST_PIXELS` pixels."""
-    if size[0] * size[1] > _MOST_PIXELS:
-        raise DataError(f"{name}: expected a canvas of at most {_MOST_PIXELS:,} pixels, got {size[0]} x {size[1]}")
+class OnnxSettings(TypedDict, total=False):
+    """Settings of a model, each of them missing where nothing says it; they are the options of `load_onnx`."""
+
+    name: str
+    head: str
+    background: BackgroundPolicy
+    classes: Sequence[str]
+    input_size: int | Sequence[int]
+    stride: int | None
+    logits: bool
+    per_class: bool
+    preprocessing: dict[str, Any]
+    licence: object
+    source: object
 
 
-def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Settings in a model's metadata, by semfov or Ultralytics, overridden by those in `model.json` beside it."""
-    texts = {f"metadata of {path.name}": metadata[METADATA_KEY]} if METADATA_KEY in metadata else {}
-    if (beside := path.with_suffix(".json")).exists():
+def check_canvas(name: str, size: Canvas) -> None:
+    """Refuse a canvas that would fill the memory.
+
+    Args:
+        name: what asks for the canvas, for the message.
+        size: `(width, height)` in pixels.
+
+    Raises:
+        DataError: it has more than `_MOST_PIXELS` pixels.
+    """
+    width, height = size
+    check_data(
+        width * height <= _MOST_PIXELS, name, f"a canvas of at most {_MOST_PIXELS:,} pixels", f"{width} x {height}"
+    )
+
+
+def read_settings(path: Path, metadata: Mapping[str, str]) -> OnnxSettings:
+    """Read the settings of a model: those of its exporter, overridden by semfov's, and these by a file beside it.
+
+    Args:
+        path: the ONNX file, beside which there may be settings in `model.json`.
+        metadata: the metadata of the model: semfov's settings, or those of Ultralytics and other exporters.
+
+    Returns:
+        The settings that are there; `preprocessing` always is.
+
+    Raises:
+        DataError: semfov's settings are no JSON, or have another form.
+    """
+    texts = {}
+    if METADATA_KEY in metadata:
+        texts[f"metadata of {path.name}"] = metadata[METADATA_KEY]
+    beside = path.with_suffix(".json")
+    if beside.exists():
         texts[str(beside)] = read_text(beside, most=_MOST_BYTES)
-    found, preprocessing = {**_names_in(metadata), **_ultralytics(metadata)}, dict[str, Any]()
-    for where, text in texts.items():
-        try:
-            settings = json.loads(text)
-        except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
-            raise DataError(f"{where}: cannot be read as JSON ({error}); correct it") from None
-        if isinstance(settings, dict) and isinstance(side := settings.get("input_size"), int):
-            settings["input_size"] = [side, side]
-        check_content(where, settings, _SETTINGS)
-        preprocessing |= settings.get("preprocessing", {})
-        found |= settings
-    return {**found, "preprocessing": preprocessing}
+    settings: OnnxSettings = {**_names_of_exporter(metadata), **_ultralytics(metadata)}
+    preprocessing: dict[str, Any] = {}
+    for place, text in texts.items():
+        stated = _parsed(place, text)
+        preprocessing |= stated.get("preprocessing", {})
+        settings |= stated
+    return {**settings, "preprocessing": preprocessing}
+
+
+def _parsed(place: str, text: str) -> OnnxSettings:
+    """Parse and check settings in JSON; `place` is where they come from."""
+    try:
+        settings = json.loads(text)
+    except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
+        raise DataError(f"{place}: cannot be read as JSON ({error}); correct it") from None
+    if isinstance(settings, dict):
+        _state_both_sides(settings)
+    check_content(place, settings, _SETTINGS)
+    return settings
+
+
+def _state_both_sides(settings: dict[str, Any]) -> None:
+    """Replace an `input_size` that is one number, as people write it, by width and height."""
+    side = settings.get("input_size")
+    if isinstance(side, int):
+        settings["input_size"] = [side, side]
 
 
 def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
@@ -75,8 +135,7 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
     stored: dict[str, Any] = json.loads(read_text(beside, most=_MOST_BYTES)) if beside.exists() else {}
     chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}
     settings = {**stored, **chosen}
-    if isinstance(side := settings.get("input_size"), int):
-        settings["input_size"] = [side, side]
+    _state_both_sides(settings)
     if "preprocessing" in settings:
         settings["preprocessing"] = {**stored.get("preprocessing", {}), **chosen.get("preprocessing", {})}
     check_content(str(beside), settings, _SETTINGS)
@@ -84,25 +143,27 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
     return beside
 
 
-def names_beside(path: Path) -> tuple[str, list[str]] | None:
-    """The file beside a model that has names of classes, and the names; None where there is none.
+def names_beside(path: Path) -> list[str] | None:
+    """Read names of classes from a file beside a model.
 
     Args:
         path: the ONNX file, beside which there may be `data.yaml`, as of a data set for YOLO, or `classes.txt`.
+
+    Returns:
+        The names; None where there is no such file.
     """
     for name in ("data.yaml", "classes.txt"):
         beside = path.with_name(name)
         if beside.is_file():
             text = read_text(beside, most=_MOST_BYTES)
-            names = _data_names(text) if name == "data.yaml" else text.splitlines()
-            names = [str(each).strip() for each in names if str(each).strip()]
+            names = _texts(_data_names(text) if name == "data.yaml" else text.splitlines())
             if names and all(map(is_plain, names)):
-                return name, names
+                return names
     return None
 
 
-def _data_names(text: str) -> list[Any]:
-    """The names of classes in `data.yaml`: a list, or by their numbers."""
+def _data_names(text: str) -> list[str | int]:
+    """Parse the names of classes in `data.yaml`: a list, or by their numbers."""
     try:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError):
@@ -110,37 +171,45 @@ def _data_names(text: str) -> list[Any]:
     return _listed(content.get("names") if isinstance(content, Mapping) else None)
 
 
-def _listed(names: Any) -> list[Any]:
-    """Names in a list, or by numbers from 0; none where they are neither."""
+def _listed(names: object) -> list[str | int]:
+    """List names that are in a list, or by numbers from 0; none where they are neither."""
     if isinstance(names, Mapping):
         by_number = {str(number): name for number, name in names.items()}
         numbers = [str(number) for number in range(len(by_number))]
         names = [by_number[number] for number in numbers] if {*numbers} == {*by_number} else []
-    listed = isinstance(names, list | tuple) and all(isinstance(name, str | int) for name in names)
-    return list(names) if listed else []
+    if isinstance(names, list | tuple) and all(isinstance(name, str | int) for name in names):
+        return list(names)
+    return []
 
 
-def _names_in(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Class names in metadata under other keys than Ultralytics': a list, by numbers, or a name a line."""
+def _texts(names: list[str | int] | list[str]) -> list[str]:
+    """Strip names, and leave out empty ones."""
+    stripped = [str(name).strip() for name in names]
+    return [name for name in stripped if name]
+
+
+def _names_of_exporter(metadata: Mapping[str, str]) -> OnnxSettings:
+    """Find class names in metadata under other keys than Ultralytics': a list, by numbers, or a name a line."""
     for key in _NAMES:
         text = metadata.get(key, "")
+        names: list[str | int] | list[str]
         try:
             names = _listed(ast.literal_eval(text))
         except (ValueError, SyntaxError, RecursionError, MemoryError):
             names = text.split("\n" if "\n" in text.strip() else ",")
-        names = [str(name).strip() for name in names if str(name).strip()]
+        names = _texts(names)
         if len(names) > 1 and all(map(is_plain, names)):
             return {"classes": names}
     return {}
 
 
-def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Class names `{0: 'person', ...}` and input size `[height, width]` from Ultralytics' metadata."""
-    settings: dict[str, Any] = {}
+def _ultralytics(metadata: Mapping[str, str]) -> OnnxSettings:
+    """Find class names `{0: 'person', ...}` and input size `[height, width]` in Ultralytics' metadata."""
+    settings: OnnxSettings = {}
     try:
         if "names" in metadata:
             names = ast.literal_eval(metadata["names"])
-            settings["classes"] = [names[i] for i in range(len(names))]
+            settings["classes"] = [names[number] for number in range(len(names))]
             if isinstance(names, str) or not all(is_plain(str(name)) for name in settings["classes"]):
                 return {}
         if "imgsz" in metadata:
@@ -151,33 +220,38 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
     return settings
 
 
-def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
-    """Find a model with another input size in the cache, and make it if it is missing; canvas `(width, height)`."""
-    # A fully convolutional network knows its size in the shape of its input, and in those that its `Reshape` nodes ask
-    # for.
+def with_input_size(path: Path, canvas: Canvas) -> Path:
+    """Find a model with another input size in the cache, and make it if it is missing.
+
+    A fully convolutional network knows its size in the shape of its input, and in those that its `Reshape` nodes ask
+    for.
+
+    Args:
+        path: the ONNX file of such a network, with a fixed input size.
+        canvas: the new `(width, height)` in pixels.
+
+    Returns:
+        The file of the network with this size; `path` where it has it already.
+
+    Raises:
+        InputError: the coarsest maps of the canvas would not be whole.
+        DataError: the canvas is too large, or the file is damaged.
+    """
     import onnx
-    from onnx import numpy_helper
 
     check_canvas("input_size", canvas)
     check(all(side % _COARSEST == 0 for side in canvas), "input_size", f"multiples of {_COARSEST} pixels", canvas)
     check_file(path)
     model = onnx.load(path)
-    sides = model.graph.input[0].type.tensor_type.shape.dim[2:4]
-    size = sides[1].dim_value, sides[0].dim_value
+    rows, columns = model.graph.input[0].type.tensor_type.shape.dim[2:4]
+    size = columns.dim_value, rows.dim_value
     if size == canvas:
         return path
-    graph, maps = model.graph, {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
-    shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
-    constants = {tensor.name: tensor for tensor in graph.initializer}
-    constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
-    for name in shape_names & constants.keys():
-        shape = numpy_helper.to_array(constants[name]).copy()
-        if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
-            shape[-2:] = maps[int(shape[-1]), int(shape[-2])][::-1]
-            constants[name].CopyFrom(numpy_helper.from_array(shape, constants[name].name))
-    sides[0].dim_value, sides[1].dim_value = canvas[1], canvas[0]
-    del graph.value_info[:]
-    for output in graph.output:
+    _resize_shapes(model.graph, size, canvas)
+    columns.dim_value, rows.dim_value = canvas
+    # What the file says of sizes inside, and of the number of boxes, is that of the former input.
+    del model.graph.value_info[:]
+    for output in model.graph.output:
         for side in output.type.tensor_type.shape.dim[1:2]:
             side.Clear()
     content = model.SerializeToString()
@@ -186,3 +260,19 @@ def with_input_size(path: Path, canvas: tuple[int, int]) -> Path:
     if not new.is_file() or sha256(new) != digest:
         write_bytes(new, content)
     return new
+
+
+def _resize_shapes(graph: onnx.GraphProto, size: Canvas, canvas: Canvas) -> None:
+    """Replace the sizes of maps of one canvas by those of another in the constants that `Reshape` nodes read."""
+    from onnx import numpy_helper
+
+    maps = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
+    shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
+    constants = {tensor.name: tensor for tensor in graph.initializer}
+    constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
+    for name in shape_names & constants.keys():
+        shape = numpy_helper.to_array(constants[name]).copy()
+        if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
+            columns, rows = maps[int(shape[-1]), int(shape[-2])]
+            shape[-2:] = rows, columns
+            constants[name].CopyFrom(numpy_helper.from_array(shape, constants[name].name))

@@ -58,6 +58,7 @@ class Head(ABC):
         background: background policy of its scores.
         faint: confidence from which on a candidate is a hint of where to zoom in.
         least: score from which on a detection counts.
+        selects: whether its networks select boxes themselves, and return one class and score for each.
     """
 
     name: ClassVar[str]
@@ -65,6 +66,7 @@ class Head(ABC):
     background: ClassVar[BackgroundPolicy] = "residual"
     faint: ClassVar[float] = FAINT
     least: ClassVar[float] = LEAST
+    selects: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -291,6 +293,7 @@ class _EndToEnd(Head):
     """
 
     name = "end2end"
+    selects = True
 
     def recognises(self, signature: Signature) -> bool:
         if signature.layout != "rows" or signature.rows.cells.anchors or signature.rows.sides[1] != 6:
@@ -307,6 +310,7 @@ class _EndToEndDetr(Head):
 
     name = "end2end-detr"
     preprocessing = _STRETCH
+    selects = True
 
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "selection" and {*signature.shapes} == {"labels", "boxes", "scores"}
@@ -319,6 +323,7 @@ class _EndToEndNms(Head):
     """A network with non-maximum suppression, by mmdeploy or TensorRT: the outputs of `decode_selected`."""
 
     name = "end2end-nms"
+    selects = True
 
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "selection" and {*signature.shapes} != {"labels", "boxes", "scores"}
