@@ -1,16 +1,19 @@
 """What a pass of an ONNX model takes, told from sizes alone: the bytes of its tensors together, and its work."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from semfov.errors import DataError, check_data
+from semfov.errors import check_data
 from semfov.io.schema import excerpt
 
+if TYPE_CHECKING:
+    from onnx import GraphProto, ModelProto, NodeProto, ValueInfoProto
+
 _MOST_ELEMENTS = 2**28  # largest number of elements of a tensor in a model; 1 GiB as float32
-_MOST_BYTES = 2**27, 2**8  # of tensors that are not stored: of any model, and more for each byte of its files
-_MOST_WORK = 2**34, 2**16  # multiplications of a pass, likewise
 _MOST_LENGTH = 2**12  # largest length of a shape that is computed from others
 _SMALL = 2**10  # elements of a tensor on whose values shapes may depend
 
@@ -32,210 +35,332 @@ _LENGTHS = {"Shape": 8, "Constant": _SMALL, "Range": math.inf}  # of what such o
 _Sizes = tuple[int, ...]
 
 
+class _Limit(NamedTuple):
+    """The most that a model may take: of any model, and more for each byte of its files."""
+
+    base: int
+    per_byte: int
+
+
+_MOST_BYTES = _Limit(2**27, 2**8)  # of tensors that are not stored
+_MOST_WORK = _Limit(2**34, 2**16)  # multiplications of a pass
+
+
 @dataclass(frozen=True)
 class Budget:
-    """The nodes of a model without functions, and the sizes of its tensors as far as they are known."""
+    """The nodes of a model without functions, and the sizes of its tensors as far as they are known.
+
+    Attributes:
+        name: what messages call the model.
+        graph: the nodes, and what is stored.
+        sizes: shapes by name, of the tensors whose sizes do not depend on values.
+        widths: bytes of an element, of the same tensors.
+    """
 
     name: str
-    graph: Any
+    graph: GraphProto
     sizes: Mapping[str, _Sizes]
-    widths: Mapping[str, int]  # bytes of an element
+    widths: Mapping[str, int]
 
     @staticmethod
-    def of(model: Any, canvas: tuple[int, int], name: str) -> "Budget":
-        """Infer the sizes for one image of a canvas `(width, height)`; what the model states itself is not believed."""
+    def of(model: ModelProto, canvas: tuple[int, int], name: str) -> Budget:
+        """Infer the sizes of tensors for one image.
+
+        Args:
+            model: a model without functions.
+            canvas: `(width, height)` of the image, where the model takes any.
+            name: what messages call the model.
+
+        Returns:
+            The sizes. What the model states itself is not believed.
+
+        Raises:
+            DataError: a tensor is too large.
+        """
         import onnx
 
         slim = without_weights(model)
-        for value in slim.graph.input:
-            kind = value.type.tensor_type
-            usual = (1, 3, canvas[1], canvas[0]) if len(kind.shape.dim) == 4 else (1,) * len(kind.shape.dim)
-            for side, size in zip(kind.shape.dim, usual, strict=True):
-                side.dim_value = side.dim_value or size
-        for value in slim.graph.output:
-            if value.type.HasField("tensor_type"):
-                value.type.tensor_type.ClearField("shape")
-        del slim.graph.value_info[:]
+        _forget_stated_sizes(slim.graph, canvas)
+        # Inference follows the values of shapes one by one, also where a model lets them grow without an end.
         short = _longest_shape(slim.graph, {}) <= _MOST_LENGTH
         inferred = onnx.shape_inference.infer_shapes(slim, data_prop=short).graph
-        sizes, kinds = {}, {}
+        sizes: dict[str, _Sizes] = {}
+        kinds: dict[str, int] = {}
         for value in (*inferred.value_info, *inferred.input, *inferred.output):
-            kind, stated = value.type.tensor_type, dims(value)
+            kind = value.type.tensor_type
+            stated = dims(value)
             check_elements(f"{name}: tensor {excerpt(value.name)}", stated)
-            if kind.HasField("shape") and all(each.HasField("dim_value") for each in kind.shape.dim):
-                sizes[value.name], kinds[value.name] = tuple(stated), kind.elem_type
+            if kind.HasField("shape") and all(side.HasField("dim_value") for side in kind.shape.dim):
+                sizes[value.name] = tuple(stated)
+                kinds[value.name] = kind.elem_type
         for tensor in inferred.initializer:
-            sizes[tensor.name], kinds[tensor.name] = tuple(tensor.dims), tensor.data_type
+            sizes[tensor.name] = tuple(tensor.dims)
+            kinds[tensor.name] = tensor.data_type
         for sparse in model.graph.sparse_initializer:
-            sizes[sparse.values.name], kinds[sparse.values.name] = tuple(sparse.dims), sparse.values.data_type
+            sizes[sparse.values.name] = tuple(sparse.dims)
+            kinds[sparse.values.name] = sparse.values.data_type
         return Budget(name, model.graph, sizes, {key: _width(kind) for key, kind in kinds.items()})
 
     def check(self, stored: int) -> None:
-        """Raise `DataError` for more bytes or more work than a model with files of `stored` bytes may take."""
+        """Check what a pass takes.
+
+        Args:
+            stored: bytes of the model's files.
+
+        Raises:
+            DataError: it takes more bytes or more work than a model with such files may.
+        """
+        self._check_limit(self.bytes(), _MOST_BYTES, "bytes of tensors together", stored)
+        self._check_limit(sum(map(self._work, self.graph.node)), _MOST_WORK, "multiplications of a pass", stored)
+
+    def _check_limit(self, got: int, limit: _Limit, unit: str, stored: int) -> None:
+        """Raise `DataError` where a model takes more than its files allow."""
+        most = limit.base + limit.per_byte * stored
         remedy = "give a smaller input_size, or replace the file"
-        for got, (base, more), unit in (
-            (self.bytes(), _MOST_BYTES, "bytes of tensors together"),
-            (sum(map(self._work, self.graph.node)), _MOST_WORK, "multiplications of a pass"),
-        ):
-            most = base + more * stored
-            check_data(got <= most, self.name, f"at most {most:,} {unit}, for {stored:,} stored", f"{got:,}; {remedy}")
+        check_data(got <= most, self.name, f"at most {most:,} {unit}, for {stored:,} stored", f"{got:,}; {remedy}")
 
     def is_open(self) -> bool:
-        """Whether sizes or work depend on values, or on operations that only onnxruntime knows."""
-        nodes = self.graph.node
-        made = {output for node in nodes for output in node.output if output}
-        return not made <= self.sizes.keys() or any(
-            n.op_type in _OPEN or n.domain not in ("", "ai.onnx") for n in nodes
-        )
+        """Tell whether sizes or work depend on values, or on operations that only onnxruntime knows."""
+        for node in self.graph.node:
+            if node.op_type in _OPEN or node.domain not in ("", "ai.onnx"):
+                return True
+            if any(output and output not in self.sizes for output in node.output):
+                return True
+        return False
 
     def bytes(self) -> int:
-        """Bytes of all tensors that follow from stored ones, and the most bytes of the others at any one time."""
-        # onnxruntime computes the former once, and keeps them all until it has done so.
+        """Sum the bytes of all tensors that follow from stored ones, and the most bytes of the others at any one time.
+
+        onnxruntime computes the former once, and keeps them all until it has done so.
+        """
         nodes = self.graph.node
-        last = {name: place for place, node in enumerate(nodes) for name in _read(node)}
-        last |= {output.name: len(nodes) for output in self.graph.output}
+        last_reader = {name: place for place, node in enumerate(nodes) for name in _read(node)}
+        last_reader |= {output.name: len(nodes) for output in self.graph.output}
         stored = {tensor.name for tensor in self.graph.initializer}
         sparse = {tensor.values.name for tensor in self.graph.sparse_initializer}
-        open_names = {value.name for value in self.graph.input} - stored - sparse
-        fixed = sum(map(self._bytes, sparse))
-        now = sum(map(self._bytes, open_names))
+        of_image = {value.name for value in self.graph.input} - stored - sparse
+        constant = sum(map(self._bytes, sparse))
+        now = sum(map(self._bytes, of_image))
         most = now
-        ending: dict[int, int] = {}
+        released: dict[int, int] = {}  # bytes by the place of the node after which nothing reads them
         for place, node in enumerate(nodes):
-            made = sum(map(self._bytes, node.output))
-            if open_names.isdisjoint(_read(node)):
-                fixed += made
+            new = sum(map(self._bytes, node.output))
+            if of_image.isdisjoint(_read(node)):
+                constant += new
                 continue
-            open_names.update(node.output)
+            of_image.update(node.output)
             for output in node.output:
-                end = last.get(output, place)
-                ending[end] = ending.get(end, 0) + self._bytes(output)
-            now += made
-            most = max(most, now + self._columns(node))
-            now -= ending.pop(place, 0)
-        return fixed + most
+                end = last_reader.get(output, place)
+                released[end] = released.get(end, 0) + self._bytes(output)
+            now += new
+            most = max(most, now + self._workspace(node))
+            now -= released.pop(place, 0)
+        return constant + most
 
     def _bytes(self, name: str) -> int:
+        """Compute the bytes of a tensor; 0 where its sizes are unknown."""
         return math.prod(self.sizes[name]) * self.widths[name] if name in self.sizes else 0
 
-    def _columns(self, node: Any) -> int:
-        """Bytes of what a transposed convolution makes of its input before it sums: all weights for each place."""
+    def _workspace(self, node: NodeProto) -> int:
+        """Compute the bytes that a transposed convolution makes of its input before it sums: all weights a place."""
         if node.op_type != "ConvTranspose" or not self.sizes.keys() >= {*node.input[:2]}:
             return 0
         image, weights = (self.sizes[name] for name in node.input[:2])
         return math.prod(image[2:]) * math.prod(weights[1:]) * self.widths[node.input[0]]
 
-    def _work(self, node: Any) -> int:
-        """Multiplications of a node, or the numbers that it reads and writes where these are more."""
+    def _work(self, node: NodeProto) -> int:
+        """Count the multiplications of a node, or the numbers that it reads and writes where these are more."""
         names = [name for name in (*node.input, *node.output) if name]
         moved = sum(math.prod(self.sizes[name]) for name in names if name in self.sizes)
         products = _PRODUCTS.get(node.op_type)
         if products is None or not self.sizes.keys() >= {*names}:
             return moved
-        return max(moved, products(node, [self.sizes.get(name, ()) for name in node.input], self.sizes[node.output[0]]))
+        inputs = [self.sizes.get(name, ()) for name in node.input]
+        return max(moved, products(node, inputs, self.sizes[node.output[0]]))
 
 
-def _of_matrices(_: Any, inputs: list[_Sizes], output: _Sizes) -> int:
-    """A column of the second matrix for each element of the result."""
-    *_, second = inputs[:2]
+def _forget_stated_sizes(graph: GraphProto, canvas: tuple[int, int]) -> None:
+    """Give inputs the sizes of one image `(width, height)` where they are open, and delete those of all else."""
+    for value in graph.input:
+        kind = value.type.tensor_type
+        rank = len(kind.shape.dim)
+        usual = (1, 3, canvas[1], canvas[0]) if rank == 4 else (1,) * rank
+        for side, size in zip(kind.shape.dim, usual, strict=True):
+            side.dim_value = side.dim_value or size
+    for value in graph.output:
+        if value.type.HasField("tensor_type"):
+            value.type.tensor_type.ClearField("shape")
+    del graph.value_info[:]
+
+
+# Multiplications of a node, by its attributes, the sizes of its inputs and those of its output.
+_Products = Callable[["NodeProto", list[_Sizes], _Sizes], int]
+
+
+def _of_matrices(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count a column of the second matrix for each element of the result."""
+    second = inputs[1]
     columns = output[-1] if len(second) > 1 and output else 1
     return math.prod(output) * math.prod(second[-2:]) // max(columns, 1)
 
 
-def _of_pool(node: Any, _: list[_Sizes], output: _Sizes) -> int:
+def _of_quantised_matrices(node: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count as for matrices; after each of them stand its scale and its zero."""
+    return _of_matrices(node, [inputs[0], inputs[3]], output)
+
+
+def _of_convolution(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count the weights of a filter for each element of the result."""
+    return math.prod(output) * math.prod(inputs[1][1:])
+
+
+def _of_quantised_convolution(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count as for a convolution; its weights come after the scale and the zero of the input."""
+    return math.prod(output) * math.prod(inputs[3][1:])
+
+
+def _of_transposed_convolution(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count the weights of a filter for each element of the input."""
+    return math.prod(inputs[0]) * math.prod(inputs[1][1:])
+
+
+def _of_pool(node: NodeProto, _: list[_Sizes], output: _Sizes) -> int:
+    """Count the elements of the kernel for each element of the result."""
     return math.prod(output) * math.prod(_attribute(node, "kernel_shape", ()))
 
 
-def _of_steps(_: Any, inputs: list[_Sizes], output: _Sizes) -> int:
-    """All weights of a recurrent layer for each step of each item."""
+def _of_response_norm(node: NodeProto, _: list[_Sizes], output: _Sizes) -> int:
+    """Count the channels around each element of the result."""
+    return math.prod(output) * _attribute(node, "size", 1)
+
+
+def _of_steps(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Count all weights of a recurrent layer for each step of each item."""
     return math.prod(inputs[0][:2]) * (math.prod(inputs[1]) + math.prod(inputs[2]))
 
 
-def _of_sums(node: Any, inputs: list[_Sizes], output: _Sizes) -> int:
-    """The product of the sides that the letters of an `Einsum` stand for; of all sides where it has an ellipsis."""
+def _of_sums(node: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
+    """Multiply the sides that the letters of an `Einsum` stand for; all sides where it has an ellipsis."""
     equation = _attribute(node, "equation", b"").decode().replace(" ", "")
     if "." in equation:
         return math.prod(map(math.prod, inputs))
     terms = equation.partition("->")[0].split(",")
-    pairs = (pair for term, sizes in zip(terms, inputs, strict=True) for pair in zip(term, sizes, strict=True))
-    return math.prod(dict(sorted(pairs, key=lambda pair: pair[1])).values())
+    sides: dict[str, int] = {}
+    for term, sizes in zip(terms, inputs, strict=True):
+        for letter, size in zip(term, sizes, strict=True):
+            sides[letter] = max(size, sides.get(letter, size))  # a side of 1 is repeated
+    return math.prod(sides.values())
 
 
-_PRODUCTS: dict[str, Callable[[Any, list[_Sizes], _Sizes], int]] = {
+_PRODUCTS: dict[str, _Products] = {
     **dict.fromkeys(("MatMul", "Gemm", "MatMulInteger"), _of_matrices),
-    "QLinearMatMul": lambda node, inputs, output: _of_matrices(node, [inputs[0], inputs[3]], output),
-    **dict.fromkeys(
-        ("Conv", "ConvInteger", "DeformConv"), lambda _, inputs, output: math.prod(output) * math.prod(inputs[1][1:])
-    ),
-    "QLinearConv": lambda _, inputs, output: math.prod(output) * math.prod(inputs[3][1:]),
-    "ConvTranspose": lambda _, inputs, output: math.prod(inputs[0]) * math.prod(inputs[1][1:]),
+    "QLinearMatMul": _of_quantised_matrices,
+    **dict.fromkeys(("Conv", "ConvInteger", "DeformConv"), _of_convolution),
+    "QLinearConv": _of_quantised_convolution,
+    "ConvTranspose": _of_transposed_convolution,
     **dict.fromkeys(("MaxPool", "AveragePool", "LpPool"), _of_pool),
-    "LRN": lambda node, _, output: math.prod(output) * _attribute(node, "size", 1),
+    "LRN": _of_response_norm,
     **dict.fromkeys(("RNN", "GRU", "LSTM"), _of_steps),
     "Einsum": _of_sums,
 }
 """Multiplications of the operations that read their inputs more than once."""
 
 
-def _attribute(node: Any, name: str, otherwise: Any) -> Any:
+def _attribute(node: NodeProto, name: str, otherwise: Any) -> Any:
+    """Read an attribute of a node, or a value for nodes without it."""
     import onnx
 
-    return next((onnx.helper.get_attribute_value(each) for each in node.attribute if each.name == name), otherwise)
+    for attribute in node.attribute:
+        if attribute.name == name:
+            return onnx.helper.get_attribute_value(attribute)
+    return otherwise
 
 
-def graphs(node: Any) -> Iterator[Any]:
-    """The graphs that a node has of its own."""
+def graphs(node: NodeProto) -> Iterator[GraphProto]:
+    """List the graphs that a node has of its own, such as the branches of an `If`.
+
+    Args:
+        node: the node.
+
+    Returns:
+        The graphs.
+    """
     for attribute in node.attribute:
         if attribute.HasField("g"):
             yield attribute.g
         yield from attribute.graphs
 
 
-def _read(node: Any) -> Iterator[str]:
-    """Names that a node reads, also in its own graphs."""
+def _read(node: NodeProto) -> Iterator[str]:
+    """List the names that a node reads, also in its own graphs."""
     yield from (name for name in node.input if name)
     for graph in graphs(node):
         for inner in graph.node:
             yield from _read(inner)
 
 
-def _longest_shape(graph: Any, lengths: dict[str, float]) -> float:
-    """The largest length of a shape that inference may follow; `lengths` has those of tensors around the graph."""
+def _longest_shape(graph: GraphProto, lengths: dict[str, float]) -> float:
+    """Find the largest length of a shape that inference may follow; `lengths` has those of tensors around the graph."""
     # Shapes that are joined to themselves again and again grow without an end, and a `Range` is computed one by one.
     lengths |= {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
     longest = 0.0
     for node in graph.node:
-        own = [lengths.get(name, 0) for name in node.input]
+        inputs = [lengths.get(name, 0) for name in node.input]
         length = _LENGTHS.get(node.op_type, 0.0)
         if node.op_type in _OF_SHAPES:
-            length = sum(own) if node.op_type == "Concat" else max(own, default=0)
+            length = sum(inputs) if node.op_type == "Concat" else max(inputs, default=0)
         lengths |= dict.fromkeys(node.output, length)
         longest = max(longest, length, *(_longest_shape(inner, lengths) for inner in graphs(node)))
     return longest
 
 
 def check_elements(name: str, sizes: Iterable[int]) -> None:
-    """Raise `DataError` for a tensor of more than `_MOST_ELEMENTS` numbers."""
+    """Refuse a tensor that would fill the memory.
+
+    Args:
+        name: what messages call the tensor.
+        sizes: its shape.
+
+    Raises:
+        DataError: it has more than `_MOST_ELEMENTS` numbers.
+    """
     sizes = list(sizes)
-    if min(sizes, default=0) < 0 or math.prod(sizes) > _MOST_ELEMENTS:
-        raise DataError(f"{name}: expected at most {_MOST_ELEMENTS:,} numbers, got sizes {excerpt(sizes)}")
+    valid = min(sizes, default=0) >= 0 and math.prod(sizes) <= _MOST_ELEMENTS
+    check_data(valid, name, f"at most {_MOST_ELEMENTS:,} numbers", f"sizes {excerpt(sizes)}")
 
 
-def dims(value: Any) -> list[int]:
-    """Sizes of a value; unknown sizes count as 1."""
-    return [d.dim_value if d.HasField("dim_value") else 1 for d in value.type.tensor_type.shape.dim]
+def dims(value: ValueInfoProto) -> list[int]:
+    """List the sizes of a value.
+
+    Args:
+        value: what a model says of one of its tensors.
+
+    Returns:
+        The sizes; unknown ones count as 1.
+    """
+    return [side.dim_value if side.HasField("dim_value") else 1 for side in value.type.tensor_type.shape.dim]
 
 
 def _width(kind: int) -> int:
-    """Bytes of an element; of a text, those of an empty one, and of a kind that is not known, the most of a number."""
+    """Find the bytes of an element; of a text, those of an empty one, and of an unknown kind, the most of a number."""
     import onnx
 
-    otherwise: dict[int, int] = {onnx.TensorProto.UNDEFINED: 16, onnx.TensorProto.STRING: 32}
-    return otherwise.get(kind) or onnx.helper.tensor_dtype_to_np_dtype(kind).itemsize
+    if kind == onnx.TensorProto.UNDEFINED:
+        return 16
+    if kind == onnx.TensorProto.STRING:
+        return 32
+    return onnx.helper.tensor_dtype_to_np_dtype(kind).itemsize
 
 
-def without_weights(model: Any) -> Any:
-    """The model without its large tensors: shapes may depend on values of small tensors only."""
+def without_weights(model: ModelProto) -> ModelProto:
+    """Copy a model without its large tensors, as shapes may depend on values of small tensors only.
+
+    Args:
+        model: the model.
+
+    Returns:
+        The copy, with inputs instead of the large tensors.
+    """
     import onnx
 
     slim = onnx.ModelProto()

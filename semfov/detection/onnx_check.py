@@ -1,26 +1,44 @@
 """Checks of ONNX files before onnxruntime opens them: their files, their functions, and what a pass takes."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from os.path import getsize
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from semfov.detection.onnx_budget import Budget, check_elements, graphs
 from semfov.errors import DataError, check_data
 from semfov.io.files import inside, reading
 from semfov.io.schema import excerpt
 
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+    from onnx import ModelProto, NodeProto, TensorProto
+
 _MOST_METADATA = 2**20  # largest number of characters of a model's metadata
 _MOST_NODES = 2**16  # after functions of the model are put where they are called
+_MOST_REASON = 400  # largest number of characters of a reason that a message has
 _HOLDERS = {f"{kind}Proto" for kind in ("Graph", "Function", "Node", "Attribute", "SparseTensor", "Tensor")}
+"""Messages of protobuf that hold tensors, perhaps at some depth."""
+
 USUAL = 640, 640  # sides of a picture with which open sizes are tried out
+
+_Function = tuple[str, str]  # domain and name
 
 
 def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
-    """Check a model without computing any of it, for one image of a canvas `(width, height)` if it takes any.
+    """Check a model without computing any of it.
+
+    Args:
+        path: the ONNX file.
+        canvas: `(width, height)` of the image that a pass is tried out for, if the model takes any.
 
     Returns:
-        whether its sizes or its work remain open, as they depend on values.
+        Whether its sizes or its work remain open, as they depend on values.
+
+    Raises:
+        DataError: the file cannot be read, or a pass takes more than a model of its size may.
     """
     import onnx
 
@@ -30,23 +48,23 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
     try:
         model = onnx.load(path, load_external_data=False)
         stored = [*_tensors(model)]
-        others = {*_other_files(path.parent, stored)}
+        files = {path, *_files_of_weights(path.parent, stored)}
         for tensor in stored:
             check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
         length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
         check_data(length <= _MOST_METADATA, name, f"at most {_MOST_METADATA:,} characters of metadata", f"{length:,}")
         budget = Budget.of(_without_functions(model, name), canvas, name)
-        budget.check(sum(map(getsize, {path, *others})))
+        budget.check(sum(map(getsize, files)))
         return budget.is_open()
     except DataError:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
-        reason = " ".join(str(error).split())[-400:]
+        reason = " ".join(str(error).split())[-_MOST_REASON:]
         raise DataError(f"cannot load the {name}: {reason}") from None
 
 
-def _tensors(message: Any) -> Iterator[Any]:
-    """All stored tensors in a part of a model, at any depth; a sparse one also with its whole size."""
+def _tensors(message: Message) -> Iterator[TensorProto]:
+    """List the stored tensors in a part of a model, at any depth; a sparse one also with its whole size."""
     import onnx
 
     if isinstance(message, onnx.TensorProto):
@@ -56,13 +74,15 @@ def _tensors(message: Any) -> Iterator[Any]:
         yield onnx.TensorProto(name=message.values.name, dims=message.dims)
     for field, value in message.ListFields():
         if field.message_type is not None and field.message_type.name in _HOLDERS:
-            for part in [value] if hasattr(value, "ListFields") else value:
+            repeated = not hasattr(value, "ListFields")
+            for part in value if repeated else [value]:
                 yield from _tensors(part)
 
 
-def _other_files(folder: Path, stored: Iterable[Any]) -> Iterator[Path]:
-    """The files of weights beside a model, which must lie in its folder."""
-    for place in {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}:
+def _files_of_weights(folder: Path, stored: Iterable[TensorProto]) -> Iterator[Path]:
+    """List the files of weights beside a model, which must lie in its folder."""
+    places = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
+    for place in places:
         file = inside(folder, place)
         with reading(file):
             file.stat()
@@ -71,22 +91,23 @@ def _other_files(folder: Path, stored: Iterable[Any]) -> Iterator[Path]:
         yield file
 
 
-def _without_functions(model: Any, name: str) -> Any:
-    """The model with its own functions put where they are called, unless these would be too many nodes."""
-    import onnx
+def _without_functions(model: ModelProto, name: str) -> ModelProto:
+    """Put the functions of a model where they are called, unless these would be too many nodes."""
     import onnx.inliner
 
-    bodies = {(each.domain, each.name): each.node for each in model.functions}
-    counts: dict[tuple[str, str], int] = {}
+    bodies = {(function.domain, function.name): function.node for function in model.functions}
+    # Nodes of each function, counted once, as functions that call each other twice grow exponentially.
+    counts: dict[_Function, int] = {}
 
-    def count(nodes: Iterable[Any], calling: tuple[tuple[str, str], ...] = ()) -> int:
+    def count(nodes: Iterable[NodeProto], callers: tuple[_Function, ...] = ()) -> int:
         total = 0
         for node in nodes:
-            key = node.domain, node.op_type
-            check_data(key not in calling, name, "functions that end", f"{excerpt(node.op_type)}, which calls itself")
-            if key in bodies and key not in counts:
-                counts[key] = count(bodies[key], (*calling, key))
-            total += counts.get(key, 1) + sum(count(graph.node, calling) for graph in graphs(node))
+            function = node.domain, node.op_type
+            got = f"{excerpt(node.op_type)}, which calls itself"
+            check_data(function not in callers, name, "functions that end", got)
+            if function in bodies and function not in counts:
+                counts[function] = count(bodies[function], (*callers, function))
+            total += counts.get(function, 1) + sum(count(graph.node, callers) for graph in graphs(node))
         return total
 
     nodes = count(model.graph.node)
