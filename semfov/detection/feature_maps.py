@@ -1,11 +1,11 @@
 """Feature maps of a look: what a network computes on the way to its boxes, named by their place in it and stride."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import log2
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -44,7 +44,14 @@ class FeatureMaps:
 
 
 class NetworkStep(NamedTuple):
-    """A step of a network: the map that it computes, its stride (None if it is no map), and the maps that it reads."""
+    """A step of a network.
+
+    Attributes:
+        name: the tensor that it computes.
+        stride: stride of the tensor in canvas pixels; None if it is no map.
+        reads: names of the tensors that it reads.
+        convolution: whether it is a convolution.
+    """
 
     name: str
     stride: int | None
@@ -53,48 +60,104 @@ class NetworkStep(NamedTuple):
 
 
 def landmarks(steps: Sequence[NetworkStep]) -> dict[str, str]:
-    """Names `backbone8`, `head8`, … of maps by the structure of a network, from its steps in order of computation.
+    """Name maps by their place in the structure of a network: `backbone8`, `head8`, ….
 
     `backbone` is the first map of a stride that a coarser one is computed from (the coarsest: that a finer one is).
     `head` is the last map that two convolutions read, else the last that one reads, of those that are computed after
     the coarsest stride, or a finer one again, is reached.
+
+    Args:
+        steps: the steps of the network, in order of computation.
+
+    Returns:
+        The names of the steps, by those of their places and strides.
     """
     strides = {step.name: step.stride for step in steps if step.stride is not None}
-    order = {step.name: place for place, step in enumerate(steps)}
-    readers = Counter(read for step in steps if step.convolution for read in step.reads[:1])
-    coarser: dict[int, str] = {}
-    finer: dict[int, str] = {}
-    begun = [order[name] for name, stride in strides.items() if stride == max(strides.values())][:1]
+    places: dict[tuple[str, int], str] = {}
+    for stride, name in _backbone_maps(steps, strides).items():
+        places["backbone", stride] = name
+    for stride, name in _head_maps(steps, strides).items():
+        places["head", stride] = name
+    return {f"{place}{stride}": name for (place, stride), name in sorted(places.items()) if stride >= _LEAST_STRIDE}
+
+
+def _changes(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> Iterator[tuple[NetworkStep, str]]:
+    """List the steps that compute a map of another stride than one that they read, with the map that they read."""
     for step in steps:
         for read in step.reads if step.name in strides else ():
-            change = strides[step.name] - strides.get(read, strides[step.name])
-            if change > 0:
-                coarser.setdefault(strides[read], read)
-            elif change < 0:
-                finer.setdefault(strides[read], read)
-                begun.append(order[step.name])
-    named = {("backbone", stride): name for stride, name in {**finer, **coarser}.items()}
+            if strides.get(read, strides[step.name]) != strides[step.name]:
+                yield step, read
+
+
+def _backbone_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict[int, str]:
+    """Find the first map of each stride that a coarser one is computed from, or else a finer one."""
+    halved: dict[int, str] = {}
+    doubled: dict[int, str] = {}
+    for step, read in _changes(steps, strides):
+        maps = halved if strides[step.name] > strides[read] else doubled
+        maps.setdefault(strides[read], read)
+    return {**doubled, **halved}
+
+
+def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict[int, str]:
+    """Find the last map of each stride that convolutions read, after the backbone ends."""
+    order = {step.name: place for place, step in enumerate(steps)}
+    readers = Counter(read for step in steps if step.convolution for read in step.reads[:1])
+    # The backbone ends with the first map of the coarsest stride, or with the first that is finer than one it reads.
+    ends = [order[name] for name, stride in strides.items() if stride == max(strides.values())][:1]
+    ends += [order[step.name] for step, read in _changes(steps, strides) if strides[step.name] < strides[read]]
+    maps = {}
     for stride in set(strides.values()):
-        late = [name for name in strides if strides[name] == stride and readers[name] and order[name] >= min(begun)]
+        late = [name for name in strides if strides[name] == stride and readers[name] and order[name] >= min(ends)]
+        shared = [name for name in late if readers[name] > 1]
         if late:
-            named["head", stride] = ([name for name in late if readers[name] > 1] or late)[-1]
-    return {f"{place}{stride}": name for (place, stride), name in sorted(named.items()) if stride >= _LEAST_STRIDE}
+            maps[stride] = (shared or late)[-1]
+    return maps
 
 
 def stride_of(canvas: int, side: int) -> int:
-    """The power of two that is nearest to the pixels of a canvas for one pixel of a map."""
+    """Find the stride of a map: the power of two that is nearest to the canvas pixels for one of its own.
+
+    Args:
+        canvas: side of the canvas in pixels.
+        side: the same side of the map.
+
+    Returns:
+        The stride in pixels.
+    """
     return int(2 ** round(log2(max(canvas / side, 1))))
 
 
 def chosen(layers: Iterable[str] | None, have: Sequence[str], detector: str) -> tuple[str, ...]:
-    """The layers that are asked for, all that a detector names if None; raises `InputError` where there is no map."""
+    """Choose the layers that are asked for.
+
+    Args:
+        layers: their names; None for all that a detector names.
+        have: the layers that the detector names.
+        detector: name of the detector, for the message.
+
+    Returns:
+        The names.
+
+    Raises:
+        InputError: the detector has no maps, or none of these names.
+    """
     if not have:
         raise no_features(detector)
-    return tuple(have if layers is None else (lookup(layer, have, f"feature map of {detector}") for layer in layers))
+    if layers is None:
+        return tuple(have)
+    return tuple(lookup(layer, have, f"feature map of {detector}") for layer in layers)
 
 
 def no_features(detector: str) -> InputError:
-    """The error of a detector that hides its feature maps."""
+    """Make the error of a detector that hides its feature maps.
+
+    Args:
+        detector: its name.
+
+    Returns:
+        The error.
+    """
     return InputError(
         f"detector: expected one that gives access to its feature maps, such as yolox-nano, yolov3-tiny or a model of "
         f"torchvision or transformers, got {detector}"
@@ -103,23 +166,36 @@ def no_features(detector: str) -> InputError:
 
 @contextmanager
 def recorded(modules: Mapping[str, nn.Module]) -> Iterator[dict[str, list[Tensor]]]:
-    """Record, by name, the maps that modules return while the block runs; parts of a batch are joined at its end."""
+    """Record the maps that modules return while the block runs.
+
+    Args:
+        modules: the modules, by the name of what they return.
+
+    Yields:
+        The maps by name, in the order in which a module returns them. They are there at the end of the block, when the
+        runs of a module on parts of a batch are joined.
+    """
     runs: dict[str, list[list[Tensor]]] = {name: [] for name in modules}
     maps: dict[str, list[Tensor]] = {}
-    hooks = [
-        module.register_forward_hook(lambda _, __, output, name=name: runs[name].append(list(_maps_in(output))))
-        for name, module in modules.items()
-    ]
+
+    def hook_of(name: str) -> Callable[[nn.Module, object, object], None]:
+        def note(module: nn.Module, inputs: object, output: object) -> None:
+            runs[name].append(list(_maps_in(output)))
+
+        return note
+
+    hooks = [module.register_forward_hook(hook_of(name)) for name, module in modules.items()]
     try:
         yield maps
-        maps.update({name: [torch.cat(parts) for parts in zip(*each, strict=True)] for name, each in runs.items()})
+        for name, parts in runs.items():
+            maps[name] = [torch.cat(pieces) for pieces in zip(*parts, strict=True)]
     finally:
         for hook in hooks:
             hook.remove()
 
 
-def _maps_in(output: Any) -> Iterator[Tensor]:
-    """The maps `(B, C, h, w)` in what a module returns, in order."""
+def _maps_in(output: object) -> Iterator[Tensor]:
+    """List the maps `(B, C, h, w)` in what a module returns, in order."""
     if isinstance(output, Tensor):
         if output.ndim == 4 and output.is_floating_point():
             yield output
