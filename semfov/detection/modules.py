@@ -3,7 +3,6 @@
 import hashlib
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,24 +12,44 @@ from semfov.detection.class_names import named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import chosen, no_features, recorded, stride_of
 from semfov.detection.placement import Placement
-from semfov.detection.scores import Candidates
+from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import check, check_shape
 
 
 class ModuleDetector(Detector):
-    """Base of detectors whose network is a torch module of another library; they are differentiable."""
+    """Base of detectors whose network is a torch module of another library; they are differentiable.
+
+    Of the `_count` scores of a box, those at `_places` stand for a class, as others are gaps or background.
+    """
 
     def __init__(
-        self, model: nn.Module, classes: Sequence[str], name: str, input_size: tuple[int, int], **options: Any
+        self,
+        model: nn.Module,
+        classes: Sequence[str],
+        name: str,
+        input_size: tuple[int, int],
+        *,
+        background: BackgroundPolicy = "residual",
+        fill: float = 0.5,
+        stride: int | None = None,
+        stretch: bool = False,
+        digest: str = "",
     ) -> None:
         names, places = named_outputs(classes)
-        super().__init__(name, names, input_size, **options)
+        super().__init__(
+            name, names, input_size, background=background, fill=fill, stride=stride, stretch=stretch, digest=digest
+        )
         self.model = model
-        self._places, self._count = places, len(classes)
+        self._places = places
+        self._count = len(classes)
         self.eval()
 
     def feature_modules(self) -> dict[str, nn.Module]:
-        """Modules of the network that return feature maps, by what the maps are called before their stride."""
+        """Name the modules of the network that return feature maps.
+
+        Returns:
+            The modules, by what their maps are called before their stride.
+        """
         return {}
 
     def propose_with_features(
@@ -40,40 +59,68 @@ class ModuleDetector(Detector):
         modules = self.feature_modules()
         if not modules:
             raise no_features(self.name)
-        with recorded(modules) as found:
+        with recorded(modules) as maps_by_module:
             candidates = self.propose(canvas)
-        maps = {
-            f"{place.rstrip('0123456789')}{stride_of(canvas.shape[-1], each.shape[-1])}": each
-            for place, several in found.items()
-            for each in several
-        }
+        maps = {}
+        for name, returned in maps_by_module.items():
+            place = name.rstrip("0123456789")
+            for feature_map in returned:
+                maps[f"{place}{stride_of(canvas.shape[-1], feature_map.shape[-1])}"] = feature_map
         return candidates, {layer: maps[layer] for layer in chosen(layers, [*maps], self.name)}
 
     def _pixels(self, canvas: Tensor) -> Tensor:
-        """A canvas in the precision of the network; raises `InputError` for anything else."""
+        """Convert a canvas to the precision of the network; raises `InputError` for anything else."""
         check_shape(canvas, "canvas", None, 3, None, None)
         check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         return canvas.to(next(self.model.parameters()).dtype)
 
 
 def edge_scale(images: Tensor, edges: tuple[float, float]) -> float:
-    """The scale at which the shorter edge of images has a length, unless the longer one exceeds another."""
+    """Find the scale at which the shorter edge of images has a length, unless the longer one exceeds another.
+
+    Args:
+        images: `(B, C, H, W)`.
+        edges: the length of the shorter edge, and the largest length of the longer one, in pixels.
+
+    Returns:
+        New pixels for a pixel of the images.
+    """
     height, width = images.shape[-2:]
-    return min(edges[0] / min(width, height), edges[1] / max(width, height))
+    shortest, longest = edges
+    return min(shortest / min(width, height), longest / max(width, height))
 
 
 def resized_images(
     images: Tensor, *, scale: float = 1.0, size: tuple[int, int] | None = None, antialias: bool = False
 ) -> tuple[Tensor, Placement]:
-    """Images resized bilinearly by a scale, or to `(width, height)`, and their placement, without padding."""
+    """Resize images bilinearly, without padding.
+
+    Args:
+        images: `(B, C, H, W)`.
+        scale: new pixels for a pixel of the images; new sides are rounded down.
+        size: `(width, height)` of the result, instead of a scale.
+        antialias: whether images are blurred where they shrink.
+
+    Returns:
+        The canvas, and the placement of the images on it.
+    """
     height, width = images.shape[-2:]
-    columns, rows = (max(1, math.floor(n * scale)) for n in (width, height)) if size is None else size
+    if size is None:
+        size = max(1, math.floor(width * scale)), max(1, math.floor(height * scale))
+    columns, rows = size
     canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False, antialias=antialias)
     return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))
 
 
 def module_digest(module: nn.Module) -> str:
-    """Compute the sha256 of the names and values of a module's parameters and buffers."""
+    """Compute the sha256 of the names and values of a module's parameters and buffers.
+
+    Args:
+        module: the module.
+
+    Returns:
+        The digest in hexadecimal.
+    """
     digest = hashlib.sha256()
     for name, tensor in module.state_dict().items():
         if isinstance(tensor, torch.Tensor):

@@ -2,11 +2,11 @@
 
 import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from os import fspath
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -20,14 +20,30 @@ from semfov.detection.scores import Candidates
 from semfov.errors import DataError, InputError, check, check_data, lookup
 from semfov.io.files import sha256
 
+if TYPE_CHECKING:
+    from torchvision.models.detection.image_list import ImageList
+
 _Raw = list[tuple[Tensor, Tensor]]
 """For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own box, and scores `(N, C)`."""
+
+_Decoder = Callable[["_Model", "ImageList", int], _Raw]
+"""What decodes a kind of model: from the model, images and the number of outputs before the classes."""
+
+# torchvision declares neither the parts of its models nor what its enums of weights hold.
+_Model = Any
+_Weights = Any
 
 _PREFIX = "torchvision:"
 
 
 class TorchvisionDetector(ModuleDetector):
-    """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable."""
+    """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
+
+    Attributes:
+        first: number of the output of the first class; the one before it, if any, is background.
+
+    `_decoder` computes boxes and scores, which are a softmax where `_softmax` is true, and else a sigmoid each.
+    """
 
     def __init__(
         self,
@@ -45,9 +61,9 @@ class TorchvisionDetector(ModuleDetector):
             count = _output_count(model)
             check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
             classes = names[first:]
-        outputs, softmax = _head_of(model)
+        decoder, softmax = _decoder_of(model)
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
-        transform: Any = model.transform
+        transform: _Model = model.transform
         fixed = transform.fixed_size
         super().__init__(
             model,
@@ -59,112 +75,159 @@ class TorchvisionDetector(ModuleDetector):
             digest=module_digest(model) if digest is None else digest,
         )
         self.first = first
-        self._outputs, self._softmax = outputs, softmax
+        self._decoder = decoder
+        self._softmax = softmax
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's transform does, without padding."""
         check_images(images)
-        transform: Any = self.model.transform
+        transform: _Model = self.model.transform
         if transform.fixed_size is not None:
             return resized_images(images, size=self.input_size)
         return resized_images(images, scale=edge_scale(images, (transform.min_size[-1], transform.max_size)))
 
     def outputs(self, canvas: Tensor) -> _Raw:
-        """Compute the boxes and scores of the model before it filters them; canvas `(B, 3, H, W)` → `(N, 4)`."""
+        """Compute the boxes and scores of the model before it filters them.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+
+        Returns:
+            For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own, and scores `(N, C)`.
+        """
         from torchvision.models.detection.image_list import ImageList
 
-        transform: Any = self.model.transform
+        transform: _Model = self.model.transform
         pixels = transform.normalize(self._pixels(canvas))
         batch = transform.batch_images(list(pixels), size_divisible=transform.size_divisible)
         sizes = [(canvas.shape[-2], canvas.shape[-1])] * canvas.shape[0]
-        return self._outputs(self.model, ImageList(batch, sizes), self.first)
+        return self._decoder(self.model, ImageList(batch, sizes), self.first)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1], padded with empty boxes to one number."""
         raw = self.outputs(canvas)
         images = [self._candidates(boxes, scores) for boxes, scores in raw]
-
-        def padded(rows: list[Tensor], value: float = 0.0) -> Tensor:
-            return pad_sequence(rows, True, value).to(canvas.dtype)
-
-        background = padded([scores[:, 0] for _, scores in raw], 1.0) if self._softmax else None
-        boxes, classes = padded([each.boxes for each in images]), padded([each.classes for each in images])
-        return Candidates(boxes, classes, background=background)
+        boxes = pad_sequence([image.boxes for image in images], True)
+        classes = pad_sequence([image.classes for image in images], True)
+        background = None
+        if self._softmax:
+            background = pad_sequence([scores[:, 0] for _, scores in raw], True, 1.0).to(canvas.dtype)
+        return Candidates(boxes.to(canvas.dtype), classes.to(canvas.dtype), background=background)
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
-        """The classes of one image without placeholders, with one box for each row."""
+        """Make candidates of one image, without placeholders of classes, and with one box for each row.
+
+        Shapes: boxes `(N, 4)` or `(N, C, 4)`, scores `(N, C)`.
+        """
         candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
         if boxes.ndim == 2:
             return candidates
         places = torch.tensor(self._places, device=boxes.device) + self.first
         best = places[candidates.classes.argmax(-1)]
-        own = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
-        return Candidates(own, candidates.classes)
+        best_boxes = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
+        return Candidates(best_boxes, candidates.classes)
 
     def feature_modules(self) -> dict[str, nn.Module]:
-        """The backbone with its pyramid."""
+        """Name the backbone with its pyramid."""
         return {"pyramid": cast(nn.Module, self.model.backbone)}
 
     def settings(self) -> dict[str, object]:
-        transform: Any = self.model.transform
-        sizes = {"min_size": list(transform.min_size), "max_size": transform.max_size}
-        return super().settings() | ({} if self.stretch else sizes)
+        settings = super().settings()
+        if not self.stretch:
+            transform: _Model = self.model.transform
+            settings |= {"min_size": list(transform.min_size), "max_size": transform.max_size}
+        return settings
 
     @classmethod
     def load(
-        cls, name: str, *, weights: Any = "DEFAULT", classes: Sequence[str] | None = None, first: int = 1, **model: Any
+        cls,
+        name: str,
+        *,
+        weights: _Weights = "DEFAULT",
+        classes: Sequence[str] | None = None,
+        first: int = 1,
+        **model: Any,
     ) -> "TorchvisionDetector":
-        """Load a torchvision detection model by its name."""
+        """Load a torchvision detection model by its name.
+
+        Args:
+            name: its name, with or without `torchvision:` before it.
+            weights: torchvision's weights, or their name; the file of a state dict; or None for random weights.
+            classes: names of the classes without background, for a state dict and for random weights.
+            first: number of the output of the first class.
+            **model: options of torchvision's builder of the model.
+
+        Returns:
+            The detector.
+
+        Raises:
+            InputError: a name or an option is unknown, or classes are missing.
+            DataError: the weights cannot be fetched, are damaged, or do not fit the model.
+        """
         from torchvision import models
 
         name = name.removeprefix(_PREFIX)
         lookup(name, models.list_models(module=models.detection), "torchvision detection model")
-        members: Any = models.get_model_weights(name)
-        enum = weights  # a member, or None for a file and for random weights
-        if weights is not None and not isinstance(weights, members):
-            text = fspath(weights).removeprefix(f"{members.__name__}.")
-            named = isinstance(weights, str) and not Path(text).suffix
-            enum = members[lookup(text, [*members.__members__], f"{members.__name__} member")] if named else None
-        if enum is not None:
+        published = _published_weights(weights, models.get_model_weights(name))
+        if published is not None:
             check(classes is None, "classes", "None, because torchvision's weights have their own classes", "names")
-            classes = enum.meta["categories"][1:]
-            digest = _download(enum)
+            classes = published.meta["categories"][1:]
+            digest = _download(published)
         elif classes is None:
             raise InputError("classes: expected the names of the model's classes without background, got None")
         else:
             model |= {"num_classes": len(classes) + first, "weights_backbone": None}
             digest = "" if weights is None else sha256(weights, f"weights {fspath(weights)!r}")
         try:
-            network = models.get_model(name, weights=enum, **model)
+            network = models.get_model(name, weights=published, **model)
         except (TypeError, ValueError) as error:
             raise InputError(f"options of {name}: {error}") from error
-        # The builder and the constructors of its model would silently accept any other option.
-        modules = (each for each in type(network).__mro__ if issubclass(each, nn.Module))
-        builders = models.get_model_builder(name), *modules
-        known = sorted({each for call in builders for each in inspect.signature(call).parameters})
-        for option in model:
-            lookup(option, known, f"option of {name}")
-        if enum is None and weights is not None:
+        _check_options(model, name, type(network))
+        if published is None and weights is not None:
             _load_state(network, Path(weights))
         return cls(network.requires_grad_(False), digest, classes=classes, name=_PREFIX + name, first=first)
 
 
-def _download(enum: Any) -> str:
-    """Download published weights, check that they hold tensors only and have the sha256 of their name; the sha256."""
+def _published_weights(weights: _Weights, members: _Weights) -> _Weights:
+    """Find the member of torchvision's enum of a model's weights; None for a file and for random weights."""
+    if weights is None or isinstance(weights, members):
+        return weights
+    text = fspath(weights).removeprefix(f"{members.__name__}.")
+    if not isinstance(weights, str) or Path(text).suffix:
+        return None
+    return members[lookup(text, [*members.__members__], f"{members.__name__} member")]
+
+
+def _check_options(options: Iterable[str], name: str, kind: type[nn.Module]) -> None:
+    """Raise `InputError` for an option that neither the builder of a model nor the constructors of its classes have."""
+    # They would silently accept any other option.
+    from torchvision import models
+
+    builders = [models.get_model_builder(name), *(base for base in kind.__mro__ if issubclass(base, nn.Module))]
+    known = set()
+    for builder in builders:
+        known |= {*inspect.signature(builder).parameters}
+    for option in options:
+        lookup(option, sorted(known), f"option of {name}")
+
+
+def _download(weights: _Weights) -> str:
+    """Download published weights, check that they hold tensors only, and return their sha256 if their name has it."""
     try:
-        enum.get_state_dict(progress=False, check_hash=True, weights_only=True)
+        weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
     except UnpicklingError as error:
-        raise DataError(f"weights {enum.url}: expected only tensors, got other objects ({error})") from error
+        raise DataError(f"weights {weights.url}: expected only tensors, got other objects ({error})") from error
     except (OSError, RuntimeError) as error:
         raise DataError(
-            f"cannot fetch the weights {enum.url} ({error}); give the path of their state dict as weights="
+            f"cannot fetch the weights {weights.url} ({error}); give the path of their state dict as weights="
         ) from error
-    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(enum.url).name
+    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(weights.url).name
     digest = sha256(path)
     start = re.search(r"-([0-9a-f]{8,})\.", path.name)
-    fits, begins = start is None or digest.startswith(start[1]), start and start[1]
-    got = f"{digest}; delete the file to fetch it again"
-    check_data(fits, f"weights {path}: damaged", f"a sha256 that begins with {begins}", got)
+    if start is not None:
+        expected = f"a sha256 that begins with {start[1]}"
+        got = f"{digest}; delete the file to fetch it again"
+        check_data(digest.startswith(start[1]), f"weights {path}: damaged", expected, got)
     return digest
 
 
@@ -182,97 +245,110 @@ def _load_state(network: nn.Module, path: Path) -> None:
         raise DataError(f"weights {str(path)!r}: do not fit the model, or are not a state dict ({error})") from error
 
 
-def _roi_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
-    """Faster R-CNN (Ren et al. 2015): the proposals, with a softmax over classes and a box for each class."""
+def _roi_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
+    """Decode Faster R-CNN (Ren et al. 2015): the proposals, with a softmax over classes and a box for each class."""
     features = _features(model, images)
     proposals, _ = model.rpn(images, features)
     heads = model.roi_heads
     regions = heads.box_head(heads.box_roi_pool(features, proposals, images.image_sizes))
     logits, regression = heads.box_predictor(regions)
-    counts = [len(each) for each in proposals]
+    counts = [len(boxes) for boxes in proposals]
     # Without proposals the box coder does not add the class dimension.
     boxes = heads.box_coder.decode(regression, proposals).reshape(len(logits), logits.shape[-1], 4).split(counts)
     scores = logits.softmax(-1).split(counts)
-    return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
+    return _clipped(boxes, scores, images)
 
 
-def _ssd_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
-    """SSD (Liu et al. 2016) and SSDlite: the default boxes, with a softmax over classes."""
+def _ssd_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
+    """Decode SSD (Liu et al. 2016) and SSDlite: the default boxes, with a softmax over classes."""
     outputs, anchors, _ = _dense(model, images)
-    boxes = [model.box_coder.decode_single(b, a) for b, a in zip(outputs["bbox_regression"], anchors, strict=True)]
+    decode = model.box_coder.decode_single
+    boxes = [decode(offsets, anchor) for offsets, anchor in zip(outputs["bbox_regression"], anchors, strict=True)]
     scores = outputs["cls_logits"].softmax(-1)
-    return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
+    return _clipped(boxes, scores, images)
 
 
-def _features(model: Any, images: Any) -> dict[str, Tensor]:
+def _level_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
+    """Decode RetinaNet (Lin et al. 2017) and FCOS (Tian et al. 2019): of every level the anchors with the best class.
+
+    Scores are a sigmoid for each class, of FCOS `√(σ(class) σ(centreness))`.
+    """
+    outputs, anchors, cells = _dense(model, images)
+    scores = outputs["cls_logits"].sigmoid()
+    if "bbox_ctrness" in outputs:
+        scores = (scores * outputs["bbox_ctrness"].sigmoid()).sqrt()
+        decode = model.box_coder.decode
+    else:
+        decode = model.box_coder.decode_single
+    anchors_per_cell = len(anchors[0]) // sum(cells)
+    counts = [anchors_per_cell * count for count in cells]
+    boxes = []
+    best_scores = []
+    for regression, image_scores, anchor in zip(outputs["bbox_regression"], scores, anchors, strict=True):
+        rows = _best_of_levels(image_scores[:, first:].detach().amax(-1), counts, model.topk_candidates)
+        boxes.append(decode(regression[rows], anchor[rows]))
+        best_scores.append(image_scores[rows])
+    return _clipped(boxes, best_scores, images)
+
+
+def _best_of_levels(best: Tensor, counts: list[int], limit: int) -> Tensor:
+    """Find the rows of the best scores `(N,)` of each level, at most `limit` of each; counts are rows by level."""
+    rows = []
+    start = 0
+    for level in best.split(counts):
+        rows.append(level.topk(min(limit, len(level))).indices + start)
+        start += len(level)
+    return torch.cat(rows)
+
+
+def _features(model: _Model, images: "ImageList") -> dict[str, Tensor]:
+    """Compute the features of a backbone, which has one map or several."""
     features = model.backbone(images.tensors)
     return {"0": features} if isinstance(features, Tensor) else features
 
 
-def _dense(model: Any, images: Any) -> tuple[dict[str, Tensor], list[Tensor], list[int]]:
-    """Outputs of a head on all levels, `(B, N, ...)`, the anchors of each image, and the number of pixels by level."""
+def _dense(model: _Model, images: "ImageList") -> tuple[dict[str, Tensor], list[Tensor], list[int]]:
+    """Compute the outputs of a head on all levels, `(B, N, ...)`, the anchors of each image, and the cells by level."""
     features = list(_features(model, images).values())
     outputs = model.head(features)
     anchors = model.anchor_generator(images, features)
     return outputs, anchors, [feature.shape[-1] * feature.shape[-2] for feature in features]
 
 
-def _level_outputs(model: Any, images: Any, backgrounds: int) -> _Raw:
-    """RetinaNet (Lin et al. 2017) and FCOS (Tian et al. 2019): of every level the anchors with the best class.
+def _clipped(boxes: Iterable[Tensor], scores: Iterable[Tensor], images: "ImageList") -> _Raw:
+    """Cut the boxes of each image to the image, and put its scores beside them."""
+    from torchvision.ops import clip_boxes_to_image
 
-    Scores are a sigmoid for each class, of FCOS `√(σ(class) σ(centreness))`.
-    """
-    outputs, anchors, pixels = _dense(model, images)
-    scores, centred = outputs["cls_logits"].sigmoid(), "bbox_ctrness" in outputs
-    if centred:
-        scores = (scores * outputs["bbox_ctrness"].sigmoid()).sqrt()
-    decode = model.box_coder.decode if centred else model.box_coder.decode_single
-    raw: _Raw = []
-    each = len(anchors[0]) // sum(pixels)
-    for regression, score, anchor, size in zip(
-        outputs["bbox_regression"], scores, anchors, images.image_sizes, strict=True
-    ):
-        index, start = [], 0
-        for best in score[:, backgrounds:].detach().amax(-1).split([each * count for count in pixels]):
-            index.append(best.topk(min(model.topk_candidates, len(best))).indices + start)
-            start += len(best)
-        rows = torch.cat(index)
-        raw.append((_clip(decode(regression[rows], anchor[rows]), size), score[rows]))
+    raw = []
+    for image_boxes, image_scores, size in zip(boxes, scores, images.image_sizes, strict=True):
+        raw.append((clip_boxes_to_image(image_boxes, size), image_scores))
     return raw
 
 
-def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
-    from torchvision.ops import clip_boxes_to_image
-
-    return clip_boxes_to_image(boxes, size)
-
-
-def _head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], _Raw], bool]:
-    """The function that decodes a kind of model, and whether its scores are a softmax."""
+def _decoder_of(model: nn.Module) -> tuple[_Decoder, bool]:
+    """Find what decodes a kind of model, and whether its scores are a softmax."""
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.ssd import SSD
 
-    for kind, function, softmax in (
-        (FasterRCNN, _roi_outputs, True),
-        (SSD, _ssd_outputs, True),
-        (RetinaNet, _level_outputs, False),
-        (FCOS, _level_outputs, False),
-    ):
-        if isinstance(model, kind):
-            return function, softmax
+    if isinstance(model, FasterRCNN):
+        return _roi_outputs, True
+    if isinstance(model, SSD):
+        return _ssd_outputs, True
+    if isinstance(model, RetinaNet | FCOS):
+        return _level_outputs, False
     raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
 
 
 def _output_count(model: nn.Module) -> int | None:
-    """The number of a model's outputs, background included; None where its head is not one of torchvision's."""
+    """Count a model's outputs, background included; None where its head is not one of torchvision's."""
     for path in (
         "roi_heads.box_predictor.cls_score.out_features",
         "head.classification_head.num_classes",
         "head.classification_head.num_columns",
     ):
-        value: Any = model
-        for part in path.split("."):
-            value = getattr(value, part, None)
-        if isinstance(value, int):
-            return value
+        part: object = model
+        for name in path.split("."):
+            part = getattr(part, name, None)
+        if isinstance(part, int):
+            return part
     return None

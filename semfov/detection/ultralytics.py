@@ -25,7 +25,7 @@ class UltralyticsDetector(ModuleDetector):
     ) -> None:
         # An `ultralytics.YOLO` object has its network as `model`; a network has layers there.
         inner = getattr(model, "model", None)
-        network: Any = inner if hasattr(inner, "names") else model
+        network = inner if hasattr(inner, "names") else model
         if not isinstance(network, nn.Module) or not hasattr(network, "names"):
             raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
         if classes is None:
@@ -42,16 +42,20 @@ class UltralyticsDetector(ModuleDetector):
         )
 
     def feature_modules(self) -> dict[str, nn.Module]:
-        """The layers that the head reads; a network without a list of layers has none."""
-        layers: Any = getattr(self.model, "model", None)
-        read = getattr(layers[-1], "f", None) if isinstance(layers, nn.Sequential) else None
-        return {f"head{place}": layers[place] for place in read} if isinstance(read, list | tuple) else {}
+        """Find the layers that the head reads; a network without a list of layers has none."""
+        layers = getattr(self.model, "model", None)
+        if not isinstance(layers, nn.Sequential):
+            return {}
+        head_inputs = getattr(layers[-1], "f", None)  # where Ultralytics keeps the numbers of the layers that one reads
+        if not isinstance(head_inputs, list | tuple):
+            return {}
+        return {f"head{number}": layers[number] for number in head_inputs}
 
     def propose(self, canvas: Tensor) -> Candidates:
         outputs = self.model(self._pixels(canvas))
         columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
         shape = tuple(columns.shape) if isinstance(columns, Tensor) else (type(columns).__name__,)
         expected = f"a network that returns all class scores of each box, (B, {4 + self._count}, N)"
-        way = "use a detection model whose head selects no boxes (end2end off)"
-        check(len(shape) == 3 and shape[1] == 4 + self._count, "detector", expected, f"{shape}; {way}")
+        remedy = "use a detection model whose head selects no boxes (end2end off)"
+        check(len(shape) == 3 and shape[1] == 4 + self._count, "detector", expected, f"{shape}; {remedy}")
         return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)
