@@ -1,4 +1,8 @@
-"""Detections in several crops of a picture around one point, merged into one set."""
+"""Detections in several crops of a picture around one point, merged into one set.
+
+The crops of a fixation lie within each other, the finest first. A box that a finer crop shows in full is left out of
+the wider ones, which are less sharp there. Others are merged as in windows (`semfov.detection.objects`).
+"""
 
 from dataclasses import replace
 
@@ -14,29 +18,56 @@ _BORDER = 2.0  # boxes that come this near to a border of their crop, in the det
 def merge_crops(
     detections: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
 ) -> Detections:
-    """Merge the detections in the crops of each fixation; windows `(F·L, 4)`, size `(width, height)`."""
-    # A box that a finer crop shows whole is left out of the wider ones, which are less sharp there. Others are merged
-    # as in windows (`semfov.detection.objects`).
+    """Merge the detections in the crops of each fixation.
+
+    Args:
+        detections: the detections in each crop, in picture pixels, of F fixations with L crops each.
+        windows: `(F·L, 4)`, the crops as boxes `(x1, y1, x2, y2)` in picture pixels.
+        crops: number L of crops of a fixation.
+        side: side of the detector's input in pixels.
+        size: `(width, height)` of the picture.
+        limit: largest number of detections of a fixation.
+
+    Returns:
+        The detections of each fixation.
+    """
     merged = []
     for first in range(0, len(detections.mask), crops):
-        rows = slice(first, first + crops)
-        number, row = detections.mask[rows].nonzero(as_tuple=True)
-        seen, window = detections[rows][number, row], windows[rows]
-        limits = seen.boxes.new_tensor([*size, *size], dtype=seen.boxes.dtype)
-        boxes = torch.minimum(seen.boxes.clamp(min=0), limits)
-        own = boxes.detach()
-        low, high = window[:, :2], window[:, 2:]
-        border = _BORDER * (high - low) / side
-        near = torch.where(low > 0, low + border, -torch.inf)
-        far = torch.where(high < limits[:2], high - border, torch.inf)
-        # Which of the boxes `(N, 4)` are whole in which of the crops `(L, 4)`, `(N, L)`.
-        whole = ((own[:, None, :2] > near) & (own[:, None, 2:] < far)).all(-1)
-        sharper = torch.arange(crops, device=number.device) < number[:, None]
-        left = (own[:, 2:] > own[:, :2]).all(-1) & ~(whole & sharper).any(-1)
-        index = left.nonzero()[:, 0]
-        value, label = seen.scores[index, 1:].detach().max(-1)
-        cut = ~whole[index, number[index]]
-        columns = (own[index], value, label, number[index], cut, -number[index])
-        chosen = index[unlike(*(column.cpu() for column in columns))[:limit].to(index)]
-        merged.append(replace(seen, boxes=boxes).take(chosen)[None])
+        fixation = slice(first, first + crops)
+        merged.append(_merge_fixation(detections[fixation], windows[fixation], side, size, limit))
     return merged[0] if len(merged) == 1 else Detections.stack(merged)
+
+
+def _merge_fixation(
+    detections: Detections, windows: Tensor, side: int, size: tuple[int, int], limit: int
+) -> Detections:
+    """Merge the detections in the crops `(L, 4)` of one fixation."""
+    crop, row = detections.mask.nonzero(as_tuple=True)
+    rows = detections[crop, row]
+    picture = rows.boxes.new_tensor([*size, *size], dtype=rows.boxes.dtype)
+    rows = replace(rows, boxes=torch.minimum(rows.boxes.clamp(min=0), picture))
+    boxes = rows.boxes.detach()
+    in_full = _shown_in_full(boxes, windows, picture[:2], side)
+    finer = torch.arange(len(windows), device=crop.device) < crop[:, None]
+    sharper_elsewhere = (in_full & finer).any(-1)
+    has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+    index = (has_area & ~sharper_elsewhere).nonzero()[:, 0]
+    score, label = rows.scores[index, 1:].detach().max(-1)
+    cut = ~in_full[index, crop[index]]
+    sharpness = -crop[index]
+    columns = (boxes[index], score, label, crop[index], cut, sharpness)
+    objects = index[unlike(*(column.cpu() for column in columns))[:limit].to(index)]
+    return rows.take(objects)[None]
+
+
+def _shown_in_full(boxes: Tensor, windows: Tensor, picture: Tensor, side: int) -> Tensor:
+    """Tell which boxes `(N, 4)` lie in which crops `(L, 4)` without being cut by their borders, `(N, L)`.
+
+    The borders of the picture `(2,)` cut no box.
+    """
+    low = windows[:, :2]
+    high = windows[:, 2:]
+    border = _BORDER * (high - low) / side
+    lowest = torch.where(low > 0, low + border, -torch.inf)
+    highest = torch.where(high < picture, high - border, torch.inf)
+    return ((boxes[:, None, :2] > lowest) & (boxes[:, None, 2:] < highest)).all(-1)

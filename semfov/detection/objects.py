@@ -72,20 +72,20 @@ class Objects:
         return len(self.boxes)
 
     def __repr__(self) -> str:
-        """The number of objects, and a line for each of the most confident ones."""
-        rows = zip(
-            *(each[:_PRINTED].tolist() for each in (self.labels, self.scores, self.boxes, self.passes)), strict=True
-        )
-        lines = [
-            f"{self.classes[label] if self.classes else f'class {label}'} {score:.2f}, box {box_text(box)}, look {look}"
-            for label, score, box, look in rows
-        ]
-        more = [f"and {len(self) - _PRINTED} more"] if len(self) > _PRINTED else []
-        return "\n  ".join([f"{len(self)} object{'s' if len(self) != 1 else ''}", *lines, *more])
+        """Write the number of objects, and a line for each of the most confident ones."""
+        lines = [f"{len(self)} object{'s' if len(self) != 1 else ''}"]
+        shown = self[:_PRINTED]
+        columns = (shown.labels.tolist(), shown.scores.tolist(), shown.boxes.tolist(), shown.passes.tolist())
+        for label, score, box, look in zip(*columns, strict=True):
+            name = self.classes[label] if self.classes else f"class {label}"
+            lines.append(f"{name} {score:.2f}, box {box_text(box)}, look {look}")
+        if len(self) > _PRINTED:
+            lines.append(f"and {len(self) - _PRINTED} more")
+        return "\n  ".join(lines)
 
     @classmethod
     def none(cls) -> "Objects":
-        """No objects.
+        """Make a set of no objects.
 
         Returns:
             The objects of a picture in which nothing was found.
@@ -94,7 +94,7 @@ class Objects:
         return cls(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
 
     def above(self, score: float) -> "Objects":
-        """Objects with at least a given score.
+        """Select objects with at least a given score.
 
         Args:
             score: the lowest score.
@@ -105,7 +105,7 @@ class Objects:
         return self[self.scores >= score]
 
     def of(self, labels: Sequence[int] | str) -> "Objects":
-        """Objects of some classes.
+        """Select objects of some classes.
 
         Args:
             labels: the classes, 1..K, or the name of one; none stands for all classes.
@@ -116,18 +116,29 @@ class Objects:
         Raises:
             InputError: no class has this name.
         """
-        labels = [class_index(labels, self.classes[1:])] if isinstance(labels, str) else labels
-        return self[torch.isin(self.labels, torch.tensor(labels))] if len(labels) else self
+        if isinstance(labels, str):
+            labels = [class_index(labels, self.classes[1:])]
+        if len(labels) == 0:
+            return self
+        return self[torch.isin(self.labels, torch.tensor(labels))]
 
     def __getitem__(self, index: Tensor | slice | int) -> "Objects":
-        """Some of the objects, or by a number one of them."""
+        """Select some of the objects, or one of them by its number."""
         check(not isinstance(index, str), "index", f"a number; objects.of({index!r}) are those of a class", repr(index))
-        index = torch.tensor([index]) if isinstance(index, int) else index
+        if isinstance(index, int):
+            index = torch.tensor([index])
         return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
 
 
 def box_text(box: Sequence[float]) -> str:
-    """Corners of a box in whole pixels."""
+    """Write the corners of a box in whole pixels.
+
+    Args:
+        box: `(x1, y1, x2, y2)`.
+
+    Returns:
+        The text.
+    """
     x1, y1, x2, y2 = (f"{edge:.0f}" for edge in box)
     return f"{x1},{y1}–{x2},{y2}"
 
@@ -172,33 +183,73 @@ def merge_boxes(
     >>> merged.boxes.tolist(), merged.passes.tolist()
     ([[502.0, 91.0, 700.0, 202.0]], [1])
     """
-    box, value = _numbers(boxes, "boxes"), _numbers(scores, "scores")
-    given = _numbers(labels, "labels")
-    label = given.long()
-    check(torch.equal(label.to(given), given), "labels", "whole numbers of classes", given.tolist()[:3])
-    box = box.view(0, 4) if not box.numel() else box
-    check_shape(box, "boxes", None, 4)
-    most = float(box.abs().max()) if box.numel() else 0.0
-    check(most <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{most:g}")
-    check_shape(value, "scores", len(box))
-    check_shape(label, "labels", len(box))
-    check(bool((box[:, :2] <= box[:, 2:]).all()), "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")
-    check(bool(((value >= 0) & (value <= 1)).all()), "scores", "numbers from 0 to 1", value.tolist()[:3])
+    corners, confidence, classes = _checked_boxes(boxes, scores, labels)
     for name, number in (("score", score), ("iou", iou), ("inside", inside)):
         check_number(number, name, 0, 1)
-    looks, cut, sharpness = torch.zeros(len(box)).long(), torch.zeros(len(box)).bool(), torch.zeros(len(box))
-    if windows is not None and len(box):
-        window = _numbers(windows, "windows")
-        check_shape(window, "windows", len(box), 4)
-        side = (window[:, 2:] - window[:, :2]).amax(-1)
-        check(bool((side > 0).all()), "windows", "boxes (x1, y1, x2, y2) of some size", window.tolist()[:3])
-        low, high = (window[:, :2].amin(0), window[:, 2:].amax(0)) if size is None else (0.0, torch.tensor(size))
-        near, far = box - window <= _BORDER * side[:, None], box - window >= -_BORDER * side[:, None]
-        cut = (near[:, :2] & (window[:, :2] > low)).any(-1) | (far[:, 2:] & (window[:, 2:] < high)).any(-1)
-        numbers: dict[tuple[float, ...], int] = {}
-        looks = torch.tensor([numbers.setdefault(tuple(each), len(numbers)) for each in window.tolist()])
+    count = len(corners)
+    if windows is None or not count:
+        looks = torch.zeros(count).long()
+        cut = torch.zeros(count).bool()
+        sharpness = torch.zeros(count)
+    else:
+        frames = _numbers(windows, "windows")
+        check_shape(frames, "windows", count, 4)
+        side = (frames[:, 2:] - frames[:, :2]).amax(-1)
+        check(bool((side > 0).all()), "windows", "boxes (x1, y1, x2, y2) of some size", frames.tolist()[:3])
+        looks = _numbers_of_windows(frames)
+        cut = _cut_by_windows(corners, frames, side, size)
         sharpness = -side
-    return merge_looks(box, value, label, looks, cut, sharpness, score=score, iou=iou, inside=inside)
+    return merge_looks(corners, confidence, classes, looks, cut, sharpness, score=score, iou=iou, inside=inside)
+
+
+def _checked_boxes(
+    boxes: ArrayLike | Tensor, scores: ArrayLike | Tensor, labels: ArrayLike | Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Convert boxes `(M, 4)`, scores `(M,)` and labels `(M,)` to tensors; raises `InputError` for any that are none."""
+    corners = _numbers(boxes, "boxes")
+    confidence = _numbers(scores, "scores")
+    numbers = _numbers(labels, "labels")
+    classes = numbers.long()
+    check(torch.equal(classes.to(numbers), numbers), "labels", "whole numbers of classes", numbers.tolist()[:3])
+    if not corners.numel():
+        corners = corners.view(0, 4)
+    check_shape(corners, "boxes", None, 4)
+    farthest = float(corners.abs().max()) if corners.numel() else 0.0
+    check(farthest <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{farthest:g}")
+    check_shape(confidence, "scores", len(corners))
+    check_shape(classes, "labels", len(corners))
+    ordered = bool((corners[:, :2] <= corners[:, 2:]).all())
+    check(ordered, "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")
+    in_range = bool(((confidence >= 0) & (confidence <= 1)).all())
+    check(in_range, "scores", "numbers from 0 to 1", confidence.tolist()[:3])
+    return corners, confidence, classes
+
+
+def _numbers_of_windows(windows: Tensor) -> Tensor:
+    """Number windows `(M, 4)` in the order in which they first appear, `(M,)`."""
+    numbers: dict[tuple[float, ...], int] = {}
+    return torch.tensor([numbers.setdefault(tuple(window), len(numbers)) for window in windows.tolist()])
+
+
+def _cut_by_windows(boxes: Tensor, windows: Tensor, side: Tensor, size: tuple[float, float] | None) -> Tensor:
+    """Tell which boxes `(M, 4)` the borders of their windows `(M, 4)` cut, `(M,)`.
+
+    Args:
+        boxes: boxes in picture pixels.
+        windows: the window of each box.
+        side: longer side of each window, `(M,)`.
+        size: `(width, height)` of the picture, whose border cuts no box; None takes the border of all windows.
+    """
+    low: Tensor | float = 0.0
+    if size is None:
+        low = windows[:, :2].amin(0)
+        high = windows[:, 2:].amax(0)
+    else:
+        high = torch.tensor(size)
+    border = _BORDER * side[:, None]
+    at_low_border = (boxes - windows <= border)[:, :2] & (windows[:, :2] > low)
+    at_high_border = (boxes - windows >= -border)[:, 2:] & (windows[:, 2:] < high)
+    return at_low_border.any(-1) | at_high_border.any(-1)
 
 
 def merge_looks(
@@ -221,11 +272,24 @@ def merge_looks(
     of the same object a whole box is kept rather than a cut one. If both or neither are cut, the one that was seen more
     sharply is kept, and of those the one with the higher score.
 
-    Shapes: boxes `(M, 4)`, scores `(M,)`, labels `(M,)`, looks `(M,)`, cut `(M,)`, sharpness `(M,)`.
+    Args:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        scores: `(M,)`, scores of the classes.
+        labels: `(M,)`, classes 1..K.
+        looks: `(M,)`, number of the look that shows each box.
+        cut: `(M,)`, whether the border of its window cuts a box.
+        sharpness: `(M,)`, of the look; only its order counts.
+        score: boxes with a lower score are left out.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+        around: width of a panorama in pixels, whose left and right edge are one; None for a flat picture.
+
+    Returns:
+        Objects, most confident first.
     """
-    enough = (scores >= score).nonzero()[:, 0]
-    columns = (each[enough] for each in (boxes, scores, labels, looks, cut, sharpness))
-    index = enough[unlike(*columns, iou=iou, inside=inside, around=around)]
+    index = (scores >= score).nonzero()[:, 0]
+    columns = (column[index] for column in (boxes, scores, labels, looks, cut, sharpness))
+    index = index[unlike(*columns, iou=iou, inside=inside, around=around)]
     return Objects(boxes[index], scores[index], labels[index], looks[index])
 
 
@@ -241,45 +305,82 @@ def unlike(
     inside: float = 0.8,
     around: float | None = None,
 ) -> Tensor:
-    """Indices of one box of each object, by the rule of `merge_looks` and with its arguments, most confident first."""
-    # Stable sorts, the last key first.
+    """Find one box of each object, by the rule of `merge_looks`.
+
+    Args:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        scores: `(M,)`, scores of the classes.
+        labels: `(M,)`, classes.
+        looks: `(M,)`, number of the look that shows each box.
+        cut: `(M,)`, whether the border of its window cuts a box.
+        sharpness: `(M,)`, of the look; only its order counts.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
+        around: width of a panorama in pixels, whose left and right edge are one; None for a flat picture.
+
+    Returns:
+        Indices of the boxes, most confident first.
+    """
+    # Best first: boxes that are not cut, of these the sharpest, of these the most confident. The sorts are stable, so
+    # the last key comes first.
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    # Each box, in this order, removes later ones that are the same object.
-    corners, kinds, seen, broken = (each[order].numpy() for each in (boxes, labels.double(), looks, cut))
+    corners, classes, look, is_cut = (column[order].numpy() for column in (boxes, labels.double(), looks, cut))
+    better, worse, shared = _overlapping_pairs(corners, classes, around)
+    area = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
+    union = area[better] + area[worse] - shared
+    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    # Boxes without area share none; equal ones are one object all the same.
+    empty = np.flatnonzero(union <= 0)
+    same[empty] = (corners[better[empty]] == corners[worse[empty]]).all(-1)
+    share_of_worse = shared / np.maximum(area, 1e-6)[worse]
+    same |= (share_of_worse >= np.float32(inside)) & is_cut[worse] & (look[better] != look[worse])
+    index = order[torch.from_numpy(_survivors(len(corners), better[same], worse[same]))]
+    return index[scores[index].argsort(descending=True, stable=True)]
+
+
+def _overlapping_pairs(
+    corners: NDArray[np.floating], classes: NDArray[np.floating], around: float | None
+) -> tuple[_Index, _Index, _Column]:
+    """Find pairs of boxes of one class that overlap along x, and the areas that they share.
+
+    Args:
+        corners: `(M, 4)`, the best box first.
+        classes: `(M,)`.
+        around: width of a panorama in pixels; None for a flat picture.
+
+    Returns:
+        Indices `(P,)` of the better and of the worse box of each pair, and the shared areas `(P,)`.
+    """
     count = len(corners)
     if around is not None:
         # Every box is there a second time, one turn further, so that boxes meet across the seam.
         turned = corners + np.array([around, 0, around, 0], corners.dtype)
-        corners, kinds = np.concatenate([corners, turned]), np.tile(kinds, 2)
+        corners = np.concatenate([corners, turned])
+        classes = np.tile(classes, 2)
     # Classes are moved apart, so that neighbours along x are of one class.
-    shift = kinds * (2 * np.abs(corners).max(initial=0) + 1)
-    start, end = corners[:, 0] + shift, corners[:, 2] + shift
-    across = start.argsort(kind="stable")
-    one, other = neighbours(start[across], end[across])
-    one, other = across[one], across[other]
+    shift = classes * (2 * np.abs(corners).max(initial=0) + 1)
+    start = corners[:, 0] + shift
+    end = corners[:, 2] + shift
+    rank = start.argsort(kind="stable")
+    first, second = neighbours(start[rank], end[rank])
+    first = rank[first]
+    second = rank[second]
     x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
-    shared = intersection(x1, y1, x2, y2, one, other)
+    shared = intersection(x1, y1, x2, y2, first, second)
     if around is not None:
-        one, other = one % count, other % count
-        apart = one != other
-        one, other, shared = one[apart], other[apart], shared[apart]
-    first, second = np.minimum(one, other), np.maximum(one, other)
-    area = ((x2 - x1) * (y2 - y1))[:count]
-    union = area[first] + area[second] - shared
-    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
-    # Boxes without area share none; equal ones are one object all the same.
-    empty = np.flatnonzero(union <= 0)
-    same[empty] = (corners[first[empty]] == corners[second[empty]]).all(-1)
-    part = shared / np.maximum(area, 1e-6)[second]
-    same |= (part >= np.float32(inside)) & broken[second] & (seen[first] != seen[second])
-    index = order[torch.from_numpy(_survivors(count, first[same], second[same]))]
-    return index[scores[index].argsort(descending=True, stable=True)]
+        first = first % count
+        second = second % count
+        others = first != second
+        first = first[others]
+        second = second[others]
+        shared = shared[others]
+    return np.minimum(first, second), np.maximum(first, second), shared
 
 
 def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
-    """Numbers as a tensor of floats on the CPU."""
+    """Convert numbers to a tensor of floats on the CPU."""
     try:
         tensor = torch.as_tensor(values, device="cpu").detach()
     except (TypeError, ValueError, RuntimeError):
@@ -290,7 +391,15 @@ def _numbers(values: ArrayLike | Tensor, name: str) -> Tensor:
 
 
 def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[_Index, _Index]:
-    """Pairs of intervals of which the second starts within the first; start `(N,)`, end `(N,)` → `(P,)`."""
+    """Pair intervals of which the second starts within the first.
+
+    Args:
+        start: `(N,)`, ascending.
+        end: `(N,)`.
+
+    Returns:
+        Indices `(P,)` of the first and of the second interval of each pair.
+    """
     stop = start.searchsorted(end, side="right")
     count = np.maximum(stop - np.arange(1, len(start) + 1), 0)
     first = np.arange(len(start)).repeat(count)
@@ -300,22 +409,45 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
 
 
 def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Index, second: _Index) -> _Column:
-    """Area `(P,)` that the boxes of each pair share, given edges `(N,)` of the boxes and indices `(P,)` of both."""
-    wide = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
-    high = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
-    return np.maximum(wide, 0) * np.maximum(high, 0)
+    """Compute the area that the boxes of each pair share.
+
+    Args:
+        x1: left edges of the boxes, `(N,)`.
+        y1: upper edges.
+        x2: right edges.
+        y2: lower edges.
+        first: indices of the first box of each pair, `(P,)`.
+        second: indices of the second box.
+
+    Returns:
+        `(P,)`, 0 where they share none.
+    """
+    width = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
+    height = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
+    return np.maximum(width, 0) * np.maximum(height, 0)
 
 
 def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
-    """Greedy suppression: the boxes that stay when each removes the worse boxes that it is paired with; both `(P,)`."""
-    doubtful, gone = np.zeros((2, count), np.bool_)
-    doubtful[worse] = True
+    """Find the boxes that stay when each, best first, removes the worse boxes that it is paired with.
+
+    Args:
+        count: number of boxes.
+        better: indices `(P,)` of the better box of each pair.
+        worse: indices `(P,)` of the other one.
+
+    Returns:
+        Indices of the boxes that stay, ascending.
+    """
     # A box that is never the worse one stays. Only the pairs that this leaves open depend on each other.
-    gone[worse[~doubtful[better]]] = True
-    left = np.flatnonzero(~(gone[better] | gone[worse]))
-    pairs = np.sort(better[left] * count + worse[left])
-    removed = bytearray(gone)
-    for one, other in zip((pairs // count).tolist(), (pairs % count).tolist(), strict=True):
-        if not removed[one]:
-            removed[other] = True
-    return np.flatnonzero(np.frombuffer(removed, np.bool_) == 0)
+    doubtful = np.zeros(count, np.bool_)
+    doubtful[worse] = True
+    removed = np.zeros(count, np.bool_)
+    removed[worse[~doubtful[better]]] = True
+    undecided = ~(removed[better] | removed[worse])
+    pairs = np.sort(better[undecided] * count + worse[undecided])
+    # Entries of a bytearray are read faster than those of an array.
+    flags = bytearray(removed)
+    for first, second in zip((pairs // count).tolist(), (pairs % count).tolist(), strict=True):
+        if not flags[first]:
+            flags[second] = True
+    return np.flatnonzero(np.frombuffer(flags, np.bool_) == 0)
