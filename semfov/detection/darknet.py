@@ -1,6 +1,7 @@
 """Darknet networks as PyTorch modules: their layers, built from the sections of a cfg, and their weights files."""
 
 import hashlib
+import math
 import struct
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -46,7 +47,18 @@ class Convolution(nn.Conv2d):
         normalised: bool = False,
     ) -> None:
         super().__init__(in_channels, out_channels, size, stride, padding, groups=groups)
-        self.activation, self.normalised = activation, normalised
+        self.activation = activation
+        self.normalised = normalised
+
+    @property
+    def stored_numbers(self) -> int:
+        """Number of its numbers in a weights file: the kernel and the bias, and the other vectors of batch norm."""
+        return self.weight.numel() + self.out_channels * self.stored_vectors
+
+    @property
+    def stored_vectors(self) -> int:
+        """Number of its vectors in a weights file: bias, with batch norm also scale, mean and variance."""
+        return 4 if self.normalised else 1
 
     def forward(self, input: Tensor) -> Tensor:
         return _ACTIVATIONS[self.activation](super().forward(input))
@@ -57,19 +69,26 @@ class MaxPool(nn.Module):
 
     def __init__(self, size: int, stride: int, padding: int) -> None:
         super().__init__()
-        self.size, self.stride, self.padding = size, stride, padding
+        self.size = size
+        self.stride = stride
+        self.padding = padding
 
     def forward(self, image: Tensor) -> Tensor:
         """Pool `(B, C, H, W)` to `(B, C, H', W')`."""
         before = self.padding // 2
-        sides = image.shape[-1], image.shape[-2]
-        outputs = [(length + self.padding - self.size) // self.stride for length in sides]
-        reached = [count * self.stride + self.size - before for count in outputs]
-        right, bottom = (max(0, reach - length) for reach, length in zip(reached, sides, strict=True))
+        right = self._padding_after(image.shape[-1])
+        bottom = self._padding_after(image.shape[-2])
+        # PyTorch's own padding is the same on both sides, and at most half the size.
         if before == right == bottom and 2 * before <= self.size:
             return F.max_pool2d(image, self.size, self.stride, before)
         padded = F.pad(image, (before, right, before, bottom), value=float("-inf"))
         return F.max_pool2d(padded, self.size, self.stride)
+
+    def _padding_after(self, length: int) -> int:
+        """Pixels beyond the end of a side that the last window reaches."""
+        last = (length + self.padding - self.size) // self.stride
+        end = last * self.stride + self.size - self.padding // 2
+        return max(0, end - length)
 
 
 class Route(nn.Module):
@@ -77,7 +96,8 @@ class Route(nn.Module):
 
     def __init__(self, groups: int = 1, group: int = 0) -> None:
         super().__init__()
-        self.groups, self.group = groups, group
+        self.groups = groups
+        self.group = group
 
     def forward(self, *images: Tensor) -> Tensor:
         """Concatenate `(B, C_i, H, W)` to `(B, Σ C_i / groups, H, W)`."""
@@ -102,7 +122,9 @@ class Head(nn.Identity):
 
     def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
         super().__init__()
-        self.anchors, self.classes, self.scale = anchors, classes, scale
+        self.anchors = anchors
+        self.classes = classes
+        self.scale = scale
 
     @property
     def channels(self) -> int:
@@ -115,8 +137,6 @@ _MOST_PARAMETERS = 3 * 10**8
 _MOST_ELEMENTS = 2**28
 _MOST_LAYERS = 2000
 _LARGEST_KERNEL = 255
-
-_KINDS = ("convolutional", "maxpool", "upsample", "route", "shortcut", "yolo", "dropout")
 
 # Keys that change what a layer computes, with the only value that is implemented.
 _NEUTRAL = {
@@ -136,107 +156,141 @@ class _Shape(NamedTuple):
 
 
 class _Builder:
-    """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads."""
+    """Makes layers from sections, one after the other, and keeps track of what they return and read.
+
+    Attributes:
+        shapes: shapes of the outputs of the layers made so far.
+        sources: the layers that each of them reads, -1 for the image.
+    """
+
+    # `_here` is the shape of the last output, before the first layer that of the image. `_pixels` are those of the
+    # image at the input size of the cfg, and `_parameters` those of all layers so far, for the limits.
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
-        self._pixels = size[0] * size[1]
+        width, height = size
+        self._pixels = width * height
         self._parameters = 0
+        self._here = _Shape(channels, Fraction(1))
         self.shapes: list[_Shape] = []
         self.sources: list[tuple[int, ...]] = []
-        self._here = _Shape(channels, Fraction(1))
+        self._makers: dict[str, Callable[[Section], nn.Module]] = {
+            "convolutional": self._convolution,
+            "maxpool": self._max_pool,
+            "upsample": self._upsample,
+            "route": self._route,
+            "shortcut": self._shortcut,
+            "yolo": self._yolo,
+            "dropout": self._dropout,
+        }
 
     def add(self, section: Section) -> nn.Module:
-        count, kind, here = len(self.shapes), section.kind, self._here
-        check_data(count < _MOST_LAYERS, section.where, f"at most {_MOST_LAYERS} layers", "more; check the cfg")
-        for key, value in _NEUTRAL.get(kind, {}).items():
+        """Make the layer of a section."""
+        few = len(self.shapes) < _MOST_LAYERS
+        check_data(few, section.where, f"at most {_MOST_LAYERS} layers", "more; check the cfg")
+        for key, value in _NEUTRAL.get(section.kind, {}).items():
             got = section.text(key, value)
             section.check(got == value, f"{key}={value}", f"{key}={got}, which is not supported")
-        makers = {"convolutional": self._convolution, "route": self._route, "yolo": self._yolo}
-        if kind in makers:
-            return makers[kind](section)
-        if kind == "maxpool":
-            stride = section.integer("stride", 1)
-            size = section.integer("size", stride)
-            padding = section.integer("padding", size - 1, minimum=0)
-            _check_kernel(section, size, stride, padding)
-            self._note(here.channels, here.step * stride)
-            return MaxPool(size, stride, padding)
-        if kind == "upsample":
-            stride = section.integer("stride", 2)
-            self._note(here.channels, here.step / stride)
-            return nn.Upsample(scale_factor=float(stride), mode="nearest")
-        if kind == "shortcut":
-            sources = self._layers(section, "from")
-            fits = len(sources) == 1 and self.shapes[sources[0]] == here
-            section.check(fits, "one layer of the same shape", f"layers {sources}")
-            self._note(here.channels, here.step, *sources)
-            return Shortcut(_activation(section, "linear"))
-        if kind != "dropout":
-            raise DataError(f"{section.where}: layer [{kind}] is not supported; supported: {', '.join(_KINDS)}")
-        self._note(here.channels, here.step)
-        return nn.Identity()
+        if section.kind not in self._makers:
+            supported = ", ".join(self._makers)
+            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {supported}")
+        return self._makers[section.kind](section)
 
-    def _note(self, channels: int, step: Fraction, *further: int, sources: tuple[int, ...] | None = None) -> None:
-        """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
-        shape = _Shape(channels, step)
-        fits = shape.channels * self._pixels <= _MOST_ELEMENTS * shape.step**2
-        check_data(fits, f"cfg: layer {len(self.shapes)}", f"a map of at most {_MOST_ELEMENTS:,} numbers", "more")
-        self.sources.append((len(self.shapes) - 1, *further) if sources is None else sources)
+    def _note(self, shape: _Shape, *sources: int) -> None:
+        """Note what a layer returns and reads; raises `DataError` where its map is too large."""
+        numbers = self._pixels * shape.channels / shape.step**2
+        most = f"a map of at most {_MOST_ELEMENTS:,} numbers"
+        check_data(numbers <= _MOST_ELEMENTS, f"cfg: layer {len(self.shapes)}", most, "more")
+        self.sources.append(sources)
         self.shapes.append(shape)
         self._here = shape
 
+    @property
+    def _previous(self) -> int:
+        """Number of the layer before the one that is made."""
+        return len(self.shapes) - 1
+
     def _convolution(self, section: Section) -> nn.Module:
-        here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
-        counts = f"{excerpt(here.channels)} input channels and {excerpt(filters)} filters"
-        section.check(here.channels % groups == filters % groups == 0, f"groups that divide {counts}", excerpt(groups))
-        size, stride = section.integer("size", 1), section.integer("stride", 1)
+        channels, step = self._here
+        filters = section.integer("filters", 1)
+        groups = section.integer("groups", 1)
+        counts = f"{excerpt(channels)} input channels and {excerpt(filters)} filters"
+        section.check(channels % groups == filters % groups == 0, f"groups that divide {counts}", excerpt(groups))
+        size = section.integer("size", 1)
+        stride = section.integer("stride", 1)
         # Parameters are counted before the layer is made, because making it allocates them.
-        self._parameters += here.channels // groups * filters * size**2 + 4 * filters
+        self._parameters += channels // groups * filters * size**2 + 4 * filters
         most = f"at most {_MOST_PARAMETERS:,} parameters up to this layer"
         section.check(self._parameters <= _MOST_PARAMETERS, most, "more; check the cfg")
         padding = section.integer("padding", 0, minimum=0)
         _check_kernel(section, size, stride, padding)
-        self._note(filters, here.step * stride)
+        self._note(_Shape(filters, step * stride), self._previous)
+        if section.integer("pad", 0, minimum=0):
+            padding = size // 2
         return Convolution(
-            here.channels,
+            channels,
             filters,
             size,
             stride=stride,
-            padding=size // 2 if section.integer("pad", 0, minimum=0) else padding,
+            padding=padding,
             groups=groups,
             activation=_activation(section, "logistic"),
             normalised=bool(section.integer("batch_normalize", 0, minimum=0)),
         )
 
+    def _max_pool(self, section: Section) -> nn.Module:
+        stride = section.integer("stride", 1)
+        size = section.integer("size", stride)
+        padding = section.integer("padding", size - 1, minimum=0)
+        _check_kernel(section, size, stride, padding)
+        self._note(_Shape(self._here.channels, self._here.step * stride), self._previous)
+        return MaxPool(size, stride, padding)
+
+    def _upsample(self, section: Section) -> nn.Module:
+        stride = section.integer("stride", 2)
+        self._note(_Shape(self._here.channels, self._here.step / stride), self._previous)
+        return nn.Upsample(scale_factor=float(stride), mode="nearest")
+
     def _route(self, section: Section) -> nn.Module:
         sources = self._layers(section, "layers")
-        groups, group = section.integer("groups", 1), section.integer("group_id", 0, minimum=0)
+        groups = section.integer("groups", 1)
+        group = section.integer("group_id", 0, minimum=0)
         shapes = [self.shapes[source] for source in sources]
         section.check(len({shape.step for shape in shapes}) == 1, "layers of one size", section.text("layers"))
         counts = [shape.channels for shape in shapes]
+        divided = group < groups and not any(count % groups for count in counts)
         parts = f"a group_id below groups, and groups that divide the channels {excerpt(counts)}"
-        fits = group < groups and not any(count % groups for count in counts)
-        section.check(fits, parts, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
-        self._note(sum(counts) // groups, shapes[0].step, sources=sources)
+        section.check(divided, parts, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
+        self._note(_Shape(sum(counts) // groups, shapes[0].step), *sources)
         return Route(groups, group)
+
+    def _shortcut(self, section: Section) -> nn.Module:
+        sources = self._layers(section, "from")
+        alike = len(sources) == 1 and self.shapes[sources[0]] == self._here
+        section.check(alike, "one layer of the same shape", f"layers {sources}")
+        self._note(self._here, self._previous, *sources)
+        return Shortcut(_activation(section, "linear"))
 
     def _yolo(self, section: Section) -> nn.Module:
         numbers = section.numbers("anchors")
-        pairs = list(zip(numbers[::2], numbers[1::2], strict=False))
-        mask = section.integers("mask", ",".join(map(str, range(len(pairs)))))
-        fits = len(numbers) % 2 == 0 and bool(mask) and all(0 <= index < len(pairs) for index in mask)
-        section.check(
-            fits, "pairs of anchors and a mask of their indices", f"{len(numbers)} numbers and the mask {mask}"
-        )
+        anchors = list(zip(numbers[::2], numbers[1::2], strict=False))
+        every_anchor = ",".join(map(str, range(len(anchors))))
+        mask = section.integers("mask", every_anchor)
+        paired = len(numbers) % 2 == 0 and bool(mask) and all(0 <= index < len(anchors) for index in mask)
+        got = f"{len(numbers)} numbers and the mask {mask}"
+        section.check(paired, "pairs of anchors and a mask of their indices", got)
         scale = section.numbers("scale_x_y", "1")
         section.check(len(scale) == 1, "one number", excerpt(section.text("scale_x_y", "1")), "scale_x_y")
-        head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
+        head = Head(tuple(anchors[index] for index in mask), section.integer("classes", 20), scale[0])
         section.check(head.channels == self._here.channels, f"{head.channels} channels", self._here.channels)
-        self._note(self._here.channels, self._here.step)
+        self._note(self._here, self._previous)
         return head
 
+    def _dropout(self, section: Section) -> nn.Module:
+        self._note(self._here, self._previous)
+        return nn.Identity()
+
     def _layers(self, section: Section, key: str) -> tuple[int, ...]:
-        """Numbers of the earlier layers that a key names, below 0 from this one on."""
+        """Read the numbers of the earlier layers that a key names, below 0 from this one on."""
         count = len(self.shapes)
         numbers = tuple(number if number >= 0 else count + number for number in section.integers(key))
         earlier = all(0 <= number < count for number in numbers)
@@ -245,12 +299,14 @@ class _Builder:
 
 
 def _check_kernel(section: Section, size: int, stride: int, padding: int) -> None:
-    fits = max(size, stride) <= _LARGEST_KERNEL and padding <= size
+    """Raise `DataError` for a kernel that is too large, or padded by more than itself."""
+    usual = max(size, stride) <= _LARGEST_KERNEL and padding <= size
     limits = f"size and stride up to {_LARGEST_KERNEL} and no more padding than size"
-    section.check(fits, limits, f"{size}, {stride} and {padding}")
+    section.check(usual, limits, f"{size}, {stride} and {padding}")
 
 
 def _activation(section: Section, default: str) -> str:
+    """Read the name of an activation."""
     name = section.text("activation", default)
     section.check(name in _ACTIVATIONS, f"one of the activations {', '.join(_ACTIVATIONS)}", repr(name))
     return name
@@ -258,65 +314,108 @@ def _activation(section: Section, default: str) -> str:
 
 _EPSILON = 1e-5  # constant ε that batch norm adds to the variance
 
+_NEW_HEADER = 20  # bytes of the header of a weights file since version 0.2, which counts images in 64 bits
+_OLD_HEADER = 16  # of an earlier one, which counts them in 32 bits
+
 
 class Darknet(nn.Module):
-    """A network from the sections of a cfg, with random weights: `(B, C, H, W)` → `(B, A (5 + K), H', W')` a head."""
+    """A network from the sections of a cfg, with random weights: `(B, C, H, W)` → `(B, A (5 + K), H', W')` a head.
+
+    Attributes:
+        sections: the sections of the cfg, `[net]` first.
+        input_size: `(width, height)` of the cfg in pixels.
+        channels: number of channels C of an image.
+        layers: the layers, numbered as in the cfg.
+        heads: those of them that are heads.
+        sources: the layers that each one reads, -1 for the image.
+        steps: input pixels for a pixel of each layer's output.
+        stride: the number of pixels that sides of an image are multiples of.
+
+    `_last_reader` has for each layer the last one that reads its output, after which the output is released. The layers
+    before `_stem` run one image at a time.
+    """
 
     def __init__(self, sections: Sequence[Section]) -> None:
         super().__init__()
         self.sections = tuple(sections)
         first = f"[{sections[0].kind}]" if sections else "no sections"
         check_data(first in ("[net]", "[network]"), "cfg", "[net] as its first section", first)
-        self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
-        self.channels = sections[0].integer("channels", 3)
-        check_canvas(sections[0].where, self.input_size)
+        net = sections[0]
+        self.input_size = (net.integer("width", 416), net.integer("height", 416))
+        self.channels = net.integer("channels", 3)
+        check_canvas(net.where, self.input_size)
         builder = _Builder(self.channels, self.input_size)
         self.layers = nn.ModuleList([builder.add(section) for section in sections[1:]])
         self.heads = [layer for layer in self.layers if isinstance(layer, Head)]
-        sections[0].check(bool(self.heads), "at least one [yolo] section", "none")
-        self.stride = max(-(-shape.step.numerator // shape.step.denominator) for shape in builder.shapes)
+        net.check(bool(self.heads), "at least one [yolo] section", "none")
         self.sources = builder.sources
         self.steps = [shape.step for shape in builder.shapes]
-        # The last layer that reads each output, after which it is released; the network returns the maps of the heads.
-        self._last_reader = {index: index for index in range(-1, len(self.layers))}
-        self._last_reader |= {source: index for index, read in enumerate(self.sources) for source in read}
-        self._last_reader |= {i: len(self.layers) for i, layer in enumerate(self.layers) if isinstance(layer, Head)}
+        self.stride = max(math.ceil(step) for step in self.steps)
+        self._last_reader = self._find_last_readers()
         # The maps of the first layers are so large that a CPU computes a batch faster one image at a time.
-        self._stem = next((index for index, shape in enumerate(builder.shapes) if shape.step >= 8), 0)
+        self._stem = next((index for index, step in enumerate(self.steps) if step >= 8), 0)
+
+    def _find_last_readers(self) -> dict[int, int]:
+        """Find the last layer that reads the output of each layer; itself, if none does."""
+        last_reader = {index: index for index in range(-1, len(self.layers))}
+        for index, sources in enumerate(self.sources):
+            for source in sources:
+                last_reader[source] = index
+        for index in self._head_numbers():
+            last_reader[index] = len(self.layers)  # the network returns the maps of heads at its end
+        return last_reader
+
+    def _head_numbers(self) -> list[int]:
+        """List the numbers of the layers that are heads."""
+        return [index for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
     def forward(self, image: Tensor) -> list[Tensor]:
+        """Compute the maps of all heads for images `(B, C, H, W)`."""
         self.check_image(image)
         image = image.contiguous(memory_format=torch.channels_last)
-        stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
         outputs = {-1: image}
+        stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
         if stem:
             runs = [self.run({-1: single}, 0, stem) for single in image.split(1)]
             outputs = {index: torch.cat([run[index] for run in runs]) for index in runs[0]}
         outputs = self.run(outputs, stem, len(self.layers))
-        return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
+        return [outputs[index] for index in self._head_numbers()]
 
     def features(self, image: Tensor) -> Tensor:
-        """Compute the input of the last convolution before the first head, `(B, C, H', W')`."""
+        """Compute the input of the last convolution before the first head.
+
+        Args:
+            image: `(B, C, H, W)`.
+
+        Returns:
+            `(B, C', H', W')`.
+        """
         self.check_image(image)
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
         last = self.sources[self.sources[head][0]][0]
         return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, last + 1)[last]
 
     def landmarks(self) -> dict[str, int]:
-        """Numbers of the layers whose maps have a name by their place (`semfov.detection.feature_maps`)."""
+        """Name maps by their place (`semfov.detection.feature_maps`).
+
+        Returns:
+            Numbers of their layers, by name.
+        """
         steps = []
-        same: dict[int, int] = {}  # layers that hand on the map of another one
+        origins: dict[int, int] = {}  # of layers that hand on the map of another one
         for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
-            reads = [same.get(source, source) for source in sources]
-            if len(reads) == 1 and (isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)):
-                same[index] = reads[0]
+            reads = [origins.get(source, source) for source in sources]
+            hands_on = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
+            if hands_on and len(reads) == 1:
+                origins[index] = reads[0]
                 continue
             names = tuple(str(read) for read in reads if read >= 0)
-            stride, convolution = round(float(self.steps[index])), isinstance(layer, Convolution)
-            steps.append(NetworkStep(str(index), stride, names, convolution))
+            stride = round(float(self.steps[index]))
+            steps.append(NetworkStep(str(index), stride, names, isinstance(layer, Convolution)))
         return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:
+        """Compute the sha256 of the sections of the cfg, in hexadecimal."""
         cfg = repr([(section.kind, sorted(section.options.items())) for section in self.sections])
         return hashlib.sha256(cfg.encode()).hexdigest()
 
@@ -324,11 +423,20 @@ class Darknet(nn.Module):
         """Raise `InputError` unless the network takes images of this shape."""
         check_shape(image, "image", None, self.channels, None, None)
         height, width = image.shape[-2:]
-        fits = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
-        check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
+        multiples = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
+        check(multiples, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
     def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
-        """Run layers `start` to `stop - 1` on outputs by layer (-1 is the image); returns those that are read later."""
+        """Run some layers.
+
+        Args:
+            outputs: outputs of earlier layers by their number, -1 for the image.
+            start: number of the first layer to run.
+            stop: number of the first one not to run.
+
+        Returns:
+            The outputs, by layer, that later layers read, or that the network returns.
+        """
         outputs = dict(outputs)
         for index in range(start, stop):
             outputs[index] = self.layers[index](*(outputs[source] for source in self.sources[index]))
@@ -337,7 +445,7 @@ class Darknet(nn.Module):
 
     @torch.no_grad()
     def read_weights(self, path: str | PathLike[str]) -> str:
-        """Load the parameters in a weights file, with batch norm folded in.
+        """Load the parameters in a weights file, with batch norm folded in; returns the file's sha256.
 
         The header of the file holds major version, minor version and revision as int32, then the number of images seen
         in training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with
@@ -347,37 +455,44 @@ class Darknet(nn.Module):
             weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
         """
         layers = [layer for layer in self.layers if isinstance(layer, Convolution)]
-        longest = 20 + 4 * sum(_count(layer) for layer in layers)
-        with reading(path, f"weights {str(path)!r}"), Path(path).open("rb") as file:
-            length = Path(path).stat().st_size
-            data = bytearray(file.read(longest + 1))  # a longer file is refused below, so it is not read to its end
-        start = 20
-        if len(data) >= 12:
-            major, minor, _ = struct.unpack_from("<3i", data)
-            start = 20 if 10 * major + minor >= 2 and major < 1000 and minor < 1000 else 16
-        needed = start + 4 * sum(_count(layer) for layer in layers)
-        got = f"{length}; the file is {'truncated' if length < needed else 'too long'}, or belongs to another network"
-        check_data(length == len(data) == needed, f"weights {str(path)!r}", f"{needed} bytes for this network", got)
-        numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
+        name = f"weights {str(path)!r}"
+        data = _read_data(Path(path), name, sum(layer.stored_numbers for layer in layers))
+        numbers = torch.frombuffer(data, dtype=torch.float32, offset=_header_length(data))
         got = "NaN or infinite ones; the file is damaged or not a weights file"
-        check_data(bool(numbers.isfinite().all()), f"weights {str(path)!r}", "finite numbers", got)
-        for layer in layers:
-            channels = layer.out_channels
-            vectors = numbers[: channels * (4 if layer.normalised else 1)].view(-1, channels).double()
-            weight = numbers[vectors.numel() : _count(layer)].view(layer.weight.shape).double()
-            bias = vectors[0]
-            if layer.normalised:
-                _, scale, mean, variance = vectors
+        check_data(bool(numbers.isfinite().all()), name, "finite numbers", got)
+        for layer, part in zip(layers, numbers.split([layer.stored_numbers for layer in layers]), strict=True):
+            vectors, kernel = part.split([layer.out_channels * layer.stored_vectors, layer.weight.numel()])
+            weight = kernel.view(layer.weight.shape).double()
+            bias, *batch_norm = vectors.view(-1, layer.out_channels).double()
+            if batch_norm:
+                scale, mean, variance = batch_norm
                 got = "negative ones; the file does not fit the cfg"
-                least = not bool((variance < 0).any())
-                check_data(least, f"weights {str(path)!r}", "variances of at least 0", got)
+                check_data(not bool((variance < 0).any()), name, "variances of at least 0", got)
                 factor = scale / (variance + _EPSILON).sqrt()
-                weight, bias = weight * factor[:, None, None, None], bias - mean * factor
+                weight = weight * factor[:, None, None, None]
+                bias = bias - mean * factor
             layer.weight.copy_(weight)
             cast(Tensor, layer.bias).copy_(bias)
-            numbers = numbers[_count(layer) :]
         return hashlib.sha256(data).hexdigest()
 
 
-def _count(layer: Convolution) -> int:
-    return layer.weight.numel() + layer.out_channels * (4 if layer.normalised else 1)
+def _read_data(path: Path, name: str, numbers: int) -> bytearray:
+    """Read a weights file, header included; raises `DataError` unless it holds a number of numbers."""
+    longest = _NEW_HEADER + 4 * numbers
+    with reading(path, name), path.open("rb") as file:
+        length = path.stat().st_size
+        data = bytearray(file.read(longest + 1))  # a longer file is refused below, so it is not read to its end
+    needed = _header_length(data) + 4 * numbers
+    got = f"{length}; the file is {'truncated' if length < needed else 'too long'}, or belongs to another network"
+    check_data(length == len(data) == needed, name, f"{needed} bytes for this network", got)
+    return data
+
+
+def _header_length(data: bytes | bytearray) -> int:
+    """Find the bytes of the header of a weights file, which has the version of Darknet that wrote it."""
+    if len(data) < struct.calcsize("<3i"):
+        return _NEW_HEADER
+    major, minor, _ = struct.unpack_from("<3i", data)
+    # Numbers that no version has mark a file of another kind, of whichever length.
+    new = 10 * major + minor >= 2 and major < 1000 and minor < 1000
+    return _NEW_HEADER if new else _OLD_HEADER
