@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
+from semfov.detection.darknet_onnx import Graph
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection
-from semfov.detection.yolo import Graph
 from semfov.zoom.eye import BORDER
 from semfov.zoom.hints import DETECTION_SCORE
 
@@ -93,7 +93,7 @@ class LookGraph(Graph):
 
     def selection(self, boxes: str, confidence: str, vectors: str, chosen: Selection) -> tuple[str, str]:
         """Select candidates `(1, N, …)` as `select` does: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
-        x1, y1, x2, y2 = self.add("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
+        x1, y1, x2, y2 = self.add_several("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
         full = self.add("And", self.add("Greater", x2, x1), self.add("Greater", y2, y1))
         full = self.add("Squeeze", full, self.constant([2]))
         sure = self.add("GreaterOrEqual", confidence, self.constant(chosen.threshold))
@@ -118,13 +118,13 @@ class LookGraph(Graph):
         )
         best = self._best(vector)
         count = self.add("Shape", best)
-        _, order = self.add("TopK", best, count, outputs=2, axis=0)
+        _, order = self.add_several("TopK", best, count, outputs=2, axis=0)
         return self.add("Gather", box, order), self.add("Gather", vector, order)
 
     def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str]:
         """Take the hints from candidates `(1, N, …)`: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
         enough = self.add("GreaterOrEqual", confidence, self.constant(self.faint))
-        _, index = self.add("Split", self.add("NonZero", enough), self.constant([1, 1]), outputs=2, axis=0)
+        _, index = self.add_several("Split", self.add("NonZero", enough), self.constant([1, 1]), outputs=2, axis=0)
         index = self.add("Squeeze", index, self.constant([0]))
         box, vector = (
             self.add("Gather", self.add("Squeeze", each, self.constant([0])), index) for each in (boxes, vectors)
@@ -133,16 +133,18 @@ class LookGraph(Graph):
 
     def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
         """Map canvas boxes `(L, 4)` to picture pixels, cut to the window; also tell which its border cuts, `(L,)`."""
-        window, canvas = self.add("Split", frame, self.constant([4, 4]), outputs=2, axis=0)
+        window, canvas = self.add_several("Split", frame, self.constant([4, 4]), outputs=2, axis=0)
         single = [self.add("Cast", each, to=_FLOAT) for each in (window, canvas)]
-        (low, high), (first, last) = (self.add("Split", n, self.constant([2, 2]), outputs=2, axis=0) for n in single)
+        (low, high), (first, last) = (
+            self.add_several("Split", n, self.constant([2, 2]), outputs=2, axis=0) for n in single
+        )
         scale = self.add("Div", self.add("Sub", high, low), self.add("Sub", last, first))
         twice = {name: self.add("Concat", value, value, axis=0) for name, value in
                  {"scale": scale, "first": first, "low": low, "high": high}.items()}  # fmt: skip
         moved = self.add("Mul", self.add("Sub", boxes, twice["first"]), twice["scale"])
         mapped = self.add("Add", moved, twice["low"])
         mapped = self.add("Min", self.add("Max", mapped, twice["low"]), twice["high"])
-        upper, lower = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        upper, lower = self.add_several("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
         border = self.constant(float(BORDER))
         shape = self.add("Cast", self.add("Gather", self.add("Shape", picture), self.constant([1, 0])), to=_FLOAT)
         near = self.add(
@@ -168,7 +170,7 @@ class LookGraph(Graph):
         top = self.add("ScatterElements", alone, at, best, axis=0, reduction="max")
         # The size of a cell is that of its most confident hint.
         leads = self.add("GreaterOrEqual", best, self.add("Gather", top, at))
-        corner, opposite = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        corner, opposite = self.add_several("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
         extent = self.add("Clip", self.add("Sub", opposite, corner), self.constant(1e-3))
         m = self.add("Cast", self.add("Gather", start, self.constant([2])), to=_FLOAT)
         log2 = self.constant(float(1 / torch.tensor(2.0).log()))
@@ -194,11 +196,11 @@ class LookGraph(Graph):
         corner = self.add("Cast", self.add("Slice", start, self.constant([0]), self.constant([2])), to=_FLOAT)
         m = self.add("Cast", self.add("Gather", start, self.constant([2])), to=_FLOAT)
         pitch = self.add("Div", self.constant([self.wide / cells, self.high / cells]), m)
-        upper, lower = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        upper, lower = self.add_several("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
         middle = self.add("Div", self.add("Add", upper, lower), self.constant(2.0))
         place = self.add("Floor", self.add("Div", self.add("Sub", middle, corner), pitch))
         place = self.add("Clip", place, self.constant(0.0), self.constant(float(cells - 1)))
-        column, row = self.add("Split", place, self.constant([1, 1]), outputs=2, axis=1)
+        column, row = self.add_several("Split", place, self.constant([1, 1]), outputs=2, axis=1)
         number = self.add("Add", self.add("Mul", row, self.constant(float(cells))), column)
         return self.add("Cast", self.add("Squeeze", number, self.constant([1])), to=_INT64)
 

@@ -40,19 +40,41 @@ class UnnamedClasses(InputError):
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Find the names that stand for a class, and their places; a whole number is a name, too."""
+    """Find the names that stand for a class; a whole number is a name, too.
+
+    Args:
+        classes: a name for each score of a head.
+
+    Returns:
+        The names without placeholders, and their places among the scores.
+
+    Raises:
+        InputError: they are no names, or two classes have one.
+    """
     wrong = [name for name in classes if isinstance(name, bool) or not isinstance(name, str | int | None)]
     remedy = "; YAML reads no, off, yes and on so: put names in quotes, or give classes="
     check(not wrong, "classes", "names", f"{wrong[:3]}{remedy}")
     names = [str(name).strip() for name in classes]
     places = tuple(index for index, name in enumerate(names) if name.lower() not in _PLACEHOLDERS)
-    kept = tuple(names[index] for index in places)
-    check(len(set(kept)) == len(kept) > 0, "classes", "at least one name, all different", kept)
-    return kept, places
+    named = tuple(names[index] for index in places)
+    check(len(set(named)) == len(named) > 0, "classes", "at least one name, all different", named)
+    return named, places
 
 
 def keep_classes(candidates: Candidates, places: Sequence[int], count: int) -> Candidates:
-    """Keep the scores at `places` only; the head must have `count` scores."""
+    """Keep the scores that stand for a class.
+
+    Args:
+        candidates: boxes with all scores of a head.
+        places: places of the scores to keep.
+        count: number of the names that were given for the scores.
+
+    Returns:
+        The boxes with these scores.
+
+    Raises:
+        InputError: the head has another number of scores.
+    """
     channels = candidates.classes.shape[-1]
     check(channels == count, "classes", f"{channels} names, one for each score of the head", count)
     if len(places) == count:

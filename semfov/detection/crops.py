@@ -65,9 +65,9 @@ def _shown_in_full(boxes: Tensor, windows: Tensor, picture: Tensor, side: int) -
 
     The borders of the picture `(2,)` cut no box.
     """
-    low = windows[:, :2]
-    high = windows[:, 2:]
-    border = _BORDER * (high - low) / side
-    lowest = torch.where(low > 0, low + border, -torch.inf)
-    highest = torch.where(high < picture, high - border, torch.inf)
+    lower = windows[:, :2]
+    upper = windows[:, 2:]
+    border = _BORDER * (upper - lower) / side
+    lowest = torch.where(lower > 0, lower + border, -torch.inf)
+    highest = torch.where(upper < picture, upper - border, torch.inf)
     return ((boxes[:, None, :2] > lowest) & (boxes[:, None, 2:] < highest)).all(-1)

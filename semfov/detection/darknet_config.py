@@ -1,10 +1,9 @@
 """Darknet cfgs, the sections that describe a network layer by layer: read from a file, or of a published YOLOv3."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from os import PathLike
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from semfov.errors import DataError, check_data
 from semfov.io.files import read_text
@@ -15,7 +14,13 @@ _T = TypeVar("_T", int, float)
 
 
 class Section(NamedTuple):
-    """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first."""
+    """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first.
+
+    Attributes:
+        kind: what stands in the brackets.
+        options: values by key, as text.
+        where: file and line, for messages.
+    """
 
     kind: str
     options: Mapping[str, str]
@@ -26,21 +31,21 @@ class Section(NamedTuple):
         check_data(condition, f"{self.where}: [{self.kind}] {key}".rstrip(), expected, got)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """The value of `key` as text; a key without a default is required."""
+        """Read the value of `key` as text; a key without a default is required."""
         value = self.options.get(key, default)
         self.check(value is not None, f"the key {key!r}", "none")
         return str(value)
 
     def integers(self, key: str, default: str | None = None) -> tuple[int, ...]:
-        """The value of `key` as a list of whole numbers."""
+        """Read the value of `key` as a list of whole numbers."""
         return self._values(int, key, default, "whole numbers")
 
     def numbers(self, key: str, default: str | None = None) -> tuple[float, ...]:
-        """The value of `key` as a list of finite numbers."""
+        """Read the value of `key` as a list of finite numbers."""
         return self._values(float, key, default, "finite numbers")
 
     def integer(self, key: str, default: int | None = None, *, minimum: int = 1) -> int:
-        """The value of `key` as one whole number, at least `minimum`."""
+        """Read the value of `key` as one whole number, at least `minimum`."""
         expected = f"one whole number of at least {minimum}"
         values = self._values(int, key, None if default is None else str(default), expected)
         self.check(len(values) == 1 and values[0] >= minimum, expected, excerpt(self.options.get(key)), key)
@@ -48,16 +53,20 @@ class Section(NamedTuple):
 
     def _values(self, kind: Callable[[str], _T], key: str, default: str | None, expected: str) -> tuple[_T, ...]:
         text = self.text(key, default)
-        values: tuple[Any, ...] = (math.nan,)
+        values: tuple[_T, ...] = ()
+        finite = False
         with suppress(ValueError):
             values = tuple(kind(part) for part in text.split(",") if part.strip())
-        finite = all(0 * value == 0 for value in values)  # also of whole numbers that no float can hold
+            finite = all(0 * value == 0 for value in values)  # also of whole numbers that no float can hold
         self.check(finite, expected, excerpt(text), key)
         return values
 
 
 def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
-    """Parse the text of a cfg; where a key is repeated in a section, the first value counts, as in Darknet."""
+    """Parse the text of a cfg.
+
+    Where a key is repeated in a section, the first value counts, as in Darknet.
+    """
     sections: list[Section] = []
     options: dict[str, str] = {}
     for number, raw in enumerate(text.splitlines(), start=1):
@@ -77,6 +86,17 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
 
 def read_cfg(path: str | PathLike[str]) -> list[Section]:
+    """Read a cfg.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its sections, `[net]` first.
+
+    Raises:
+        DataError: the file cannot be read, or a line is neither a section nor a key with its value.
+    """
     return _parse_cfg(read_text(path, most=_MOST_BYTES), str(path))
 
 
@@ -85,9 +105,9 @@ _TINY_ANCHORS = "10,14, 23,27, 37,58, 81,82, 135,169, 344,319"
 
 
 def _yolov3(classes: int = 80, size: int = 416, pyramid: Sequence[Section] = ()) -> list[Section]:
-    """YOLOv3: Darknet-53 and heads at strides 32, 16 and 8 on a square input; 75 convolutions."""
+    """Describe YOLOv3: Darknet-53 and heads at strides 32, 16 and 8 on a square input; 75 convolutions."""
     sections = [_section("net", width=size, height=size, channels=3), _convolution(32, 3)]
-    ends = []
+    stage_ends = []
     for filters, blocks in ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4)):
         sections.append(_convolution(filters, 3, stride=2))
         sections += [
@@ -95,24 +115,27 @@ def _yolov3(classes: int = 80, size: int = 416, pyramid: Sequence[Section] = ())
             _convolution(filters, 3),
             _section("shortcut", **{"from": -3}, activation="linear"),
         ] * blocks
-        ends.append(len(sections) - 2)  # minus 2, because [net] is not a layer
-    for width, mask, lateral in ((512, "6,7,8", None), (256, "3,4,5", ends[3]), (128, "0,1,2", ends[2])):
-        if lateral is not None:
+        stage_ends.append(len(sections) - 2)  # minus 2, because [net] is not a layer
+    lateral = {256: stage_ends[3], 128: stage_ends[2]}  # stages that the finer heads read as well
+    for width, mask in ((512, "6,7,8"), (256, "3,4,5"), (128, "0,1,2")):
+        coarsest = width not in lateral
+        if not coarsest:
             sections += [
                 _section("route", layers="-4"),
                 _convolution(width, 1),
                 _section("upsample", stride=2),
-                _section("route", layers=f"-1,{lateral}"),
+                _section("route", layers=f"-1,{lateral[width]}"),
             ]
         sections += [_convolution(width, 1), _convolution(2 * width, 3), _convolution(width, 1)]
-        sections += pyramid if lateral is None else []
+        if coarsest:
+            sections += pyramid
         sections += [_convolution(2 * width, 3), _convolution(width, 1), _convolution(2 * width, 3)]
         sections += _head(mask, _ANCHORS, classes)
     return sections
 
 
 def _yolov3_spp(classes: int = 80) -> list[Section]:
-    """YOLOv3-spp: YOLOv3 with parallel max pools of sizes 5, 9 and 13 before the first head, at 608 x 608."""
+    """Describe YOLOv3-spp: YOLOv3 with parallel max pools of sizes 5, 9 and 13 before the first head, at 608 x 608."""
     pyramid = [
         _section("maxpool", size=5, stride=1),
         _section("route", layers="-2"),
@@ -126,7 +149,7 @@ def _yolov3_spp(classes: int = 80) -> list[Section]:
 
 
 def _yolov3_tiny(classes: int = 80) -> list[Section]:
-    """YOLOv3-tiny: seven convolutions with max pools, heads at strides 32 and 16; the weights fit anchors 1, 2, 3."""
+    """Describe YOLOv3-tiny: seven convolutions with max pools, and heads at strides 32 and 16."""
     backbone = []
     for filters in (16, 32, 64, 128, 256):
         backbone += [_convolution(filters, 3), _section("maxpool", size=2, stride=2)]
@@ -150,7 +173,7 @@ def _yolov3_tiny(classes: int = 80) -> list[Section]:
         *backbone,
         *coarse,
         *fine,
-        *_head("1,2,3", _TINY_ANCHORS, classes),
+        *_head("1,2,3", _TINY_ANCHORS, classes),  # others have 0,1,2, which the published weights do not fit
     ]
 
 
@@ -159,19 +182,23 @@ ARCHITECTURES: dict[str, Callable[..., list[Section]]] = {
     "yolov3-tiny": _yolov3_tiny,
     "yolov3-spp": _yolov3_spp,
 }
+"""Sections of the published networks, by name."""
 
 
 def _section(kind: str, **options: int | str) -> Section:
+    """Make a section of a built-in cfg."""
     return Section(kind, {key: str(value) for key, value in options.items()}, "built-in cfg")
 
 
 def _convolution(filters: int, size: int, stride: int = 1) -> Section:
+    """Make the section of a convolution with batch norm."""
     return _section(
         "convolutional", batch_normalize=1, filters=filters, size=size, stride=stride, pad=1, activation="leaky"
     )
 
 
 def _head(mask: str, anchors: str, classes: int) -> list[Section]:
+    """Make the sections of a head: the convolution of its map, and the decoding of the anchors in `mask`."""
     filters = len(mask.split(",")) * (5 + classes)
     maps = _section("convolutional", filters=filters, size=1, stride=1, pad=1, activation="linear")
     return [maps, _section("yolo", mask=mask, anchors=anchors, classes=classes)]

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from semfov.detection.exchange import category_ids, coco_results, named_detections
+from semfov.detection.exchange import Category, CocoResult, category_ids, coco_results, named_detections
 from semfov.errors import check, check_shape, check_whole
 
 if TYPE_CHECKING:
     import supervision
 
 
+_MOST_CLASSES = 10**6
 _SCORES = "scores"  # name of the full score vectors in a library that can store further data with its boxes
 
 
 def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
-    """Score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1) each; the rest is background."""
-    check_whole(classes, "classes", 1, 10**6)
-    scores = torch.ones(len(labels), device=labels.device) if scores is None else scores
-    scores = scores if scores.is_floating_point() else scores.float()
+    """Make score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1); the rest is background."""
+    check_whole(classes, "classes", 1, _MOST_CLASSES)
+    if scores is None:
+        scores = torch.ones(len(labels), device=labels.device)
+    elif not scores.is_floating_point():
+        scores = scores.float()
     check_shape(scores, "scores", len(labels))
     inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
     check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
@@ -112,11 +115,11 @@ class Detections:
         Returns:
             The detections on that device.
         """
-        return self._mapped(lambda each: each.to(device))
+        return self._mapped(lambda tensor: tensor.to(device))
 
     def __getitem__(self, index: int | slice | Tensor | tuple[Tensor, ...] | None) -> Self:
         """Return the detections of some images of the batch."""
-        return self._mapped(lambda each: each[index])
+        return self._mapped(lambda tensor: tensor[index])
 
     def take(self, rows: slice | Tensor) -> Self:
         """Take some detections of every image.
@@ -132,8 +135,8 @@ class Detections:
         )
 
     def _mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The results of a function of each tensor."""
-        return type(self)(*map(function, (self.boxes, self.scores, self.mask, self.confidence)))
+        """Apply a function to each tensor."""
+        return type(self)(function(self.boxes), function(self.scores), function(self.mask), function(self.confidence))
 
     @classmethod
     def empty(cls, batch: int, classes: int, *, like: Tensor | None = None) -> Self:
@@ -162,23 +165,31 @@ class Detections:
             One batch with all images.
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
-        longest = max(each.mask.shape[-1] for each in images)
-        padded = [each._padded(longest) for each in images]
-        columns = zip(*((each.boxes, each.scores, each.mask, each.confidence) for each in padded), strict=True)
-        return cls(*map(torch.cat, columns))
+        longest = max(batch.mask.shape[-1] for batch in images)
+        padded = [batch._padded(longest) for batch in images]
+        return cls(
+            torch.cat([batch.boxes for batch in padded]),
+            torch.cat([batch.scores for batch in padded]),
+            torch.cat([batch.mask for batch in padded]),
+            torch.cat([batch.confidence for batch in padded]),
+        )
 
     def _padded(self, length: int) -> Self:
-        """The same detections with padding up to a length."""
-        more = length - self.mask.shape[-1]
-        rows = pad(self.boxes, (0, 0, 0, more)), pad(self.scores, (0, 0, 0, more))
-        return type(self)(*rows, pad(self.mask, (0, more)), pad(self.confidence, (0, more)))
+        """Pad the detections to a length."""
+        missing = length - self.mask.shape[-1]
+        return type(self)(
+            pad(self.boxes, (0, 0, 0, missing)),
+            pad(self.scores, (0, 0, 0, missing)),
+            pad(self.mask, (0, missing)),
+            pad(self.confidence, (0, missing)),
+        )
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Boxes, score vectors, classes from 1, and confidences of the single image, the most confident first."""
+        """List boxes, score vectors, classes from 1, and confidences of the single image, most confident first."""
         lead = self.mask.shape[:-1]
-        one = "the detections of one image, such as detections[0]"
-        check(lead.numel() == 1, "detections", one, f"a batch of shape {tuple(lead)}")
-        image = self._mapped(lambda each: each.reshape(*each.shape[len(lead) :]))
+        expected = "the detections of one image, such as detections[0]"
+        check(lead.numel() == 1, "detections", expected, f"a batch of shape {tuple(lead)}")
+        image = self._mapped(lambda tensor: tensor.reshape(*tensor.shape[len(lead) :]))
         image = image.take(image.mask)
         image = image.take(image.confidence.argsort(descending=True, stable=True))
         labels = image.labels if image.scores.shape[-1] > 1 else image.mask.long()
@@ -226,7 +237,8 @@ class Detections:
             InputError: classes are missing, or a class or a confidence is out of range.
         """
         boxes = torch.as_tensor(detections.xyxy).reshape(-1, 4)
-        boxes = boxes if boxes.is_floating_point() else boxes.float()
+        if not boxes.is_floating_point():
+            boxes = boxes.float()
         scores = None if detections.confidence is None else torch.as_tensor(detections.confidence)
         full = detections.data.get(_SCORES)
         if full is not None:
@@ -275,9 +287,9 @@ class Detections:
     def to_coco(
         self,
         image_id: int | str,
-        categories: Sequence[int | str] | Sequence[Mapping[str, Any]],
+        categories: Sequence[int | str] | Sequence[Category],
         classes: Sequence[str] | None = None,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CocoResult]:
         """Convert the detections of one image to COCO results, for `pycocotools.COCO.loadRes`.
 
         Args:
@@ -300,9 +312,11 @@ class Detections:
 
     @classmethod
     def _one_image(cls, boxes: Tensor, vectors: Tensor, confidence: Tensor | None = None) -> Self:
-        """A batch of one, in descending order of the largest score of a class; confidence `(L,)`, or None."""
+        """Make a batch of one, in descending order of the largest score of a class; confidence `(L,)`, or None."""
         check_shape(boxes, "boxes", len(vectors), 4)
         every = torch.ones(1, len(boxes), dtype=torch.bool, device=boxes.device)
-        own = {} if confidence is None else {"confidence": confidence[None]}
+        image = cls(boxes[None], vectors[None], every)
+        if confidence is not None:
+            image = replace(image, confidence=confidence[None])
         order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
-        return cls(boxes[None], vectors[None], every, **own).take(order)
+        return image.take(order)

@@ -87,8 +87,10 @@ class Detector(StatedModule, ABC):
         self.selection = Selection() if selection is None else selection
         self.fill = fill
         self.stride = stride
-        self.stretch, self.corner = stretch, corner
-        self.faint, self.least = faint, least
+        self.stretch = stretch
+        self.corner = corner
+        self.faint = faint
+        self.least = least
         self.digest = digest
 
     @abstractmethod
@@ -264,10 +266,16 @@ class Detector(StatedModule, ABC):
         try:
             converted = convert(torch.zeros(0))
         except (RuntimeError, AssertionError) as error:
-            here, reason = ", ".join(devices_here()), " ".join(str(error).split())
+            here = ", ".join(devices_here())
+            reason = " ".join(str(error).split())
             raise InputError(f"device: expected one that PyTorch has here ({here}), got another: {reason}") from None
-        converts = converted.dtype not in HALVES or any(True for _ in self.parameters())
-        check(converts, "half", "a detector of PyTorch", f"{self.name}, which has no parameters")
+        has_parameters = any(True for _ in self.parameters())
+        check(
+            converted.dtype not in HALVES or has_parameters,
+            "half",
+            "a detector of PyTorch",
+            f"{self.name}, which has no parameters",
+        )
 
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.
@@ -289,7 +297,7 @@ class Detector(StatedModule, ABC):
 
 def check_images(images: Tensor) -> None:
     """Raise `InputError` unless `images` have the form that detectors take."""
-    fits = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
-    what = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
-    check(fits, "images", what, f"{images.dtype} of shape {tuple(images.shape)}")
+    are_rgb = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
+    expected = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
+    check(are_rgb, "images", expected, f"{images.dtype} of shape {tuple(images.shape)}")
     check_pixels(images, "images")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from operator import index
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, SupportsIndex, TypedDict
 
 import numpy as np
 import torch
@@ -18,10 +18,34 @@ if TYPE_CHECKING:
     import supervision
 
 
+Category = Mapping[str, object]
+"""A category of a COCO file, with `id` and `name`."""
+
+
+class CocoResult(TypedDict):
+    """A detection in COCO's format of results; boxes are `[x, y, width, height]` in pixels."""
+
+    image_id: int | str
+    category_id: int | str
+    bbox: list[float]
+    score: float
+
+
 def named_detections(
-    boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, Any]
+    boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, object]
 ) -> supervision.Detections:
-    """`supervision.Detections` of boxes, with classes from 0, their names unless None, and further data."""
+    """Make `supervision.Detections` of boxes.
+
+    Args:
+        boxes: `(L, 4)`, corners in pixels.
+        labels: `(L,)`, classes from 1; Supervision counts from 0.
+        scores: `(L,)`.
+        classes: names of the classes, without background; None leaves them out.
+        data: further data of the boxes by name.
+
+    Returns:
+        The detections for Supervision.
+    """
     numbers = (labels - 1).numpy()
     names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
     with needing("supervision", "supervision"):
@@ -31,27 +55,49 @@ def named_detections(
 
 def coco_results(
     image_id: int | str, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int | str]
-) -> list[dict[str, Any]]:
-    """COCO results of boxes (corners), with the category id of each class 1..K from `ids`."""
+) -> list[CocoResult]:
+    """Make COCO results of boxes.
+
+    Args:
+        image_id: id of the image.
+        boxes: `(L, 4)`, corners in pixels.
+        labels: `(L,)`, classes 1..K.
+        scores: `(L,)`.
+        ids: category id of each class.
+
+    Returns:
+        A result for each box.
+    """
     check(_is_id(image_id), "image_id", "the whole number of an image, or text", repr(image_id))
     image_id = _plain_id(image_id)
     size = boxes[:, 2:] - boxes[:, :2]
-    placed = torch.cat([boxes[:, :2], size], -1).double().tolist()
+    placed = torch.cat([boxes[:, :2], size], -1).double()
     return [
         {"image_id": image_id, "category_id": ids[label], "bbox": [*map(pixels, box)], "score": digits(score)}
-        for label, box, score in zip(labels.tolist(), placed, scores.double().tolist(), strict=True)
+        for label, box, score in zip(labels.tolist(), placed.tolist(), scores.double().tolist(), strict=True)
     ]
 
 
 def category_ids(
-    categories: Sequence[int | str] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
+    categories: Sequence[int | str] | Sequence[Category], classes: Sequence[str] | None = None
 ) -> list[int | str]:
-    """The category id of each class: ids as they are, or those of a file's categories, the first of each name."""
+    """Find the category id of each class.
+
+    Args:
+        categories: the ids themselves, or the categories of a file, of which the first of each name counts.
+        classes: names of the classes, for categories of a file.
+
+    Returns:
+        The ids in the order of the classes.
+
+    Raises:
+        InputError: an id is none, or a class has no category.
+    """
     named = [category for category in categories if isinstance(category, Mapping)]
     if not named:
-        ids = [each for each in categories if not isinstance(each, Mapping)]
+        ids = [category for category in categories if not isinstance(category, Mapping)]
         check(all(map(_is_id, ids)), "categories", "whole numbers or texts, or categories of a file", categories[:3])
-        return [_plain_id(each) for each in ids]
+        return [_plain_id(value) for value in ids]
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
     by_name = {canonical_name(str(category["name"])): _plain_id(category["id"]) for category in reversed(named)}
@@ -62,9 +108,10 @@ def category_ids(
 
 
 def _is_id(value: object) -> bool:
-    """Whether a value is text, or a whole number of any library."""
+    """Tell whether a value is text, or a whole number of any library."""
     return isinstance(value, str) or (hasattr(value, "__index__") and not isinstance(value, bool))
 
 
-def _plain_id(value: Any) -> int | str:
+def _plain_id(value: str | SupportsIndex) -> int | str:
+    """Convert a whole number of any library to Python's."""
     return value if isinstance(value, str) else index(value)

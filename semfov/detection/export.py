@@ -10,50 +10,57 @@ from pathlib import Path
 
 import torch
 
+from semfov.detection.darknet_onnx import network_model
 from semfov.detection.detector import Detector
-from semfov.detection.onnx_file import METADATA_KEY
-from semfov.detection.yolo import YoloV3, network_model
+from semfov.detection.onnx_file import METADATA_KEY, OnnxSettings
+from semfov.detection.yolo import YoloV3
 from semfov.errors import InputError, SemfovError
 from semfov.io.files import write_bytes
 
 
 def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:
-    """Write a Darknet detector as an ONNX model of all its boxes, with what `load_onnx` needs in its metadata."""
+    """Write a Darknet detector as an ONNX model of all its boxes, with what `load_onnx` needs in its metadata.
+
+    Args:
+        detector: the detector.
+        path: the ONNX file.
+        static: whether the model takes one image at a time, of the detector's input size.
+
+    Raises:
+        InputError: it is no Darknet network.
+    """
     if not isinstance(detector, YoloV3):
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
     model = network_model(detector.network, detector.name, detector.input_size if static else None)
-    model.metadata_props.add(
-        key=METADATA_KEY,
-        value=json.dumps(
-            {
-                "name": detector.name,
-                "head": "candidates",
-                "classes": list(detector.classes),
-                "input_size": list(detector.input_size),
-                "background": detector.background,
-                "preprocessing": {"fill": detector.fill},
-            }
-            | ({} if static else {"stride": detector.stride})
-        ),
-    )
+    settings: OnnxSettings = {
+        "name": detector.name,
+        "head": "candidates",
+        "classes": list(detector.classes),
+        "input_size": list(detector.input_size),
+        "background": detector.background,
+        "preprocessing": {"fill": detector.fill},
+    }
+    if not static:
+        settings["stride"] = detector.stride
+    model.metadata_props.add(key=METADATA_KEY, value=json.dumps(settings))
     write_bytes(path, model.SerializeToString())
 
 
 def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
-    """Largest absolute difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
+    """Find the largest difference from the export's outputs on a noise image, boxes as fractions of the canvas."""
     from semfov.detection.onnx import load_onnx
 
     exported = load_onnx(path)
     noise = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        ours, theirs = (each.propose(each.fit(noise)[0]) for each in (detector, exported))
+        expected = detector.propose(detector.fit(noise)[0])
+        actual = exported.propose(exported.fit(noise)[0])
     side = max(detector.input_size)
-    pairs = (
-        (ours.boxes / side, theirs.boxes / side),
-        (ours.classes, theirs.classes),
-        (ours.objectness, theirs.objectness),
-    )
-    return max(float((a - b).abs().max()) for a, b in pairs if a is not None and b is not None)
+    differences = [(expected.boxes / side - actual.boxes / side).abs().max()]
+    differences.append((expected.classes - actual.classes).abs().max())
+    if expected.objectness is not None and actual.objectness is not None:
+        differences.append((expected.objectness - actual.objectness).abs().max())
+    return max(map(float, differences))
 
 
 def main() -> None:

@@ -1,12 +1,12 @@
 """Loading of detectors by name, file or model: `load_detector`."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import fields, replace
 from inspect import Parameter, signature
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -31,10 +31,13 @@ _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?de
 _OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".keras", ".mlmodel", ".safetensors")
 """Ends of the names of models in formats that are not read."""
 
-_SELECTING = [each.name for each in fields(Selection)]
+_Loader = Callable[..., Detector]
+"""A function that makes a detector of a name or a model, with options of its own."""
+
+_SELECTING = [field.name for field in fields(Selection)]
 _COMMON = ["background", "device", *_SELECTING]  # options of all detectors
 
-_WRAPPERS: dict[str, Callable[..., Detector]] = {
+_WRAPPERS: dict[str, _Loader] = {
     "torchvision.models.detection.": TorchvisionDetector,
     "transformers.models.": TransformersDetector,
     "ultralytics.": UltralyticsDetector,
@@ -88,64 +91,105 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
         return model
     if isinstance(model, str | PathLike):
         name = _detector_name(model)
-        load: Callable[..., Detector] = load_yolo
-        if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
-            load = load_onnx
-        elif name.startswith("torchvision:"):
-            load = TorchvisionDetector.load
-        elif name.startswith("hf:"):
-            load = TransformersDetector.load
-        return _load(load, name, name, options)
+        return _load(_loader_of(name), name, name, options)
+    return _load(_wrapper_of(model), model, f"a {type(model).__name__}", options)
+
+
+def _loader_of(name: str) -> _Loader:
+    """Find the loader of a detector by its name or its file."""
+    if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
+        return load_onnx
+    if name.startswith("torchvision:"):
+        return TorchvisionDetector.load
+    if name.startswith("hf:"):
+        return TransformersDetector.load
+    return load_yolo
+
+
+def _wrapper_of(model: nn.Module) -> _Loader:
+    """Find the class of detectors that hold a model of another library."""
     for package, wrapper in _WRAPPERS.items():
         if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
-            return _load(wrapper, model, f"a {type(model).__name__}", options)
-    inner = next((name for name in _INNER if isinstance(getattr(model, name, None), nn.Module)), None)
-    way = "write a class with the method propose (semfov.Detector), or export it to ONNX"
-    if inner is not None:
-        way = f"give the {type(getattr(model, inner)).__name__} in it, which is its .{inner}; or {way}"
+            return wrapper
+    remedy = "write a class with the method propose (semfov.Detector), or export it to ONNX"
+    for name in _INNER:
+        inner = getattr(model, name, None)
+        if isinstance(inner, nn.Module):
+            remedy = f"give the {type(inner).__name__} in it, which is its .{name}; or {remedy}"
+            break
     kind = f"{type(model).__module__}.{type(model).__qualname__}"
-    expected = "a model of torchvision, transformers or Ultralytics"
-    raise InputError(f"detector: expected {expected}, got {kind}; {way}")
+    raise InputError(f"detector: expected a model of torchvision, transformers or Ultralytics, got {kind}; {remedy}")
 
 
-def _load(load: Callable[..., Detector], model: str | nn.Module, what: str, options: dict[str, Any]) -> Detector:
-    """Call a loader with options that it has, and set those of all detectors."""
-    own = _options_of(load)
-    check_options(options, [*own, *_COMMON], f"semfov.load_detector for {what}")
+def _load(load: _Loader, model: str | nn.Module, description: str, options: dict[str, Any]) -> Detector:
+    """Call a loader with options that it has, and set those of all detectors.
+
+    Args:
+        load: the loader.
+        model: the name or the model that it takes.
+        description: what messages call the model.
+        options: options of the loader, and of all detectors.
+    """
+    of_loader = _options_of(load)
+    check_options(options, [*of_loader, *_COMMON], f"semfov.load_detector for {description}")
     if options.get("classes") is not None:
         options = {**options, "classes": given_names(options["classes"])}
     if "device" in options:
-        try:
-            torch.device(options["device"])
-        except (RuntimeError, TypeError):
-            got = repr(options["device"])
-            raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {got}") from None
+        _check_is_device(options["device"])
     selecting = {name: value for name, value in options.items() if name in _SELECTING}
     Selection(**selecting)  # what is wrong is told before a network is loaded
-    detector = load(model, **{name: value for name, value in options.items() if name in own})
+    detector = load(model, **{name: value for name, value in options.items() if name in of_loader})
     detector.selection = replace(detector.selection, **selecting)
     if options.get("background") is not None:
         detector.background = options["background"]
-    if "device" in own or options.get("device") is None:
+    device = options.get("device")
+    if device is None or "device" in of_loader:
         return detector
-    if torch.device(options["device"]).type != "meta":
-        check_device(options["device"])
-    return detector.to(options["device"])
+    if torch.device(device).type != "meta":
+        check_device(device)
+    return detector.to(device)
 
 
-def _options_of(load: Callable[..., Detector]) -> list[str]:
-    """Names of the options that a loader has of its own."""
-    return [each.name for each in signature(load).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
+def _check_is_device(device: torch.device | str) -> None:
+    """Raise `InputError` for what PyTorch does not take as a device."""
+    try:
+        torch.device(device)
+    except (RuntimeError, TypeError):
+        raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {device!r}") from None
+
+
+def _options_of(load: _Loader) -> list[str]:
+    """List the names of the options that a loader has of its own."""
+    parameters = signature(load).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is Parameter.KEYWORD_ONLY]
 
 
 def loader_options() -> list[str]:
-    """Names of the options of `load_detector` for any detector."""
-    loaders: list[Callable[..., Detector]] = [load_yolo, load_onnx, TorchvisionDetector.load, TransformersDetector.load]
-    return [*_COMMON, *(name for load in (*loaders, *_WRAPPERS.values()) for name in _options_of(load))]
+    """List the names of the options of `load_detector` for any detector.
+
+    Returns:
+        The names, some of them several times.
+    """
+    loaders: list[_Loader] = [load_yolo, load_onnx, TorchvisionDetector.load, TransformersDetector.load]
+    names = list(_COMMON)
+    for load in (*loaders, *_WRAPPERS.values()):
+        names += _options_of(load)
+    return names
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
-    """Check without loading it that a detector exists."""
+    """Check without loading it that a detector exists.
+
+    Args:
+        name_or_path: its name, or the path of its `.onnx` or `.cfg` file.
+
+    Returns:
+        The names of its classes where they are known without loading it: those of published detectors.
+
+    Raises:
+        InputError: the name is unknown.
+        DataError: there is no such file.
+    """
     name = _detector_name(name_or_path)
     if name.endswith((".onnx", ".cfg")):
         if not Path(name).exists():
@@ -160,8 +204,19 @@ def _detector_name(name_or_path: str | PathLike[str]) -> str:
     check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")
     if name.endswith((".onnx", ".cfg")):
         return name
-    alone = f"weights only; give 'x.cfg' with weights='{name}'"
-    check(not name.endswith(".weights"), "detector", "a cfg and its weights", alone)
+    _check_has_loader(name)
+    lower = name.lower()
+    if lower.startswith("torchvision:"):
+        return lower
+    if lower.startswith("hf:"):
+        return f"hf:{name[3:]}"  # names of the hub keep their case
+    return lower if lower in WEIGHTS else lookup(name, WEIGHTS, "detector")
+
+
+def _check_has_loader(name: str) -> None:
+    """Raise `InputError` for files of other programs, with the call that makes one to load."""
+    weights_alone = f"weights only; give 'x.cfg' with weights='{name}'"
+    check(not name.endswith(".weights"), "detector", "a cfg and its weights", weights_alone)
     pickled = (
         f"{name}; export the model to ONNX, for Ultralytics with: yolo export model={name} format=onnx; for other "
         f"modules with: torch.onnx.export(model, image, '{Path(name).stem}.onnx'). A state dict of a torchvision model "
@@ -170,13 +225,10 @@ def _detector_name(name_or_path: str | PathLike[str]) -> str:
     safe = "a file that can be read without running code from it"
     check(not name.endswith((".pt", ".pth")), "detector", safe, pickled)
     lower = name.lower()
-    way = f"its name; export it with: yolo export model={name}.pt format=onnx"
-    check(_EXPORTED.fullmatch(lower) is None, "detector", f"an ONNX file of {name}", way)
-    read = Path(lower).suffix not in _OTHER_FORMATS
-    check(read, "detector", "an ONNX file, a Darknet cfg or a name", f"{name}; export the model to ONNX")
-    if lower.startswith(("torchvision:", "hf:")):
-        return lower if lower[0] == "t" else f"hf:{name[3:]}"
-    return lower if lower in WEIGHTS else lookup(name, WEIGHTS, "detector")
+    export = f"its name; export it with: yolo export model={name}.pt format=onnx"
+    check(_EXPORTED.fullmatch(lower) is None, "detector", f"an ONNX file of {name}", export)
+    other_format = Path(lower).suffix in _OTHER_FORMATS
+    check(not other_format, "detector", "an ONNX file, a Darknet cfg or a name", f"{name}; export the model to ONNX")
 
 
 def load_yolo(
@@ -189,11 +241,29 @@ def load_yolo(
     runtime: Runtime = "auto",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
-    """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights."""
+    """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights.
+
+    Args:
+        name_or_cfg: its name, or the path of its cfg.
+        weights: the file of its weights; None fetches those of a published network.
+        classes: names of the classes in the order of the scores, without background; None for COCO's.
+        input_size: side, or `(width, height)`, of the canvas in pixels; None for the one in the cfg.
+        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
+        runtime: `torch`, `onnxruntime`, or `auto` for the faster one where both give the same.
+        dtype: precision of the network.
+
+    Returns:
+        The detector.
+
+    Raises:
+        InputError: the name is unknown, or an option does not fit the network.
+        DataError: the cfg or the weights are damaged, or cannot be downloaded.
+    """
     if name_or_cfg.endswith(".cfg"):
         if weights is None:
             raise InputError(f"weights: expected the path of the weights of {name_or_cfg!r}, got None")
-        name, sections = Path(name_or_cfg).stem, read_cfg(name_or_cfg)
+        name = Path(name_or_cfg).stem
+        sections = read_cfg(name_or_cfg)
     else:
         name = lookup(name_or_cfg, ARCHITECTURES, "detector")
         sections = ARCHITECTURES[name]()
@@ -212,8 +282,20 @@ def load_yolo(
     return detector.eval()
 
 
-def given_names(classes: Any) -> tuple[str, ...]:
-    """Class names in the order of the scores: of a list, a text with commas, the lines of a file, or by numbers."""
+def given_names(classes: object) -> tuple[str, ...]:
+    """Read class names in one of the forms in which users give them.
+
+    Args:
+        classes: a list in the order of the scores, a text with commas, the path of a file with a name a line, or a
+            mapping from numbers, as Ultralytics has it.
+
+    Returns:
+        The names in the order of the scores.
+
+    Raises:
+        InputError: their order is not known.
+        DataError: there is no such file.
+    """
     expected = "names in the order of the scores, in a list"
     if isinstance(classes, str | PathLike):
         text = fspath(classes)
@@ -221,9 +303,10 @@ def given_names(classes: Any) -> tuple[str, ...]:
             return tuple(line.strip() for line in read_text(text).splitlines() if line.strip())
         return tuple(name.strip() for name in text.split(","))
     if isinstance(classes, Mapping):
-        known = {str(number): name for number, name in classes.items()}
-        numbers = [str(number) for number in range(len(known))]
-        check({*numbers} == {*known}, "classes", f"{expected}, or by numbers from 0", f"numbers {[*known][:5]}")
-        return tuple(known[number] for number in numbers)
+        by_number = {str(number): name for number, name in classes.items()}
+        numbers = [str(number) for number in range(len(by_number))]
+        from_zero = {*numbers} == {*by_number}
+        check(from_zero, "classes", f"{expected}, or by numbers from 0", f"numbers {[*by_number][:5]}")
+        return tuple(by_number[number] for number in numbers)
     check(not isinstance(classes, Set), "classes", expected, f"a {type(classes).__name__}, which has no order")
-    return tuple(classes)
+    return tuple(cast(Iterable[str], classes))

@@ -226,7 +226,7 @@ def _checked_boxes(
 
 
 def _numbers_of_windows(windows: Tensor) -> Tensor:
-    """Number windows `(M, 4)` in the order in which they first appear, `(M,)`."""
+    """Give numbers to windows `(M, 4)` in the order in which they first appear, `(M,)`."""
     numbers: dict[tuple[float, ...], int] = {}
     return torch.tensor([numbers.setdefault(tuple(window), len(numbers)) for window in windows.tolist()])
 
@@ -240,15 +240,15 @@ def _cut_by_windows(boxes: Tensor, windows: Tensor, side: Tensor, size: tuple[fl
         side: longer side of each window, `(M,)`.
         size: `(width, height)` of the picture, whose border cuts no box; None takes the border of all windows.
     """
-    low: Tensor | float = 0.0
+    lower: Tensor | float = 0.0
     if size is None:
-        low = windows[:, :2].amin(0)
-        high = windows[:, 2:].amax(0)
+        lower = windows[:, :2].amin(0)
+        upper = windows[:, 2:].amax(0)
     else:
-        high = torch.tensor(size)
+        upper = torch.tensor(size)
     border = _BORDER * side[:, None]
-    at_low_border = (boxes - windows <= border)[:, :2] & (windows[:, :2] > low)
-    at_high_border = (boxes - windows >= -border)[:, 2:] & (windows[:, 2:] < high)
+    at_low_border = (boxes - windows <= border)[:, :2] & (windows[:, :2] > lower)
+    at_high_border = (boxes - windows >= -border)[:, 2:] & (windows[:, 2:] < upper)
     return at_low_border.any(-1) | at_high_border.any(-1)
 
 
@@ -356,8 +356,8 @@ def _overlapping_pairs(
     count = len(corners)
     if around is not None:
         # Every box is there a second time, one turn further, so that boxes meet across the seam.
-        turned = corners + np.array([around, 0, around, 0], corners.dtype)
-        corners = np.concatenate([corners, turned])
+        next_turn = corners + np.array([around, 0, around, 0], corners.dtype)
+        corners = np.concatenate([corners, next_turn])
         classes = np.tile(classes, 2)
     # Classes are moved apart, so that neighbours along x are of one class.
     shift = classes * (2 * np.abs(corners).max(initial=0) + 1)
@@ -372,10 +372,10 @@ def _overlapping_pairs(
     if around is not None:
         first = first % count
         second = second % count
-        others = first != second
-        first = first[others]
-        second = second[others]
-        shared = shared[others]
+        distinct = first != second
+        first = first[distinct]
+        second = second[distinct]
+        shared = shared[distinct]
     return np.minimum(first, second), np.maximum(first, second), shared
 
 

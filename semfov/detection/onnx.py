@@ -184,19 +184,19 @@ class OnnxDetector(Detector):
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
-        low, high = _range(candidates.classes)
+        least, greatest = _range(candidates.classes)
         if candidates.objectness is not None:
-            lowest, highest = _range(candidates.objectness)
-            low = min(low, lowest)
-            high = max(high, highest)
+            least_objectness, greatest_objectness = _range(candidates.objectness)
+            least = min(least, least_objectness)
+            greatest = max(greatest, greatest_objectness)
         remedy = "set logits=True if the model returns them before the sigmoid"
-        got = f"[{low:.3g}, {high:.3g}]; {remedy}, and check that its head is {self.head!r}"
-        check_data(low >= -_ROUNDING and high <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
-        if low >= 0 and high <= 1:
+        got = f"[{least:.3g}, {greatest:.3g}]; {remedy}, and check that its head is {self.head!r}"
+        check_data(least >= -_ROUNDING and greatest <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
+        if least >= 0 and greatest <= 1:
             return candidates
         if not self._rounding_told:
             warnings.warn(
-                f"{self.name}: scores from {low:.7g} to {high:.7g}, which rounding explains, are taken as 0 to 1",
+                f"{self.name}: scores from {least:.7g} to {greatest:.7g}, which rounding explains, are taken as 0 to 1",
                 stacklevel=2,
             )
         self._rounding_told = True
@@ -216,9 +216,9 @@ class OnnxDetector(Detector):
 
     def _check_logits(self, logits: Tensor, function: str, remedy: str) -> None:
         """Raise `DataError` for numbers that a function has brought into [0, 1] already."""
-        low, high = _range(logits)
-        got = f"[{low:.3g}, {high:.3g}]; {remedy}"
-        check_data(not 0 <= low < high <= 1, self.name, f"scores before the {function}", got)
+        least, greatest = _range(logits)
+        got = f"[{least:.3g}, {greatest:.3g}]; {remedy}"
+        check_data(not 0 <= least < greatest <= 1, self.name, f"scores before the {function}", got)
 
     def settings(self) -> dict[str, object]:
         settings = super().settings()
@@ -236,8 +236,10 @@ def _with_scores(candidates: Candidates, function: Callable[[Tensor], Tensor]) -
 
 def _range(numbers: Tensor) -> tuple[float, float]:
     """Find the least and greatest number in one pass; both are NaN where one of them is."""
-    low, high = numbers.aminmax() if numbers.numel() else (0.0, 0.0)
-    return float(low), float(high)
+    if not numbers.numel():
+        return 0.0, 0.0
+    least, greatest = numbers.aminmax()
+    return float(least), float(greatest)
 
 
 def load_onnx(
@@ -299,30 +301,13 @@ def load_onnx(
     if None in session.shape[2:]:
         check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
-
-    names = settings.get("classes")
-    names_nearby = names_beside(file) if names is None and published_name is None else None
+    published = published_name is not None
     if "head" not in settings:
-        count = _class_count(names, published=published_name is not None)
+        count = _class_count(settings.get("classes"), published=published)
         settings["head"] = _recognised_head(session, outputs, size, count)
     head = lookup(settings["head"], HEADS, "head")
-    if not isinstance(preprocessing, Preprocessing):
-        stored = HEADS[head].preprocessing.merged(settings.get("preprocessing", {}))
-        preprocessing = stored.merged({} if preprocessing is None else preprocessing)
-    if names is None and HEADS[head].selects:
-        names = names_nearby  # its outputs do not tell how many classes there are
-    scores = _score_count(head, outputs, size, names)
-    if HEADS[head].selects:
-        warnings.warn(
-            f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
-            "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
-            stacklevel=2,
-        )
-    if names is None:
-        found = names_nearby is not None and len(names_nearby) == scores
-        names = names_nearby if found else _coco_names(scores, file)
-    check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
-
+    preprocessing = _merged_preprocessing(head, settings, preprocessing)
+    names = _class_names(file, head, outputs, size, settings.get("classes"), published=published)
     detector = OnnxDetector(
         session,
         head,
@@ -368,6 +353,58 @@ def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: 
     signature = Signature(session.image, shapes, size, session.producer, classes, session.metadata)
     grey = torch.full((1, 3, size[1], size[0]), 0.5)
     return recognise(signature, lambda: session(grey))
+
+
+def _merged_preprocessing(
+    head: str, settings: OnnxSettings, option: Preprocessing | Mapping[str, Any] | None
+) -> Preprocessing:
+    """Override the preprocessing of a head by the settings of the model, and these by an option."""
+    if isinstance(option, Preprocessing):
+        return option
+    stored = HEADS[head].preprocessing.merged(settings.get("preprocessing", {}))
+    return stored if option is None else stored.merged(option)
+
+
+def _class_names(
+    file: Path,
+    head: str,
+    outputs: Mapping[str, Tensor],
+    size: Canvas,
+    stated: Sequence[str] | None,
+    *,
+    published: bool,
+) -> Sequence[str]:
+    """Find a name for each score of a head.
+
+    Args:
+        file: the ONNX file, for a file of names beside it.
+        head: name of the head.
+        outputs: the outputs for one canvas, whose scores are counted.
+        size: `(width, height)` of the canvas.
+        stated: names in the settings.
+        published: whether the model is a published one, with the classes of COCO.
+
+    Returns:
+        The names.
+
+    Raises:
+        InputError: the head does not fit the outputs, or there are no names, or others than scores.
+    """
+    nearby = names_beside(file) if stated is None and not published else None
+    selects = HEADS[head].selects
+    # Outputs of a network that selects boxes itself do not tell how many classes there are.
+    names = nearby if stated is None and selects else stated
+    scores = _score_count(head, outputs, size, names)
+    if selects:
+        warnings.warn(
+            f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
+            "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
+            stacklevel=3,
+        )
+    if names is None:
+        names = _unstated_names(nearby, scores, file)
+    check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
+    return names
 
 
 def _score_count(head: str, outputs: Mapping[str, Tensor], size: Canvas, names: Sequence[str] | None) -> int:
@@ -418,8 +455,10 @@ def _sides(input_size: int | Sequence[int]) -> Canvas:
     return size[0], size[1]
 
 
-def _coco_names(count: int, file: Path) -> Sequence[str]:
-    """Name 80 scores (COCO's classes) or 91 scores (COCO's category ids with their gaps)."""
+def _unstated_names(nearby: Sequence[str] | None, count: int, file: Path) -> Sequence[str]:
+    """Name scores by a file beside the model, or 80 by COCO's classes, or 91 by COCO's category ids with their gaps."""
+    if nearby is not None and len(nearby) == count:
+        return nearby
     if count == 80:
         return COCO_CLASSES
     if count == 91:

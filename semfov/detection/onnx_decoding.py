@@ -35,10 +35,10 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
     """
     check_shape(raw, "raw", None, None, None)
     if values_known(raw) and raw.numel():
-        low, high = map(float, raw[..., :4].detach().aminmax())
+        least, greatest = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         as_fractions = "numbers from 0 to 1, as fractions of the canvas"
-        check(not 0 <= low < high <= 1, "output of the head", form, as_fractions)
+        check(not 0 <= least < greatest <= 1, "output of the head", form, as_fractions)
     grid = cell_grid(raw.shape[1], canvas, strides, 0.0, raw.dtype, raw.device)
     cell = grid[:, :2]
     stride = grid[:, 2:]
@@ -101,9 +101,9 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
 
 
 def _check_numbers_of_classes(numbers: Tensor, classes: int) -> None:
-    """Raise `InputError` unless numbers `(M,)` of classes are whole, from 0 to `classes - 1`."""
-    whole = bool((numbers == numbers.round()).all())
-    check(whole, "rows", "a whole number of a class in the last column", numbers[:3].tolist())
+    """Raise `InputError` unless numbers `(M,)` of classes are integral, from 0 to `classes - 1`."""
+    integral = bool((numbers == numbers.round()).all())
+    check(integral, "rows", "a integral number of a class in the last column", numbers[:3].tolist())
     if len(numbers):
         inside = float(numbers.min()) >= 0 and float(numbers.max()) < classes
         check(inside, "classes", "a name for each class of the rows", f"{classes}, and class {numbers.max():g}")

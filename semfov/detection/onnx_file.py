@@ -90,9 +90,9 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> OnnxSettings:
     texts = {}
     if METADATA_KEY in metadata:
         texts[f"metadata of {path.name}"] = metadata[METADATA_KEY]
-    beside = path.with_suffix(".json")
-    if beside.exists():
-        texts[str(beside)] = read_text(beside, most=_MOST_BYTES)
+    settings_file = path.with_suffix(".json")
+    if settings_file.exists():
+        texts[str(settings_file)] = read_text(settings_file, most=_MOST_BYTES)
     settings: OnnxSettings = {**_names_of_exporter(metadata), **_ultralytics(metadata)}
     preprocessing: dict[str, Any] = {}
     for place, text in texts.items():
@@ -131,16 +131,16 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
     Returns:
         The file of the settings.
     """
-    beside = path.with_suffix(".json")
-    stored: dict[str, Any] = json.loads(read_text(beside, most=_MOST_BYTES)) if beside.exists() else {}
+    settings_file = path.with_suffix(".json")
+    stored: dict[str, Any] = json.loads(read_text(settings_file, most=_MOST_BYTES)) if settings_file.exists() else {}
     chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}
     settings = {**stored, **chosen}
     _state_both_sides(settings)
     if "preprocessing" in settings:
         settings["preprocessing"] = {**stored.get("preprocessing", {}), **chosen.get("preprocessing", {})}
-    check_content(str(beside), settings, _SETTINGS)
-    write_bytes(beside, f"{json.dumps(settings, indent=1, ensure_ascii=False)}\n".encode())
-    return beside
+    check_content(str(settings_file), settings, _SETTINGS)
+    write_bytes(settings_file, f"{json.dumps(settings, indent=1, ensure_ascii=False)}\n".encode())
+    return settings_file
 
 
 def names_beside(path: Path) -> list[str] | None:
@@ -153,9 +153,9 @@ def names_beside(path: Path) -> list[str] | None:
         The names; None where there is no such file.
     """
     for name in ("data.yaml", "classes.txt"):
-        beside = path.with_name(name)
-        if beside.is_file():
-            text = read_text(beside, most=_MOST_BYTES)
+        names_file = path.with_name(name)
+        if names_file.is_file():
+            text = read_text(names_file, most=_MOST_BYTES)
             names = _texts(_data_names(text) if name == "data.yaml" else text.splitlines())
             if names and all(map(is_plain, names)):
                 return names

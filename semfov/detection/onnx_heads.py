@@ -239,7 +239,7 @@ class _NanodetPlus(Head):
         if signature.layout != "rows":
             return False
         rows = signature.rows
-        has_cells = rows.cells == (1, 4) and not rows.across and not rows.lack_objectness
+        has_cells = rows.cells == (1, 4) and not rows.boxes_are_columns and not rows.lack_objectness
         return has_cells and rows.hold_scores_and(_DISTANCE_CHANNELS)
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
@@ -283,7 +283,7 @@ class _Yolov8(Head):
         return signature.layout == "rows" and signature.rows.lack_objectness
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        return decode_yolov8(_rows(outputs, canvas, across=True).mT)
+        return decode_yolov8(_rows(outputs, canvas, prefer_columns=True).mT)
 
 
 class _EndToEnd(Head):
@@ -449,7 +449,9 @@ class _RfDetr(_SigmoidQueries):
 
 def _has_objectness(rows: Rows) -> bool:
     """Tell whether the rows of cells with one anchor may begin with a box and its objectness."""
-    return rows.cells.anchors == 1 and not rows.across and not rows.lack_objectness and rows.hold_scores_and(5)
+    return (
+        rows.cells.anchors == 1 and not rows.boxes_are_columns and not rows.lack_objectness and rows.hold_scores_and(5)
+    )
 
 
 def _has_yolox_rows(rows: Rows) -> bool:
@@ -467,11 +469,14 @@ def _single(outputs: _Outputs) -> Tensor:
     return next(iter(outputs.values()))
 
 
-def _rows(outputs: _Outputs, canvas: Canvas, *, across: bool = False) -> Tensor:
-    """Return the only output as rows `(B, N, C)`; with `across`, boxes are its columns if both sides could be boxes."""
+def _rows(outputs: _Outputs, canvas: Canvas, *, prefer_columns: bool = False) -> Tensor:
+    """Return the only output as rows `(B, N, C)`; exports have boxes along either side.
+
+    `prefer_columns` takes its columns as boxes where both sides, or neither, are as many as cells.
+    """
     output = _single(outputs)
     counts = box_counts(canvas)
     check_shape(output, "outputs", None, None, None)
     rows_fit, columns_fit = (side in counts for side in output.shape[1:])
-    transposed = (columns_fit and not rows_fit) or (across and rows_fit == columns_fit)
+    transposed = (columns_fit and not rows_fit) or (prefer_columns and rows_fit == columns_fit)
     return output.mT if transposed else output

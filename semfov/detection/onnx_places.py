@@ -30,18 +30,18 @@ def misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
         return None
     if not bool(rows.isfinite().all()):
         return "boxes that are not finite"
-    low = rows[:, :2]
-    high = rows[:, 2:]
+    lower = rows[:, :2]
+    upper = rows[:, 2:]
     size = rows.new_tensor(canvas)
-    middle = (low + high) / 2
-    crossed = (high < low).any(-1).double().mean()
+    middle = (lower + upper) / 2
+    crossed = (upper < lower).any(-1).double().mean()
     outside = ((middle - size / 2).abs() > size).any(-1).double().mean()
     reason = None
     if float(rows.abs().max()) <= _LARGEST_FRACTION < min(canvas):
         reason = "fractions of the canvas instead of pixels"
     elif float(crossed) >= _MISPLACED_SHARE:
         reason = "boxes whose right or lower edge comes first"
-    elif _spread_out(middle, size) and bool((high >= 3 * low).all()):
+    elif _spread_out(middle, size) and bool((upper >= 3 * lower).all()):
         reason = "corners of boxes that were read as their centres and sizes"
     elif float(outside) >= _MISPLACED_SHARE:
         place = middle.median(0).values.round().long().tolist()

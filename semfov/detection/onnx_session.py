@@ -187,8 +187,8 @@ class OnnxSession:
         check(rgb, self.path.name, "one floating-point input (B, 3, H, W)", description)
         image = images[0]
         extra = tuple(node.name for node in inputs if node is not image)
-        known = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
-        check(set(extra) <= set(_EXTRA_INPUTS), self.path.name, known, description)
+        expected = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
+        check(set(extra) <= set(_EXTRA_INPUTS), self.path.name, expected, description)
         return _Inputs(image.name, _sizes(image.shape), _FLOATS[image.type], extra)
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:

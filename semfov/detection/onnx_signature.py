@@ -32,13 +32,13 @@ class Rows:
     Attributes:
         sides: `(rows, columns)`.
         cells: anchors and levels of the cells that there are as many boxes for; zeros where no cells fit.
-        across: whether the columns are boxes, as in YOLOv8's export.
+        boxes_are_columns: as in YOLOv8's export.
         classes: number of classes; None where it is unknown.
     """
 
     sides: tuple[int, int]
     cells: CellBoxes
-    across: bool
+    boxes_are_columns: bool
     classes: int | None
 
     @staticmethod
@@ -46,14 +46,14 @@ class Rows:
         """Find which side of an output are boxes, by the numbers of boxes that cells of a canvas have."""
         counts = box_counts(canvas)
         rows, columns = sides
-        across = columns in counts and rows not in counts
-        boxes = columns if across else rows
-        return Rows(sides, counts.get(boxes, CellBoxes(0, 0)), across, classes)
+        boxes_are_columns = columns in counts and rows not in counts
+        boxes = columns if boxes_are_columns else rows
+        return Rows(sides, counts.get(boxes, CellBoxes(0, 0)), boxes_are_columns, classes)
 
     @property
     def channels(self) -> int:
         """Numbers for each box."""
-        return self.sides[0] if self.across else self.sides[1]
+        return self.sides[0] if self.boxes_are_columns else self.sides[1]
 
     def hold_scores_and(self, others: int) -> bool:
         """Tell whether channels hold some other numbers and a score for each class; at least one, if unknown."""
@@ -65,7 +65,7 @@ class Rows:
         if self.cells.anchors != 1 or not self.hold_scores_and(4):
             return False
         # Without names, rows have an objectness unless their scores are as many as COCO's.
-        return self.across or self.classes is not None or self.channels - 4 in _COCO_COUNTS
+        return self.boxes_are_columns or self.classes is not None or self.channels - 4 in _COCO_COUNTS
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ def selected_outputs(outputs: Mapping[str, _Output]) -> dict[str, _Output]:
         Those that are there, by `boxes`, `scores`, `labels` and `count`.
     """
     selected = {}
-    for what, names in _SELECTED.items():
+    for meaning, names in _SELECTED.items():
         name = next((name for name in names if name in outputs), None)
         if name is not None:
-            selected[what] = outputs[name]
+            selected[meaning] = outputs[name]
     return selected

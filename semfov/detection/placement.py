@@ -45,7 +45,8 @@ class Placement:
         """
         check_shape(points, "points", 2)
         points = as_positions(points)
-        scale, offset = points.new_tensor(self.scale), points.new_tensor(self.offset)
+        scale = points.new_tensor(self.scale)
+        offset = points.new_tensor(self.offset)
         return (points + 0.5) * scale + offset - 0.5
 
     def boxes_to_image(self, boxes: Tensor) -> Tensor:
@@ -59,7 +60,8 @@ class Placement:
         """
         check_shape(boxes, "boxes", 4)
         boxes = as_positions(boxes)
-        scale, offset = boxes.new_tensor(self.scale * 2), boxes.new_tensor(self.offset * 2)
+        scale = boxes.new_tensor(self.scale * 2)
+        offset = boxes.new_tensor(self.offset * 2)
         image = (boxes - offset) / scale
         limit = boxes.new_tensor(self.size * 2, dtype=boxes.dtype)
         return torch.minimum(image.clamp(min=0.0), limit)
@@ -96,21 +98,36 @@ def letterbox(
     height, width = image.shape[-2:]
     check(image.is_floating_point(), "image", "floating-point pixels in [0, 1]", image.dtype)
     check(height > 0 and width > 0, "image", "at least one pixel", tuple(image.shape))
-    if stretch:
-        inner = size
+    columns, rows = size if stretch else _size_within(size, width, height)
+    if stride is None:
+        horizontal = size[0] - columns
+        vertical = size[1] - rows
     else:
-        ratio = min(size[0] / width, size[1] / height)
-        inner = (max(1, round(width * ratio)), max(1, round(height * ratio)))
-    canvas_size = size if stride is None else tuple(-(-n // stride) * stride for n in inner)
-    resized = resize(image, inner)
-    left, top = (0, 0) if corner else ((canvas_size[0] - inner[0]) // 2, (canvas_size[1] - inner[1]) // 2)
-    right, bottom = canvas_size[0] - inner[0] - left, canvas_size[1] - inner[1] - top
-    canvas = F.pad(resized, (left, right, top, bottom), value=fill)
-    return canvas, Placement((width, height), (inner[0] / width, inner[1] / height), (left, top))
+        horizontal = -columns % stride
+        vertical = -rows % stride
+    left = 0 if corner else horizontal // 2
+    top = 0 if corner else vertical // 2
+    padding = (left, horizontal - left, top, vertical - top)
+    canvas = F.pad(resize(image, (columns, rows)), padding, value=fill)
+    return canvas, Placement((width, height), (columns / width, rows / height), (left, top))
+
+
+def _size_within(size: tuple[int, int], width: int, height: int) -> tuple[int, int]:
+    """Find the largest `(width, height)` of the proportions of an image that is within a canvas."""
+    ratio = min(size[0] / width, size[1] / height)
+    return max(1, round(width * ratio)), max(1, round(height * ratio))
 
 
 def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize images `(B, C, H, W)` to `(width, height)` bilinearly, antialiased where they shrink to less than half."""
+    """Resize images bilinearly, antialiased where they shrink to less than half.
+
+    Args:
+        image: `(B, C, H, W)`.
+        size: `(width, height)` of the result.
+
+    Returns:
+        `(B, C, height, width)`, a new tensor.
+    """
     # Down to half the size, plain bilinear interpolation reads every pixel, and detectors are trained with it:
     # antialiasing COCO's photographs to 416 pixels costs YOLOv3-tiny a point of AP50.
     width, height = size

@@ -12,7 +12,6 @@ from semfov.io.schema import Array, Flag, Number
 
 _ChannelOrder = Literal["rgb", "bgr"]
 
-
 _KINDS = {
     "scale": Number(above=0),
     "mean": Array(Number(), 3),
@@ -25,7 +24,17 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Conversion of a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`."""
+    """Conversion of a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`.
+
+    Attributes:
+        channels: order of the channels of the input.
+        scale: value of white.
+        mean: subtracted from each channel, in the order of the input.
+        std: divides each channel.
+        stretch: whether images are stretched to the canvas instead of letterboxed.
+        corner: whether letterboxed images are in the upper left corner of the canvas instead of its middle.
+        fill: value of the canvas's padding.
+    """
 
     channels: _ChannelOrder = "rgb"
     scale: float = 1.0
@@ -45,37 +54,54 @@ class Preprocessing:
     def __call__(self, canvas: Tensor) -> Tensor:
         """Convert a canvas `(B, 3, H, W)` to the input of the network, a new tensor of the same shape."""
         check_shape(canvas, "canvas", None, 3, None, None)
+        planes = []
         # Plane by plane, as each stays in the cache between the operations.
-        sources = canvas.unbind(1)[:: -1 if self.channels == "bgr" else 1]
-        planes = [source * (self.scale / std) for source, std in zip(sources, self.std, strict=True)]
-        shifts = [mean / std for mean, std in zip(self.mean, self.std, strict=True)]
-        return torch.stack([plane - shift if shift else plane for plane, shift in zip(planes, shifts, strict=True)], 1)
+        for plane, mean, std in zip(self._in_channel_order(canvas), self.mean, self.std, strict=True):
+            scaled = plane * (self.scale / std)
+            planes.append(scaled - mean / std if mean else scaled)
+        return torch.stack(planes, 1)
 
     def of_bytes(self, canvas: Tensor) -> Tensor:
         """Convert a canvas of bytes `(B, 3, H, W)` to the input: `self(canvas / 255)`, in one pass over memory."""
         check_bytes(canvas)
         image = torch.empty(canvas.shape, device=canvas.device)
-        sources = canvas.unbind(1)[:: -1 if self.channels == "bgr" else 1]
+        sources = self._in_channel_order(canvas)
         for plane, source, mean, std in zip(image.unbind(1), sources, self.mean, self.std, strict=True):
             plane.copy_(source)
-            if (factor := self.scale / 255 / std) != 1:
+            factor = self.scale / 255 / std
+            if factor != 1:
                 plane.mul_(factor)
             if mean:
                 plane.sub_(mean / std)
         return image
 
+    def _in_channel_order(self, canvas: Tensor) -> tuple[Tensor, ...]:
+        """List the planes `(B, H, W)` of a canvas in the order of the network's channels."""
+        planes = canvas.unbind(1)
+        return planes[::-1] if self.channels == "bgr" else planes
+
     def merged(self, settings: Mapping[str, Any]) -> Self:
-        """Return a copy with some settings replaced; unknown names are refused."""
+        """Replace some settings.
+
+        Args:
+            settings: the new settings by name.
+
+        Returns:
+            A copy with them.
+
+        Raises:
+            InputError: a name or a value is unknown.
+        """
         for name in settings:
             lookup(name, [field.name for field in fields(self)], "preprocessing setting")
         return replace(self, **settings)
 
     def settings(self) -> dict[str, Any]:
         """List all settings as JSON values."""
-        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
 
 def check_bytes(canvas: Tensor) -> None:
     """Raise `InputError` unless a canvas is `(B, 3, H, W)`, bytes."""
-    fits = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
-    check(fits, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")
+    is_rgb_bytes = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
+    check(is_rgb_bytes, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")

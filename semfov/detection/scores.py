@@ -70,8 +70,9 @@ class Candidates:
         return self._mapped(lambda tensor: tensor[image].index_select(0, index))
 
     def _mapped(self, function: Callable[[Tensor], Tensor]) -> "Candidates":
-        """The results of a function of each tensor."""
-        objectness, background = (None if x is None else function(x) for x in (self.objectness, self.background))
+        """Apply a function to each tensor."""
+        objectness = None if self.objectness is None else function(self.objectness)
+        background = None if self.background is None else function(self.background)
         return Candidates(function(self.boxes), function(self.classes), objectness, background)
 
 
@@ -107,25 +108,41 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
 
 
 def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Tensor]:
-    """Compute the parts of `score_vectors`: the background score `(...)` and the scores of the classes `(..., K)`."""
+    """Compute the parts of `score_vectors`.
+
+    Args:
+        candidates: boxes with class scores `(..., K)`.
+        policy: background policy.
+
+    Returns:
+        The background score `(...)`, and the scores of the classes `(..., K)`.
+
+    Raises:
+        InputError: the policy is unknown, or is `own` for a head without a background score.
+    """
     lookup(policy, get_args(BackgroundPolicy), "background policy")
     classes = candidates.classes
     check_shape(classes, "classes", None)
+    background = _background(candidates, policy)
+    classes = classes.clamp(min=torch.finfo(classes.dtype).tiny)
+    return background, (1 - background)[..., None] * classes / classes.sum(-1, keepdim=True)
+
+
+def _background(candidates: Candidates, policy: BackgroundPolicy) -> Tensor:
+    """Compute the background score `(...)` by a policy; `score_vectors` has the formulas."""
+    classes = candidates.classes
     if policy == "own":
         if candidates.background is None:
             raise InputError("background: expected a head with a score for the policy 'own', got none; use 'residual'")
-        background = candidates.background
-    elif policy == "residual":
-        background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)
-    elif policy == "normalised":
-        objectness = classes.amax(-1) if candidates.objectness is None else candidates.objectness
-        sure = 1 if candidates.objectness is None else objectness
-        # (1 - o) / (1 - o + o Σ c); below, the classes share the rest as with every policy.
-        total = 1 - objectness + sure * classes.sum(-1)
-        background = (1 - objectness) / total.clamp(min=torch.finfo(classes.dtype).tiny)
-    elif policy == "uniform":
-        background = torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
-    else:
-        background = torch.zeros_like(classes[..., 0])
-    classes = classes.clamp(min=torch.finfo(classes.dtype).tiny)
-    return background, (1 - background)[..., None] * classes / classes.sum(-1, keepdim=True)
+        return candidates.background
+    if policy == "uniform":
+        return torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
+    if policy == "none":
+        return torch.zeros_like(classes[..., 0])
+    objectness = classes.amax(-1) if candidates.objectness is None else candidates.objectness
+    if policy == "residual":
+        return 1 - objectness
+    # With objectness, the scores of the classes are o c; the classes share the rest as with every policy.
+    total_of_classes = classes.sum(-1) if candidates.objectness is None else objectness * classes.sum(-1)
+    total = 1 - objectness + total_of_classes
+    return (1 - objectness) / total.clamp(min=torch.finfo(classes.dtype).tiny)

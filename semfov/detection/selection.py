@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -45,87 +44,139 @@ class Selection:
 def select(
     candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
-    """Select the best boxes of each image, map them to the image, and compute their score vectors."""
+    """Select the best boxes of each image, map them to the image, and compute their score vectors.
+
+    Args:
+        candidates: all boxes of a head, in canvas pixels.
+        placement: placement of the images on the canvas; None leaves boxes in canvas pixels.
+        selection: threshold, non-maximum suppression and limit.
+        policy: background policy of the score vectors.
+
+    Returns:
+        The boxes, those with the largest score of a class in their vectors first.
+
+    Raises:
+        InputError: a number of the detector is not finite, or out of range.
+    """
+    device = candidates.boxes.device
+    count = candidates.boxes.shape[0]
     # On a GPU each step would wait for the number of boxes that the step before has left.
-    device, count = candidates.boxes.device, candidates.boxes.shape[0]
     if values_known(candidates.boxes):
         candidates = candidates.to(torch.device("cpu"))
-    detections = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
-    chosen = detections[0] if count == 1 else Detections.stack(detections)
-    return chosen if chosen.boxes.device == device else chosen.to(device)
+    images = [_select_of_image(candidates, image, placement, selection, policy) for image in range(count)]
+    detections = images[0] if count == 1 else Detections.stack(images)
+    return detections if detections.boxes.device == device else detections.to(device)
 
 
 def check_numbers(image: int, low: float, high: float, **named: Tensor | None) -> None:
-    """Raise `InputError` where a detector returns NaN, infinite numbers, or numbers outside a range."""
-    for name, each in named.items():
-        if each is not None and each.numel() and values_known(each):
-            least, most = map(float, each.detach().aminmax())  # one pass; NaN and infinite numbers are among them
-            if not (low <= least and most <= high and math.isfinite(most - least)):
-                where = f"detector: {name.replace('_', ' ')} in image {image}"
-                check_finite(each, where)
-                check(False, where, f"numbers in [{low:g}, {high:g}]", "numbers outside")
+    """Check the numbers of a detector.
+
+    Args:
+        image: number of the image, for the message.
+        low: the smallest number that may be.
+        high: the largest one.
+        **named: numbers by what they are, with `_` for a space; None is left out.
+
+    Raises:
+        InputError: some are NaN, infinite or outside the range.
+    """
+    for name, numbers in named.items():
+        if numbers is None or not numbers.numel() or not values_known(numbers):
+            continue
+        least, greatest = map(float, numbers.detach().aminmax())  # one pass; NaN and infinite numbers are among them
+        if not (low <= least and greatest <= high and math.isfinite(greatest - least)):
+            where = f"detector: {name.replace('_', ' ')} in image {image}"
+            check_finite(numbers, where)
+            check(False, where, f"numbers in [{low:g}, {high:g}]", "numbers outside")
 
 
-def _select_one(
+def _select_of_image(
     candidates: Candidates, image: int, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
+    """Select the best boxes of one image."""
     confidence = candidates.confidence[image]
     index = (confidence >= selection.threshold).nonzero()[:, 0]
     boxes = candidates.boxes[image].index_select(0, index)
     check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
-    boxes = boxes if placement is None else placement.boxes_to_image(boxes)
+    if placement is not None:
+        boxes = placement.boxes_to_image(boxes)
+    # Labels are read only where boxes suppress those of their own class.
     labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
-    chosen = suppress(boxes, confidence.index_select(0, index), labels, selection)
-    rows = candidates.take(image, index[chosen])
+    survivors = suppress(boxes, confidence.index_select(0, index), labels, selection)
+    rows = candidates.take(image, index[survivors])
     check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     scores = score_vectors(rows, policy)
     # Suppression ranks by confidence; the shares of a vector can rank otherwise.
     order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
-    boxes, scores = boxes.index_select(0, chosen[order]), scores.index_select(0, order)
+    boxes = boxes.index_select(0, survivors[order])
+    scores = scores.index_select(0, order)
+    confidence = rows.confidence.index_select(0, order)
     every = torch.ones_like(order, dtype=torch.bool)
-    return Detections(boxes[None], scores[None], every[None], rows.confidence.index_select(0, order)[None])
+    return Detections(boxes[None], scores[None], every[None], confidence[None])
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
-    """Indices of the boxes that survive non-maximum suppression, most confident first."""
-    boxes, confidence = boxes.detach(), confidence.detach()
+    """Suppress boxes that overlap more confident ones; boxes without area are left out.
+
+    Args:
+        boxes: `(N, 4)`, `(x1, y1, x2, y2)`.
+        confidence: `(N,)`.
+        labels: `(N,)`, best classes; read where the selection is for each class.
+        selection: overlap from which on boxes suppress each other, and largest number of boxes.
+
+    Returns:
+        Indices of the boxes that survive, most confident first.
+    """
+    boxes = boxes.detach()
+    confidence = confidence.detach()
     if boxes.dtype in HALVES:  # too coarse for pixels, and not there on a CPU
-        boxes, confidence = boxes.float(), confidence.float()
-    full = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
-    ranked, order = confidence[full].sort(descending=True, stable=True)
-    order = full[order]
-    return order[_survivors(boxes.index_select(0, order), ranked, labels[order], selection)]
+        boxes = boxes.float()
+        confidence = confidence.float()
+    with_area = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
+    ranked, order = confidence[with_area].sort(descending=True, stable=True)
+    order = with_area[order]
+    boxes = boxes.index_select(0, order)
+    labels = labels[order]
+    if boxes.device.type == "cpu" and values_known(boxes):
+        return order[_survivors(boxes, labels, selection)]
+    from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
+
+    survivors = (
+        batched_nms(boxes, ranked, labels, selection.iou) if selection.per_class else nms(boxes, ranked, selection.iou)
+    )
+    return order[survivors[: selection.limit]]
 
 
-def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
-    """Indices of the boxes that survive suppression, among boxes in descending order of confidence."""
-    if boxes.device.type != "cpu" or not values_known(boxes):
-        from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
+def _survivors(boxes: Tensor, labels: Tensor, selection: Selection) -> Tensor:
+    """Find the boxes `(N, 4)`, most confident first, that survive suppression, block by block of them.
 
-        if selection.per_class:
-            return batched_nms(boxes, confidence, labels, selection.iou)[: selection.limit]
-        return nms(boxes, confidence, selection.iou)[: selection.limit]
-    corners, kinds, survivors = boxes.numpy(), labels.numpy(), np.zeros(0, np.int64)
+    A block is compared with the survivors of the blocks before it, and with itself.
+    """
+    corners = boxes.numpy()
+    classes = labels.numpy()
+    survivors = np.zeros(0, np.int64)
     for start in range(0, len(corners), _BLOCK):
         block = np.arange(start, min(start + _BLOCK, len(corners)))
         rivals = np.concatenate([survivors, block])
-        over = _overlaps(corners[rivals], corners[block], selection.iou)
+        overlaps = _overlaps(corners[rivals], corners[block], selection.iou)
         if selection.per_class:
-            over &= kinds[rivals, None] == kinds[block]
-        beaten: NDArray[np.bool_] = over[: len(survivors)].any(axis=0)  # type: ignore[assignment]
-        for number, row in enumerate(over[len(survivors) :]):
-            if not beaten[number]:
-                beaten[number + 1 :] |= row[number + 1 :]
-        survivors = np.concatenate([survivors, block[~beaten]])
+            overlaps &= classes[rivals, None] == classes[block]
+        by_earlier = overlaps[: len(survivors)]
+        suppressed: NDArray[np.bool_] = by_earlier.any(axis=0)  # type: ignore[assignment]
+        for number, by_this in enumerate(overlaps[len(survivors) :]):
+            if not suppressed[number]:
+                suppressed[number + 1 :] |= by_this[number + 1 :]
+        survivors = np.concatenate([survivors, block[~suppressed]])
         if len(survivors) >= selection.limit:
             break
     return torch.from_numpy(survivors[: selection.limit])
 
 
-def _overlaps(boxes: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], iou: float) -> NDArray[np.bool_]:
-    """Whether the intersection over union of each two boxes is above a limit; boxes `(M, 4)`, others `(N, 4)`."""
-    (x1, y1, x2, y2), (left, top, right, bottom) = boxes.T[:, :, None], others.T[:, None]
-    shared = (np.minimum(x2, right) - np.maximum(x1, left)).clip(0)
-    shared *= (np.minimum(y2, bottom) - np.maximum(y1, top)).clip(0)
-    together = (x2 - x1) * (y2 - y1) + (right - left) * (bottom - top) - shared
-    return shared > iou * together
+def _overlaps(boxes: NDArray[np.floating], others: NDArray[np.floating], iou: float) -> NDArray[np.bool_]:
+    """Tell whether the intersection over union of each two boxes is above a limit; boxes `(M, 4)`, others `(N, 4)`."""
+    x1, y1, x2, y2 = boxes.T[:, :, None]
+    left, top, right, bottom = others.T[:, None]
+    intersection = (np.minimum(x2, right) - np.maximum(x1, left)).clip(0)
+    intersection *= (np.minimum(y2, bottom) - np.maximum(y1, top)).clip(0)
+    union = (x2 - x1) * (y2 - y1) + (right - left) * (bottom - top) - intersection
+    return intersection > iou * union

@@ -204,11 +204,11 @@ def _check_options(options: Iterable[str], name: str, kind: type[nn.Module]) -> 
     from torchvision import models
 
     builders = [models.get_model_builder(name), *(base for base in kind.__mro__ if issubclass(base, nn.Module))]
-    known = set()
+    names = set()
     for builder in builders:
-        known |= {*inspect.signature(builder).parameters}
+        names |= {*inspect.signature(builder).parameters}
     for option in options:
-        lookup(option, sorted(known), f"option of {name}")
+        lookup(option, sorted(names), f"option of {name}")
 
 
 def _download(weights: _Weights) -> str:

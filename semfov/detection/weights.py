@@ -7,6 +7,7 @@ import sys
 import tarfile
 import tempfile
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,16 +73,9 @@ class _SourceDistribution(NamedTuple):
                 raise DataError(f"pip: {self.project} {self.version} lacks {self.member}") from error
 
     def _download(self, folder: Path) -> None:
-        backend, temporary = folder / "backend", folder / "temporary"
-        (backend / "setuptools").mkdir(parents=True)
-        temporary.mkdir()
-        (backend / "setuptools" / "__init__.py").touch()
-        text = _BACKEND.format(project=self.project, version=self.version)
-        (backend / "setuptools" / "build_meta.py").write_text(text, encoding="utf-8")
+        """Download the archive into `archives` in a folder, without running its code."""
         requirements = folder / "requirements.txt"
         requirements.write_text(f"{self.project}=={self.version} --hash=sha256:{self.sha256}\n", encoding="utf-8")
-        path = os.pathsep.join(filter(None, [str(backend), os.environ.get("PYTHONPATH")]))
-        environment = os.environ | {"PYTHONPATH": path, "PIP_USE_PEP517": "1", "TMPDIR": str(temporary)}
         # fmt: off
         command = [
             sys.executable, "-m", "pip", "download", "--no-deps", "--no-binary", self.project,
@@ -89,6 +83,7 @@ class _SourceDistribution(NamedTuple):
             "--dest", str(folder / "archives"), "--disable-pip-version-check",
         ]
         # fmt: on
+        environment = self._environment(folder)
         with (folder / "log.txt").open("w+", encoding="utf-8", errors="replace") as log:
             shown = sys.stderr if sys.stderr.isatty() else log  # pip draws its progress
             process = subprocess.run(
@@ -96,14 +91,39 @@ class _SourceDistribution(NamedTuple):
             )
             log.seek(0)
             if process.returncode != 0:
-                lines = [line.strip() for line in log if line.strip()]
-                errors = [line for line in lines if line.startswith("ERROR:")]
-                reason = ([*lines, *errors] or ["ended without a message"])[-1]  # the line that describes it best
-                raise DataError(f"pip: {reason.removeprefix('ERROR: ')}")
+                raise DataError(f"pip: {_reason(log)}")
+
+    def _environment(self, folder: Path) -> dict[str, str]:
+        """Make the variables with which pip finds the replacement of setuptools, which is written into a folder."""
+        setuptools = folder / "backend" / "setuptools"
+        setuptools.mkdir(parents=True)
+        (setuptools / "__init__.py").touch()
+        backend = _BACKEND.format(project=self.project, version=self.version)
+        (setuptools / "build_meta.py").write_text(backend, encoding="utf-8")
+        temporary = folder / "temporary"
+        temporary.mkdir()
+        path = os.pathsep.join(filter(None, [str(setuptools.parent), os.environ.get("PYTHONPATH")]))
+        return os.environ | {"PYTHONPATH": path, "PIP_USE_PEP517": "1", "TMPDIR": str(temporary)}
+
+
+def _reason(log: Iterable[str]) -> str:
+    """Find the line that says best why pip failed: its last error, else its last line."""
+    lines = [line.strip() for line in log if line.strip()]
+    errors = [line for line in lines if line.startswith("ERROR:")]
+    return ([*lines, *errors] or ["ended without a message"])[-1].removeprefix("ERROR: ")
 
 
 class _Weights(NamedTuple):
-    """A weights file that is found by name: in the package, in the cache, or at one of its sources."""
+    """A weights file that is found by name: in the package, in the cache, or at one of its sources.
+
+    Attributes:
+        file: name of the file.
+        size: its bytes.
+        sha256: its digest in hexadecimal.
+        licence: its licence.
+        sources: where it is downloaded from, tried in order.
+        remark: what a message says where it cannot be fetched.
+    """
 
     file: str
     size: int
@@ -120,10 +140,12 @@ _PACKAGED = Path(__file__).parent / "models"
 
 
 def _official(file: str) -> tuple[_Address, ...]:
+    """List the addresses of the authors of Darknet."""
     return _Address(f"https://pjreddie.com/media/files/{file}"), _Address(f"https://data.pjreddie.com/files/{file}")
 
 
 def _yolox(file: str, size: int, digest: str) -> _Weights:
+    """Describe a file of YOLOX's release."""
     return _Weights(file, size, digest, _YOLOX_LICENCE, (_Address(f"{_YOLOX_RELEASE}/{file}"),))
 
 
@@ -185,28 +207,52 @@ WEIGHTS: dict[str, _Weights] = {
 
 
 def cache_folder() -> Path:
-    """The folder of downloads: `$SEMFOV_CACHE`, else the platform's cache folder for semfov."""
+    """Find the folder of downloads: `$SEMFOV_CACHE`, else the platform's cache folder for semfov.
+
+    Returns:
+        The folder, which may be missing.
+
+    Raises:
+        DataError: it is a file, or no path.
+    """
     import pooch
 
-    given = os.environ.get("SEMFOV_CACHE")
+    variable = os.environ.get("SEMFOV_CACHE")
     try:
-        folder = Path(given or pooch.os_cache("semfov")).expanduser()
-        fits = folder.is_dir() or not folder.exists()
+        folder = Path(variable or pooch.os_cache("semfov")).expanduser()
+        is_file = folder.exists() and not folder.is_dir()
     except (OSError, RuntimeError, ValueError) as error:  # a name that is too long, or the home of nobody
-        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {given!r} ({error})") from None
-    check_data(fits, "SEMFOV_CACHE", "a folder for downloads", f"the file {folder}")
+        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {variable!r} ({error})") from None
+    check_data(not is_file, "SEMFOV_CACHE", "a folder for downloads", f"the file {folder}")
     return folder
 
 
 def weights_path(name: str) -> Path:
-    """Name the place of named weights: in the package, or else in the cache, where they may be missing."""
+    """Name the place of named weights.
+
+    Args:
+        name: their name in `WEIGHTS`.
+
+    Returns:
+        Their file in the package, or else in the cache, where it may be missing.
+    """
     entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
     packaged = _PACKAGED / entry.file
     return packaged if packaged.is_file() else cache_folder() / entry.file
 
 
 def fetch(name: str) -> Path:
-    """Find named weights in the package or in the cache, and download them if they are missing."""
+    """Find named weights in the package or in the cache, and download them if they are missing.
+
+    Args:
+        name: their name in `WEIGHTS`.
+
+    Returns:
+        Their file, whose digest has been checked.
+
+    Raises:
+        DataError: no source has the file.
+    """
     path = weights_path(name)
     entry = WEIGHTS[name]
     if path.exists():
@@ -218,14 +264,16 @@ def fetch(name: str) -> Path:
         try:
             with replacing(path) as temporary:
                 source.fetch(temporary)
-                size, digest = temporary.stat().st_size, sha256(temporary)
+                size = temporary.stat().st_size
+                digest = sha256(temporary)
                 check_data(size == entry.size, entry.file, f"{entry.size} bytes", size)
                 check_data(digest == entry.sha256, entry.file, f"sha256 {entry.sha256}", digest)
         except DataError as error:
             faults.append(str(error))
         else:
             return path
+    remark = f"; {entry.remark}" if entry.remark else ""
     raise DataError(
         f"cannot fetch the weights {name!r} ({'; '.join(faults)}); put {entry.file} ({entry.size} bytes, sha256 "
-        f"{entry.sha256}) into {path.parent}, or give its path as weights={'; ' * bool(entry.remark)}{entry.remark}"
+        f"{entry.sha256}) into {path.parent}, or give its path as weights={remark}"
     )

@@ -106,7 +106,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _export_to_temporary_folder(monkeypatch: pytest.MonkeyPatch, exports: Path) -> None:
-    monkeypatch.setattr("semfov.detection.yolo.cache_folder", lambda: exports)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.cache_folder", lambda: exports)
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,8 @@ from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp
 
 from semfov import example
+from semfov.detection.darknet_onnx import _VERSION, OnnxTwin, _exported, network_digest, network_model
 from semfov.detection.load import load_yolo
-from semfov.detection.yolo import _VERSION, _exported, _network_digest, _OnnxTwin, network_model
 from semfov.errors import InputError
 from tests.refusals import refused
 
@@ -20,8 +20,8 @@ from tests.refusals import refused
 def looks(monkeypatch):
     """Canvases that were given to onnxruntime."""
     seen = []
-    call = _OnnxTwin.__call__
-    monkeypatch.setattr(_OnnxTwin, "__call__", lambda self, *given: (seen.append(given[1]), call(self, *given))[1])
+    call = OnnxTwin.__call__
+    monkeypatch.setattr(OnnxTwin, "__call__", lambda self, *given: (seen.append(given[1]), call(self, *given))[1])
     return seen
 
 
@@ -29,7 +29,7 @@ def looks(monkeypatch):
 def folder(tmp_path, monkeypatch):
     """An empty cache for one test."""
     path = tmp_path / "cache"
-    monkeypatch.setattr("semfov.detection.yolo.cache_folder", lambda: path)
+    monkeypatch.setattr("semfov.detection.darknet_onnx.cache_folder", lambda: path)
     return path
 
 
@@ -194,27 +194,27 @@ def test_another_number_of_threads_or_process_opens_a_new_session(make_small, th
 @pytest.mark.parametrize("damage", [b"", b"half", None])
 def test_a_damaged_export_is_replaced(make_small, folder, damage):
     network = make_small("torch").network
-    path = _exported(network, _network_digest(network), folder)
+    path = _exported(network, network_digest(network), folder)
     whole = path.read_bytes()
     content = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:] if damage is None else damage
     path.write_bytes(content)
-    assert _exported(network, _network_digest(network), folder) == path
+    assert _exported(network, network_digest(network), folder) == path
     assert path.read_bytes() == whole
     assert os.listdir(folder) == [path.name]
 
 
 def test_every_network_and_version_has_its_own_export(make_small, folder, monkeypatch):
     network = make_small("torch").network
-    path = _exported(network, _network_digest(network), folder)
+    path = _exported(network, network_digest(network), folder)
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
     written = path.stat().st_mtime_ns
-    assert _exported(network, _network_digest(network), folder).stat().st_mtime_ns == written
-    monkeypatch.setattr("semfov.detection.yolo._VERSION", _VERSION + 1)
-    assert _exported(network, _network_digest(network), folder) != path
-    assert _network_digest(copy.deepcopy(network).double()) == _network_digest(network)
+    assert _exported(network, network_digest(network), folder).stat().st_mtime_ns == written
+    monkeypatch.setattr("semfov.detection.darknet_onnx._VERSION", _VERSION + 1)
+    assert _exported(network, network_digest(network), folder) != path
+    assert network_digest(copy.deepcopy(network).double()) == network_digest(network)
     with torch.no_grad():
         network.layers[0].weight.mul_(2)
-    assert _exported(network, _network_digest(network), folder) != path
+    assert _exported(network, network_digest(network), folder) != path
     assert len(os.listdir(folder)) == 3
 
 
@@ -242,7 +242,7 @@ def test_exporting_does_not_change_random_state_or_depend_on_default_dtype(make_
     before = torch.get_rng_state()
     detector.propose(canvas)
     assert torch.equal(torch.get_rng_state(), before)
-    whole = _exported(detector.network, _network_digest(detector.network), folder / "exported").read_bytes()
+    whole = _exported(detector.network, network_digest(detector.network), folder / "exported").read_bytes()
     torch.set_default_dtype(torch.float64)
     try:
         assert network_model(detector.network, "darknet").SerializeToString() == whole

@@ -13,10 +13,10 @@ from PIL import Image
 
 from semfov import Detector, load_detector
 from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.darknet_onnx import _OUTPUTS
 from semfov.detection.export import _largest_difference, export_onnx, main
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_heads import HEADS
-from semfov.detection.yolo import _OUTPUTS
 from tests.refusals import refused, unusable
 
 

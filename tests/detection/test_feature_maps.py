@@ -77,10 +77,10 @@ def test_maps_of_a_darknet_network_are_what_its_layers_return(tiny):
 
 
 def test_onnxruntime_gives_the_maps_that_torch_gives(tiny, tmp_path, monkeypatch):
-    from semfov.detection.yolo import _network_digest
+    from semfov.detection.darknet_onnx import network_digest
 
     monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path))
-    twin = YoloV3(tiny.network, tiny.classes, input_size=(96, 64), runtime="auto", digest=_network_digest(tiny.network))
+    twin = YoloV3(tiny.network, tiny.classes, input_size=(96, 64), runtime="auto", digest=network_digest(tiny.network))
     image = rand(1, 3, 64, 96)
     fast, slow = twin.features(image), tiny.features(image)
     for name, expected in slow.maps.items():

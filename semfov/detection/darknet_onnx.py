@@ -1,0 +1,402 @@
+"""Darknet networks as ONNX models: their graph, and onnxruntime's twin of a network that torch holds."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut
+from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.scores import Candidates
+from semfov.detection.weights import cache_folder
+from semfov.errors import DataError, values_known
+from semfov.io.files import sha256, write_bytes
+
+if TYPE_CHECKING:
+    from onnx import ModelProto, NodeProto, TensorProto
+
+_VERSION = 1
+"""Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
+
+_OPSET = 17
+_IR_VERSION = 8  # IR version from the time of opset 17; some runtimes that could run the model refuse newer versions
+
+_OUTPUTS = ("boxes", "objectness", "classes")
+
+
+class Graph:
+    """A graph under construction. Methods that add a node return the name of its output.
+
+    Attributes:
+        nodes: the nodes, in order.
+        constants: the stored tensors by name.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[NodeProto] = []
+        self.constants: dict[str, TensorProto] = {}
+
+    def add(self, op: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        """Add a node with one output.
+
+        Args:
+            op: its operation.
+            *inputs: names of what it reads, `""` for an input that is left out.
+            output: name of its output; None for one of its own.
+            **attributes: attributes of the operation.
+
+        Returns:
+            The name of its output.
+        """
+        name = output or self._free_name(op)
+        self._append(op, inputs, [name], attributes)
+        return name
+
+    def add_several(self, op: str, *inputs: str, outputs: int, **attributes: Any) -> list[str]:
+        """Add a node with several outputs.
+
+        Args:
+            op: its operation.
+            *inputs: names of what it reads.
+            outputs: number of its outputs.
+            **attributes: attributes of the operation.
+
+        Returns:
+            The names of its outputs.
+        """
+        names = [f"{self._free_name(op)}_{number}" for number in range(outputs)]
+        self._append(op, inputs, names, attributes)
+        return names
+
+    def _free_name(self, op: str) -> str:
+        """Make a name for the output of the next node."""
+        return f"{op.lower()}_{len(self.nodes)}"
+
+    def _append(self, op: str, inputs: Sequence[str], outputs: list[str], attributes: Mapping[str, Any]) -> None:
+        from onnx import helper
+
+        self.nodes.append(helper.make_node(op, list(inputs), outputs, **attributes))
+
+    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        """Add a constant; floating-point numbers become float32 unless they are a float64 tensor.
+
+        Args:
+            values: the numbers.
+
+        Returns:
+            The name of the constant.
+        """
+        from onnx import numpy_helper
+
+        tensor = torch.as_tensor(values)
+        python_floats = tensor.is_floating_point() and not isinstance(values, Tensor)
+        if python_floats or tensor.dtype == torch.float16:
+            tensor = tensor.float()
+        name = f"constant_{len(self.constants)}"
+        self.constants[name] = numpy_helper.from_array(tensor.detach().cpu().contiguous().numpy(), name)
+        return name
+
+
+class _NetworkGraph(Graph):
+    """The graph of a Darknet network, in float32."""
+
+    def activation(self, kind: str, source: str) -> str:
+        """Add an activation by its Darknet name."""
+        if kind == "linear":
+            return source
+        if kind == "leaky":
+            return self.add("LeakyRelu", source, alpha=0.1)
+        if kind == "relu":
+            return self.add("Relu", source)
+        if kind == "mish":
+            return self.add("Mul", source, self.add("Tanh", self.add("Softplus", source)))
+        gate = self.add("Sigmoid", source)
+        return self.add("Mul", source, gate) if kind == "swish" else gate
+
+    def layer(self, layer: nn.Module, *sources: str) -> str:
+        """Add a layer that reads the outputs of others."""
+        if isinstance(layer, Convolution):
+            return self._convolution(layer, sources[0])
+        if isinstance(layer, MaxPool):
+            return self._max_pool(layer, sources[0])
+        if isinstance(layer, nn.Upsample):
+            return self._upsample(layer, sources[0])
+        if isinstance(layer, Route):
+            return self._route(layer, sources)
+        if isinstance(layer, Shortcut):
+            return self.activation(layer.activation, self.add("Add", *sources))
+        return sources[0]  # heads are decoded apart from their maps, and dropout does nothing
+
+    def _convolution(self, layer: Convolution, source: str) -> str:
+        vertical, horizontal = (int(side) for side in layer.padding)
+        convolved = self.add(
+            "Conv",
+            source,
+            self.constant(layer.weight.float()),
+            self.constant(cast(Tensor, layer.bias).float()),
+            strides=list(layer.stride),
+            pads=[vertical, horizontal, vertical, horizontal],
+            group=layer.groups,
+        )
+        return self.activation(layer.activation, convolved)
+
+    def _max_pool(self, layer: MaxPool, source: str) -> str:
+        before = layer.padding // 2
+        after = layer.padding - before
+        return self.add(
+            "MaxPool",
+            source,
+            kernel_shape=[layer.size] * 2,
+            strides=[layer.stride] * 2,
+            pads=[before, before, after, after],
+        )
+
+    def _upsample(self, layer: nn.Upsample, source: str) -> str:
+        scale = float(cast(float, layer.scale_factor))
+        return self.add(
+            "Resize",
+            source,
+            "",
+            self.constant([1.0, 1.0, scale, scale]),
+            mode="nearest",
+            nearest_mode="floor",
+            coordinate_transformation_mode="asymmetric",
+        )
+
+    def _route(self, layer: Route, sources: Sequence[str]) -> str:
+        chunks = list(sources)
+        if layer.groups > 1:
+            for number, source in enumerate(sources):
+                chunks[number] = self.add_several("Split", source, outputs=layer.groups, axis=1)[layer.group]
+        return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
+
+    def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
+        """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
+        shape = self.constant([0, len(head.anchors), 5 + head.classes, -1])
+        cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
+        lengths = self.constant([2, 2, 1, head.classes])
+        shift, size, objectness, classes = self.add_several("Split", cells, lengths, outputs=4, axis=3)
+        centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
+        corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
+        centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
+        half = self.add("Mul", self.add("Exp", size), self.constant((torch.tensor(head.anchors) / 2).float()))
+        boxes = self.add("Concat", self.add("Sub", centre, half), self.add("Add", centre, half), axis=3)
+        return (
+            self.add("Reshape", boxes, self.constant([0, -1, 4])),
+            self.add("Reshape", self.add("Sigmoid", objectness), self.constant([0, -1])),
+            self.add("Reshape", self.add("Sigmoid", classes), self.constant([0, -1, head.classes])),
+        )
+
+    def _corners(self, source: str) -> str:
+        """Add the column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
+        size = self.add("Shape", source)
+        rows, columns = (self.add("Gather", size, self.constant(axis)) for axis in (2, 3))
+        count = self.add("Mul", rows, columns)
+        cell = self.add("Range", self.constant(0), count, self.constant(1))
+        column = self.add("Mod", cell, columns)
+        row = self.add("Div", cell, columns)
+        axes = self.constant([1, 2])
+        pair = [self.add("Unsqueeze", place, axes) for place in (column, row)]
+        return self.add("Cast", self.add("Concat", *pair, axis=2), to=1)
+
+
+def network_model(
+    network: Darknet, name: str, size: tuple[int, int] | None = None, layers: Sequence[int] = ()
+) -> ModelProto:
+    """Make the ONNX model of a network, with decoded boxes.
+
+    Args:
+        network: the network.
+        name: name of the model.
+        size: `(width, height)` of the one image that it takes; None for any number of images of any size.
+        layers: numbers of layers whose maps are further outputs, `layer_0`, ….
+
+    Returns:
+        The model, with outputs `boxes` `(B, N, 4)`, `objectness` `(B, N)` and `classes` `(B, N, K)`.
+    """
+    try:
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
+    graph = _NetworkGraph()
+    names = {-1: "images"}
+    heads = []
+    for index, (layer, sources) in enumerate(zip(network.layers, network.sources, strict=True)):
+        names[index] = graph.layer(layer, *(names[source] for source in sources))
+        if isinstance(layer, Head):
+            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
+    for output, parts in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
+        graph.add("Concat", *parts, output=output, axis=1)
+    for number in layers:
+        graph.add("Identity", names[number], output=f"layer_{number}")
+    batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
+    boxes = "boxes" if size is None else None
+    classes = network.heads[0].classes
+    shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
+    outputs = [helper.make_tensor_value_info(output, TensorProto.FLOAT, shapes[output]) for output in _OUTPUTS]
+    outputs += [helper.make_tensor_value_info(f"layer_{number}", TensorProto.FLOAT, None) for number in layers]
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])
+    return helper.make_model(
+        helper.make_graph(graph.nodes, name, [images], outputs, list(graph.constants.values())),
+        producer_name="semfov",
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+    )
+
+
+class _OpenSession(NamedTuple):
+    """A session, and what it was opened for: a process, and a number of threads."""
+
+    holder: tuple[int, int]
+    session: OnnxSession
+
+
+class OnnxTwin:
+    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
+
+    A twin computes the network of one digest. Private attributes: `_versions` are those of the parameters when their
+    digest was last compared, and `_same` is what the comparison gave; parameters of the same versions have not changed
+    since. `_opened` has the sessions of this process by the layers whose maps they return.
+    """
+
+    def __init__(self, digest: str, versions: tuple[object, ...] | None = None) -> None:
+        self.digest = digest
+        self._versions = versions
+        self._same = versions is not None
+        self._opened: dict[tuple[int, ...], _OpenSession] = {}
+
+    def __reduce__(self) -> tuple[Callable[[str], OnnxTwin], tuple[str]]:
+        return OnnxTwin, (self.digest,)
+
+    def obstacle(self, network: Darknet) -> str | None:
+        """Find the reason why onnxruntime cannot run a network as it is now.
+
+        Args:
+            network: the network.
+
+        Returns:
+            The reason in words; None if it can.
+        """
+        parameters = list(network.parameters())
+        dtype = parameters[0].dtype
+        devices = {parameter.device.type for parameter in parameters}
+        if devices != {"cpu"}:
+            return f"a network on {', '.join(sorted(devices))}"
+        if dtype != torch.float32:
+            return f"a network of {dtype}"
+        if network.channels != 3:
+            return f"a network that takes {network.channels} channels"
+        versions = parameter_versions(parameters)
+        if versions != self._versions:
+            self._versions = versions
+            self._same = network_digest(network) == self.digest
+        return None if self._same else "weights that were changed after loading"
+
+    def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
+        """Find the reason why onnxruntime cannot run a network on a canvas.
+
+        Args:
+            network: the network.
+            canvas: `(B, 3, H, W)`.
+
+        Returns:
+            The reason in words; None if it can.
+        """
+        tensors = [canvas, *network.parameters()]
+        if not values_known(*tensors) or torch.jit.is_tracing():  # type: ignore[attr-defined]
+            return "graphs that are traced, and function transforms"
+        if any(type(tensor) not in (Tensor, nn.Parameter) for tensor in tensors):
+            return "subclasses of tensors"
+        reverse = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+        if reverse or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+            return "gradients"
+        if canvas.device.type != "cpu":
+            return f"a canvas on {canvas.device}"
+        return self.obstacle(network)
+
+    def __call__(
+        self, network: Darknet, canvas: Tensor, layers: Mapping[str, int]
+    ) -> tuple[Candidates, dict[str, Tensor]]:
+        """Compute all boxes, and maps, in float32, without gradients.
+
+        Args:
+            network: the network of this twin.
+            canvas: `(B, 3, H, W)`.
+            layers: numbers of the layers whose maps are returned, by name.
+
+        Returns:
+            The boxes in canvas pixels, with their scores, and the maps by name.
+        """
+        network.check_image(canvas)
+        outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
+        candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
+        return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
+
+    def _session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
+        """Return the session of this process that returns the maps of layers; opened if there is none."""
+        # A session that was opened before a process was forked has none of its threads.
+        holder = os.getpid(), torch.get_num_threads()
+        if layers not in self._opened or self._opened[layers].holder != holder:
+            self._opened[layers] = _OpenSession(holder, self._new_session(network, layers))
+        return self._opened[layers].session
+
+    def _new_session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
+        try:
+            return OnnxSession(_exported(network, self.digest, cache_folder() / "exported", layers), open_ended=False)
+        except DataError:  # the cache cannot be written to
+            with tempfile.TemporaryDirectory() as folder:
+                return OnnxSession(_exported(network, self.digest, Path(folder), layers), open_ended=False)
+
+
+def network_digest(network: Darknet) -> str:
+    """Compute the sha256 of a network's cfg and of its parameters as float32.
+
+    Args:
+        network: the network.
+
+    Returns:
+        The digest in hexadecimal.
+    """
+    digest = hashlib.sha256(network.cfg_digest().encode())
+    for parameter in network.parameters():
+        digest.update(parameter.detach().float().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def parameter_versions(parameters: Sequence[nn.Parameter]) -> tuple[object, ...]:
+    """List what changes whenever parameters do.
+
+    Args:
+        parameters: the parameters.
+
+    Returns:
+        Where each of them is in memory, and how often it was written; None for tensors of inference, which are not
+        counted.
+    """
+    return tuple(
+        (parameter.data_ptr(), None if parameter.is_inference() else parameter._version) for parameter in parameters
+    )
+
+
+def _exported(network: Darknet, digest: str, folder: Path, layers: Sequence[int] = ()) -> Path:
+    """Find the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
+    source = json.dumps([digest, _VERSION, torch.__version__, *layers])
+    key = hashlib.sha256(source.encode()).hexdigest()[:16]
+    for path in sorted(folder.glob(f"{key}.*.onnx")):
+        with suppress(OSError):
+            if sha256(path) == path.name.split(".")[1]:
+                return path
+    content = network_model(network, "darknet", layers=layers).SerializeToString()
+    path = folder / f"{key}.{hashlib.sha256(content).hexdigest()}.onnx"
+    write_bytes(path, content)
+    return path
