@@ -101,9 +101,9 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
 
 
 def _check_numbers_of_classes(numbers: Tensor, classes: int) -> None:
-    """Raise `InputError` unless numbers `(M,)` of classes are integral, from 0 to `classes - 1`."""
+    """Raise `InputError` unless numbers `(M,)` of classes are whole, from 0 to `classes - 1`."""
     integral = bool((numbers == numbers.round()).all())
-    check(integral, "rows", "a integral number of a class in the last column", numbers[:3].tolist())
+    check(integral, "rows", "a whole number of a class in the last column", numbers[:3].tolist())
     if len(numbers):
         inside = float(numbers.min()) >= 0 and float(numbers.max()) < classes
         check(inside, "classes", "a name for each class of the rows", f"{classes}, and class {numbers.max():g}")
