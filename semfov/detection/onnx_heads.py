@@ -36,8 +36,10 @@ from semfov.errors import InputError, check, check_shape
 _Outputs = Mapping[str, Tensor]
 """Outputs of a model by name, in its order."""
 
+# What the authors' own code does with a picture.
 _LETTERBOX = Preprocessing()
 _STRETCH = Preprocessing(stretch=True)
+# YOLOX pads on the right and below.
 _YOLOX = Preprocessing(channels="bgr", scale=255.0, corner=True)
 _IMAGENET = Preprocessing(mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225), stretch=True)
 _NANODET = Preprocessing(
@@ -192,7 +194,26 @@ class _Candidates(Head):
         return Candidates(outputs["boxes"], scores, outputs.get("objectness"), outputs.get("background"))
 
 
-class _Yolox(Head):
+class _RowsHead(Head):
+    """Base of heads with one output, whose rows or columns are boxes."""
+
+    def recognises(self, signature: Signature) -> bool:
+        return signature.layout == "rows" and self.recognises_rows(signature.rows, signature)
+
+    @abstractmethod
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        """Tell whether a model with one output may have this head.
+
+        Args:
+            rows: the output.
+            signature: what else is known of the model.
+
+        Returns:
+            True where they fit.
+        """
+
+
+class _Yolox(_RowsHead):
     """YOLOX (Ge et al. 2021): one output `(B, N, 5 + K)`, for the cells of strides 8, 16 and 32.
 
     A row is `t_x t_y t_w t_h` (`decode_yolox`), objectness, K class scores.
@@ -201,27 +222,27 @@ class _Yolox(Head):
     name = "yolox"
     preprocessing = _YOLOX
 
-    def recognises(self, signature: Signature) -> bool:
-        return signature.layout == "rows" and _has_yolox_rows(signature.rows)
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        return rows.cells.levels == 3 and rows.may_have_objectness
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         return decode_yolox(_single(outputs), canvas, STRIDES[:3])
 
 
-class _YoloxDecoded(Head):
+class _YoloxDecoded(_RowsHead):
     """YOLOX with boxes that the network has decoded: rows of `yolov5`, for an image in the corner of the canvas."""
 
     name = "yolox-decoded"
     preprocessing = _YOLOX
 
-    def recognises(self, signature: Signature) -> bool:
-        return signature.layout == "rows" and _has_yolox_rows(signature.rows)
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        return rows.cells.levels == 3 and rows.may_have_objectness
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         return decode_yolov5(_single(outputs))
 
 
-class _NanodetPlus(Head):
+class _NanodetPlus(_RowsHead):
     """NanoDet-Plus: one output `(B, N, K + 32)`, for the corners of the cells of strides 8, 16, 32 and 64.
 
     A row has K class scores, then the distances of `decode_distances`, with 8 bins for each side.
@@ -235,12 +256,9 @@ class _NanodetPlus(Head):
     faint = 0.02
     least = 0.2
 
-    def recognises(self, signature: Signature) -> bool:
-        if signature.layout != "rows":
-            return False
-        rows = signature.rows
-        has_cells = rows.cells == (1, 4) and not rows.boxes_are_columns and not rows.lack_objectness
-        return has_cells and rows.hold_scores_and(_DISTANCE_CHANNELS)
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        in_four_levels = rows.cells == (1, 4) and not rows.boxes_are_columns
+        return in_four_levels and not rows.lack_objectness and rows.hold_scores_and(_DISTANCE_CHANNELS)
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         rows = _single(outputs)
@@ -249,7 +267,7 @@ class _NanodetPlus(Head):
         return decode_distances(scores, distances, canvas, strides=STRIDES, offset=0.0)
 
 
-class _Yolov5(Head):
+class _Yolov5(_RowsHead):
     """YOLOv5 and other heads with objectness: one output `(B, N, 5 + K)`, or its transpose.
 
     A row is `c_x c_y w h` in canvas pixels, objectness, K class scores.
@@ -257,21 +275,18 @@ class _Yolov5(Head):
 
     name = "yolov5"
 
-    def recognises(self, signature: Signature) -> bool:
-        if signature.layout != "rows" or not signature.rows.hold_scores_and(5):
-            return False
-        rows = signature.rows
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
         if rows.cells.anchors == 3:
-            return True
+            return rows.hold_scores_and(5)
         # YOLOv6 has one anchor and three levels, as YOLOX has, whose own exports have these names of input and output.
         named_by_yolox = (signature.image, signature.outputs[0][0]) == ("images", "output")
-        return _has_objectness(rows) and not (rows.cells.levels == 3 and named_by_yolox)
+        return rows.may_have_objectness and not (rows.cells.levels == 3 and named_by_yolox)
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         return decode_yolov5(_rows(outputs, canvas))
 
 
-class _Yolov8(Head):
+class _Yolov8(_RowsHead):
     """YOLOv8 and other heads without objectness: one output `(B, 4 + K, N)`, or its transpose.
 
     A column is `c_x c_y w h` in canvas pixels, K class scores.
@@ -279,14 +294,14 @@ class _Yolov8(Head):
 
     name = "yolov8"
 
-    def recognises(self, signature: Signature) -> bool:
-        return signature.layout == "rows" and signature.rows.lack_objectness
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        return rows.lack_objectness
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         return decode_yolov8(_rows(outputs, canvas, prefer_columns=True).mT)
 
 
-class _EndToEnd(Head):
+class _EndToEnd(_RowsHead):
     """A network of Ultralytics that selects boxes itself: one output `(B, N, 6)`.
 
     A row is `x1 y1 x2 y2` in canvas pixels, score, number of the class; the boxes have no other scores.
@@ -295,8 +310,8 @@ class _EndToEnd(Head):
     name = "end2end"
     selects = True
 
-    def recognises(self, signature: Signature) -> bool:
-        if signature.layout != "rows" or signature.rows.cells.anchors or signature.rows.sides[1] != 6:
+    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        if rows.cells.anchors or rows.sides[1] != 6:
             return False
         # The rows of two classes are as long. Ultralytics' exports say which ones they are.
         return signature.classes != 2 or signature.selects or "end2end" not in signature.metadata
@@ -445,18 +460,6 @@ class _RfDetr(_SigmoidQueries):
 
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "dets"
-
-
-def _has_objectness(rows: Rows) -> bool:
-    """Tell whether the rows of cells with one anchor may begin with a box and its objectness."""
-    return (
-        rows.cells.anchors == 1 and not rows.boxes_are_columns and not rows.lack_objectness and rows.hold_scores_and(5)
-    )
-
-
-def _has_yolox_rows(rows: Rows) -> bool:
-    """Tell whether rows may be YOLOX's, with an objectness, of cells in three levels."""
-    return rows.cells.levels == 3 and _has_objectness(rows)
 
 
 def _made_by_paddle(signature: Signature) -> bool:

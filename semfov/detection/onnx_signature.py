@@ -67,6 +67,12 @@ class Rows:
         # Without names, rows have an objectness unless their scores are as many as COCO's.
         return self.boxes_are_columns or self.classes is not None or self.channels - 4 in _COCO_COUNTS
 
+    @property
+    def may_have_objectness(self) -> bool:
+        """Whether the boxes of cells with one anchor may have an objectness before their class scores."""
+        rows_of_cells = self.cells.anchors == 1 and not self.boxes_are_columns
+        return rows_of_cells and not self.lack_objectness and self.hold_scores_and(5)
+
 
 @dataclass(frozen=True)
 class Signature:

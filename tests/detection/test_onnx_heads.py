@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import onnx_decoding as decoding
-from semfov.detection.onnx_heads import HEADS, misplaced, recognise
+from semfov.detection.onnx_heads import HEADS, Head, misplaced, recognise
 from semfov.detection.onnx_signature import Signature
+from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from tests.refusals import refused
 
@@ -168,6 +169,25 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
 )
 def test_unambiguous_signatures_are_recognised(expected, given):
     assert recognise(given) == expected
+
+
+def test_a_head_is_registered_by_being_defined():
+    class Points(Head):
+        name = "points"
+
+        def recognises(self, signature):
+            return "points" in signature.shapes
+
+        def decode(self, outputs, canvas, classes):
+            points = outputs["points"]
+            return Candidates(torch.cat([points[..., :2] - 1, points[..., :2] + 1], -1), points[..., 2:])
+
+    try:
+        assert recognise(signature(("points", (1, 5, 9)))) == "points"
+        assert decode("points", (64, 64), torch.ones(1, 5, 9), names=["points"]).classes.shape == (1, 5, 7)
+    finally:
+        HEADS.pop("points")
+    refused("no head fits", recognise, signature(("points", (1, 5, 9))))
 
 
 @pytest.mark.parametrize(
