@@ -100,18 +100,24 @@ def _backbone_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> 
 
 
 def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict[int, str]:
-    """Find the last map of each stride that convolutions read, after the backbone ends."""
+    """Find the last map of each stride that two convolutions read, else the last that one reads, after the backbone."""
+    if not strides:
+        return {}
     order = {step.name: place for place, step in enumerate(steps)}
     readers = Counter(read for step in steps if step.convolution for read in step.reads[:1])
     # The backbone ends with the first map of the coarsest stride, or with the first that is finer than one it reads.
-    ends = [order[name] for name, stride in strides.items() if stride == max(strides.values())][:1]
-    ends += [order[step.name] for step, read in _changes(steps, strides) if strides[step.name] < strides[read]]
-    maps = {}
-    for stride in set(strides.values()):
-        late = [name for name in strides if strides[name] == stride and readers[name] and order[name] >= min(ends)]
-        shared = [name for name in late if readers[name] > 1]
-        if late:
-            maps[stride] = (shared or late)[-1]
+    coarsest = max(strides.values())
+    end = min(order[name] for name, stride in strides.items() if stride == coarsest)
+    for step, read in _changes(steps, strides):
+        if strides[step.name] < strides[read]:
+            end = min(end, order[step.name])
+    maps: dict[int, str] = {}
+    for name, stride in strides.items():
+        if not readers[name] or order[name] < end:
+            continue
+        # A map that one convolution reads does not replace one that two read, as boxes and scores come from those.
+        if readers[name] > 1 or readers[maps.get(stride, name)] == 1:
+            maps[stride] = name
     return maps
 
 
