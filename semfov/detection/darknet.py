@@ -197,6 +197,7 @@ class _Builder:
 
     def _note(self, shape: _Shape, *sources: int) -> None:
         """Note what a layer returns and reads; raises `DataError` where its map is too large."""
+        # A fraction, which is exact: a cfg may state sizes that no float can hold.
         numbers = self._pixels * shape.channels / shape.step**2
         most = f"a map of at most {_MOST_ELEMENTS:,} numbers"
         check_data(numbers <= _MOST_ELEMENTS, f"cfg: layer {len(self.shapes)}", most, "more")
@@ -224,6 +225,7 @@ class _Builder:
         padding = section.integer("padding", 0, minimum=0)
         _check_kernel(section, size, stride, padding)
         self._note(_Shape(filters, step * stride), self._previous)
+        # As in Darknet, `pad` is a flag that overrides `padding`.
         if section.integer("pad", 0, minimum=0):
             padding = size // 2
         return Convolution(

@@ -182,6 +182,7 @@ class _NetworkGraph(Graph):
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
         """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
+        # A 0 keeps the size of the batch. Cells are last, as their number is open.
         shape = self.constant([0, len(head.anchors), 5 + head.classes, -1])
         cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
         lengths = self.constant([2, 2, 1, head.classes])
@@ -390,6 +391,7 @@ def parameter_versions(parameters: Sequence[nn.Parameter]) -> tuple[object, ...]
 
 def _exported(network: Darknet, digest: str, folder: Path, layers: Sequence[int] = ()) -> Path:
     """Find the ONNX model of a network in a folder; exported if it is missing or damaged (sha256 in its name)."""
+    # Two processes that export at the same time write the same bytes under the same name.
     source = json.dumps([digest, _VERSION, torch.__version__, *layers])
     key = hashlib.sha256(source.encode()).hexdigest()[:16]
     for path in sorted(folder.glob(f"{key}.*.onnx")):

@@ -103,6 +103,7 @@ class Detections:
         Every background policy divides what background leaves in proportion to these scores.
         """
         classes = self.scores[..., 1:]
+        # Padding has no scores to divide by.
         best = classes.amax(-1, keepdim=True).clamp(min=torch.finfo(classes.dtype).tiny)
         return classes / best * self.confidence[..., None]
 
@@ -240,6 +241,7 @@ class Detections:
         if not boxes.is_floating_point():
             boxes = boxes.float()
         scores = None if detections.confidence is None else torch.as_tensor(detections.confidence)
+        # What `to_supervision` has put there, which Supervision keeps when it filters.
         full = detections.data.get(_SCORES)
         if full is not None:
             vectors = torch.as_tensor(full)

@@ -51,6 +51,7 @@ def _largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
     from semfov.detection.onnx import load_onnx
 
     exported = load_onnx(path)
+    # Noise, as numbers that are equal would hide exchanged channels and sides.
     noise = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         expected = detector.propose(detector.fit(noise)[0])

@@ -139,12 +139,14 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
     selecting = {name: value for name, value in options.items() if name in _SELECTING}
     Selection(**selecting)  # what is wrong is told before a network is loaded
     detector = load(model, **{name: value for name, value in options.items() if name in of_loader})
+    # What is not given stays as the loader has set it, such as `per_class` in the settings of an ONNX file.
     detector.selection = replace(detector.selection, **selecting)
     if options.get("background") is not None:
         detector.background = options["background"]
     device = options.get("device")
     if device is None or "device" in of_loader:
         return detector
+    # Tensors on `meta` have no values, so a device cannot be tried out there.
     if torch.device(device).type != "meta":
         check_device(device)
     return detector.to(device)
@@ -269,6 +271,7 @@ def load_yolo(
         sections = ARCHITECTURES[name]()
     network = Darknet(sections).to(dtype).requires_grad_(False)
     digest = network.read_weights(fetch(name) if weights is None else weights)
+    # Convolutions on a CPU are faster in this order of memory.
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,

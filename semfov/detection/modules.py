@@ -63,6 +63,7 @@ class ModuleDetector(Detector):
             candidates = self.propose(canvas)
         maps = {}
         for name, returned in maps_by_module.items():
+            # A module's name may end with the number of its layer, which the stride replaces.
             place = name.rstrip("0123456789")
             for feature_map in returned:
                 maps[f"{place}{stride_of(canvas.shape[-1], feature_map.shape[-1])}"] = feature_map

@@ -83,6 +83,7 @@ class OnnxDetector(Detector):
             least=kind.least,
             digest=digest,
         )
+        # A model with a fixed input takes the whole canvas, however much of it is padding.
         fixed = None not in session.shape[2:]
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
         self.session = session
@@ -112,6 +113,7 @@ class OnnxDetector(Detector):
         self, canvas: Tensor, layers: Sequence[str] | None = None
     ) -> tuple[Candidates, dict[str, Tensor]]:
         outputs, maps = self._outputs_and_maps(canvas, layers)
+        # Heads are found by the names and the number of outputs, to which maps do not belong.
         head_outputs = {name: outputs[name] for name, _ in self.session.outputs}
         return self.decode(head_outputs, (canvas.shape[-1], canvas.shape[-2])), maps
 
@@ -125,6 +127,7 @@ class OnnxDetector(Detector):
         """Compute outputs and maps, by name, in one run of a session that has the maps as further outputs."""
         self._check_canvas(canvas)
         tensors = self._map_tensors(canvas, layers)
+        # A further output is copied in every run, so a session returns only those that were asked for last.
         if not set(tensors.values()) <= {name for name, _ in self._map_session.outputs}:
             self._map_session = self.session.widened([*tensors.values()])
         outputs = self._map_session(self.preprocessing(canvas.detach()))
@@ -170,6 +173,7 @@ class OnnxDetector(Detector):
         candidates = HEADS[self.head].decode(outputs, size, self._scores)
         count = candidates.boxes.shape[1]
         check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
+        # A wrong head shows in the first pass, so later ones spend no time on it.
         first = not self._first_checked and values_known(candidates.boxes, candidates.classes)
         if first:
             self._check_first(outputs, candidates, size)

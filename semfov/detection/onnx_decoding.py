@@ -35,6 +35,7 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
     """
     check_shape(raw, "raw", None, None, None)
     if values_known(raw) and raw.numel():
+        # Exports with boxes as fractions of the canvas have the same shape.
         least, greatest = map(float, raw[..., :4].detach().aminmax())
         form = "offsets from cells and logarithms of sizes, some of them below 0"
         as_fractions = "numbers from 0 to 1, as fractions of the canvas"
@@ -95,6 +96,7 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     numbers = rows[..., 5]
     if values_known(rows):
         _check_numbers_of_classes(numbers[scores > 0], classes)
+    # Rows without a score are padding, whose class may be any number, or NaN.
     index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
     vectors = scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
     return Candidates(rows[..., :4], vectors)
@@ -125,6 +127,7 @@ def decode_selected(outputs: Mapping[str, Tensor], classes: int | None) -> Candi
     boxes = selected["boxes"]
     labels = selected["labels"]
     check_shape(labels, "labels", None, None)
+    # mmdeploy writes the score of a box beside its corners.
     scores = selected["scores"] if "scores" in selected else boxes[..., 4]
     if "count" in selected:
         place = torch.arange(scores.shape[1], device=scores.device)

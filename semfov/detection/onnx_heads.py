@@ -127,6 +127,7 @@ def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -
     names = [name for name, head in HEADS.items() if head.recognises(signature)]
     if len(names) > 1 and run is not None:
         outputs = run()
+        # Where no head places boxes on the canvas, the message names all that fit.
         names = [name for name in names if _places_boxes(HEADS[name], outputs, signature)] or names
     # Outputs with YOLOX's own names are YOLOX's, even where the values do not tell which form they have.
     if len(names) == 1 or names == ["yolox", "yolox-decoded"]:
@@ -146,6 +147,7 @@ def _check_has_scores(signature: Signature) -> None:
     if signature.layout != "rows":
         return
     _, columns = signature.rows.sides
+    # With three classes, rows of 7 are boxes and all scores.
     selected = columns == 7 and signature.classes != 3 and not signature.rows.cells.anchors
     name, shape = signature.outputs[0]
     output = f"output {name} (1, {shape[1]}, {shape[2]})"
@@ -363,6 +365,7 @@ class _DistanceMaps(Head):
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
         strides = STRIDES[: len(outputs) // 2]
+        # Some exports have all class maps first, others the two maps of a level together.
         shapes = [tuple(output.shape) for output in outputs.values()]
         class_maps = []
         distance_maps = []
@@ -381,6 +384,7 @@ class _Picodet(_DistanceMaps):
     preprocessing = _IMAGENET
 
     def recognises(self, signature: Signature) -> bool:
+        # These names are in NanoDet's own exports.
         by_nanodet = any(name.startswith("dis_pred") for name, _ in signature.outputs)
         return super().recognises(signature) and (_made_by_paddle(signature) or not by_nanodet)
 
@@ -448,6 +452,7 @@ class _RtDetr(_SigmoidQueries):
             return query_logits(signature.shapes)[-1] == classes
         if signature.layout != "rows" or signature.rows.cells.anchors or signature.classes is None:
             return False
+        # Rows of 6 are boxes and the scores of two classes, or a box, its score and its class.
         selected = signature.rows.sides[1] == 6 and signature.selects
         return signature.rows.hold_scores_and(4) and not selected
 

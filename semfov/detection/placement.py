@@ -99,6 +99,7 @@ def letterbox(
     check(image.is_floating_point(), "image", "floating-point pixels in [0, 1]", image.dtype)
     check(height > 0 and width > 0, "image", "at least one pixel", tuple(image.shape))
     columns, rows = size if stretch else _size_within(size, width, height)
+    # Networks with convolutions alone take a canvas of any size that their strides divide.
     if stride is None:
         horizontal = size[0] - columns
         vertical = size[1] - rows

@@ -124,6 +124,7 @@ def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Te
     classes = candidates.classes
     check_shape(classes, "classes", None)
     background = _background(candidates, policy)
+    # Where all scores are 0, the classes share equally instead of 0 / 0.
     classes = classes.clamp(min=torch.finfo(classes.dtype).tiny)
     return background, (1 - background)[..., None] * classes / classes.sum(-1, keepdim=True)
 

@@ -132,6 +132,7 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     if boxes.dtype in HALVES:  # too coarse for pixels, and not there on a CPU
         boxes = boxes.float()
         confidence = confidence.float()
+    # A box without area overlaps none, so nothing would suppress it.
     with_area = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
     ranked, order = confidence[with_area].sort(descending=True, stable=True)
     order = with_area[order]

@@ -55,6 +55,7 @@ class TorchvisionDetector(ModuleDetector):
         first: int = 1,
     ) -> None:
         if classes is None:
+            # COCO's names are taken only for as many outputs, as other classes are usually more or fewer.
             from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
             names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
@@ -109,6 +110,7 @@ class TorchvisionDetector(ModuleDetector):
         images = [self._candidates(boxes, scores) for boxes, scores in raw]
         boxes = pad_sequence([image.boxes for image in images], True)
         classes = pad_sequence([image.classes for image in images], True)
+        # Padding is all background.
         background = None
         if self._softmax:
             background = pad_sequence([scores[:, 0] for _, scores in raw], True, 1.0).to(canvas.dtype)
@@ -122,6 +124,7 @@ class TorchvisionDetector(ModuleDetector):
         candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
         if boxes.ndim == 2:
             return candidates
+        # A detection has one box for all its scores: the one of its best class.
         places = torch.tensor(self._places, device=boxes.device) + self.first
         best = places[candidates.classes.argmax(-1)]
         best_boxes = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
@@ -293,6 +296,7 @@ def _level_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
 
 def _best_of_levels(best: Tensor, counts: list[int], limit: int) -> Tensor:
     """Find the rows of the best scores `(N,)` of each level, at most `limit` of each; counts are rows by level."""
+    # As torchvision does before it suppresses boxes.
     rows = []
     start = 0
     for level in best.split(counts):

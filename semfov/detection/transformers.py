@@ -22,6 +22,7 @@ _SOFTMAX = ("detr", "table-transformer", "yolos")
 _IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformable_detr", "dab-detr")
 """Kinds of models whose images are usually normalised by the mean and deviation of ImageNet."""
 
+# Sizes of image processors, by transformers' names: usually those of DETR, or the square of RT-DETR.
 _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
 _MOST = ("max_height", "max_width")
 _SQUARE = {"height": 640, "width": 640}
@@ -54,6 +55,7 @@ class TransformersDetector(ModuleDetector):
         config: Any = model.config
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
+        # A model of another kind that is trained without focal loss would have a softmax, too.
         softmax = config.model_type in _SOFTMAX
         focal = getattr(config, "use_focal_loss", True)
         settings = _with_usual_settings(processor or {}, config.model_type)
@@ -156,6 +158,7 @@ class TransformersDetector(ModuleDetector):
 def _check_model(model: nn.Module) -> None:
     """Raise `InputError` unless a model detects objects of classes of its own."""
     detects = any(kind.__name__.endswith("ForObjectDetection") for kind in type(model).__mro__)
+    # Models that find what a text describes have no classes.
     takes_text = "input_ids" in inspect.signature(model.forward).parameters
     expected = "a model for object detection with classes of its own, such as RTDetrForObjectDetection"
     check(detects and not takes_text, "detector", expected, type(model).__name__)

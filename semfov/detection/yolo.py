@@ -120,6 +120,7 @@ class YoloV3(Detector):
         super().__init__(name, classes, size, stride=stride, digest=digest)
         self.network = network
         self.runtime = runtime
+        # Before the digest is computed, so that a change in between is noticed.
         versions = parameter_versions([*network.parameters()])
         self._twin = None if runtime == "torch" else OnnxTwin(network_digest(network), versions)
 
