@@ -425,7 +425,7 @@ class Darknet(nn.Module):
         """Raise `InputError` unless the network takes images of this shape."""
         check_shape(image, "image", None, self.channels, None, None)
         height, width = image.shape[-2:]
-        multiples = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
+        multiples = all(side > 0 and side % self.stride == 0 for side in (width, height))
         check(multiples, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
     def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:

@@ -29,8 +29,8 @@ def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     elif not scores.is_floating_point():
         scores = scores.float()
     check_shape(scores, "scores", len(labels))
-    inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
-    check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
+    in_range = bool(((labels >= 1) & (labels <= classes)).all())
+    check(in_range, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
     # The comparison also refuses NaN.
     check(bool(((scores >= 0) & (scores <= 1)).all()), "scores", "numbers from 0 to 1", scores.tolist()[:3])
     vectors = scores.new_zeros(len(labels), classes + 1)

@@ -296,7 +296,14 @@ class Detector(StatedModule, ABC):
 
 
 def check_images(images: Tensor) -> None:
-    """Raise `InputError` unless `images` have the form that detectors take."""
+    """Check that images have the form that detectors take.
+
+    Args:
+        images: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Raises:
+        InputError: they have another shape or dtype, or other numbers.
+    """
     are_rgb = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
     expected = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
     check(are_rgb, "images", expected, f"{images.dtype} of shape {tuple(images.shape)}")

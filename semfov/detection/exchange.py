@@ -47,10 +47,12 @@ def named_detections(
         The detections for Supervision.
     """
     numbers = (labels - 1).numpy()
-    names = {} if classes is None else {"class_name": np.array([classes[n] for n in numbers.tolist()], dtype=str)}
     with needing("supervision", "supervision"):
         from supervision import Detections
-    return Detections(boxes.numpy(), None, scores.numpy(), numbers, data={**data, **names})
+    data = dict(data)
+    if classes is not None:
+        data["class_name"] = np.array([classes[number] for number in numbers.tolist()], dtype=str)
+    return Detections(boxes.numpy(), None, scores.numpy(), numbers, data=data)
 
 
 def coco_results(

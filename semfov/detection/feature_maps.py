@@ -134,7 +134,7 @@ def stride_of(canvas: int, side: int) -> int:
     return int(2 ** round(log2(max(canvas / side, 1))))
 
 
-def chosen(layers: Iterable[str] | None, have: Sequence[str], detector: str) -> tuple[str, ...]:
+def choose_layers(layers: Iterable[str] | None, have: Sequence[str], detector: str) -> tuple[str, ...]:
     """Choose the layers that are asked for.
 
     Args:
@@ -171,7 +171,7 @@ def no_features(detector: str) -> InputError:
 
 
 @contextmanager
-def recorded(modules: Mapping[str, nn.Module]) -> Iterator[dict[str, list[Tensor]]]:
+def record_maps(modules: Mapping[str, nn.Module]) -> Iterator[dict[str, list[Tensor]]]:
     """Record the maps that modules return while the block runs.
 
     Args:

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from semfov.detection.class_names import named_outputs
 from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import chosen, no_features, recorded, stride_of
+from semfov.detection.feature_maps import choose_layers, no_features, record_maps, stride_of
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.errors import check, check_shape
@@ -59,7 +59,7 @@ class ModuleDetector(Detector):
         modules = self.feature_modules()
         if not modules:
             raise no_features(self.name)
-        with recorded(modules) as maps_by_module:
+        with record_maps(modules) as maps_by_module:
             candidates = self.propose(canvas)
         maps = {}
         for name, returned in maps_by_module.items():
@@ -67,7 +67,7 @@ class ModuleDetector(Detector):
             place = name.rstrip("0123456789")
             for feature_map in returned:
                 maps[f"{place}{stride_of(canvas.shape[-1], feature_map.shape[-1])}"] = feature_map
-        return candidates, {layer: maps[layer] for layer in chosen(layers, [*maps], self.name)}
+        return candidates, {layer: maps[layer] for layer in choose_layers(layers, [*maps], self.name)}
 
     def _pixels(self, canvas: Tensor) -> Tensor:
         """Convert a canvas to the precision of the network; raises `InputError` for anything else."""

@@ -328,7 +328,8 @@ def unlike(
     order = order[cut[order].int().argsort(stable=True)]
     corners, classes, look, is_cut = (column[order].numpy() for column in (boxes, labels.double(), looks, cut))
     better, worse, shared = _overlapping_pairs(corners, classes, around)
-    area = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
+    x1, y1, x2, y2 = corners.T
+    area = (x2 - x1) * (y2 - y1)
     union = area[better] + area[worse] - shared
     same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
     # Boxes without area share none; equal ones are one object all the same.

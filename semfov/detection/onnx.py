@@ -13,11 +13,11 @@ from torch import Tensor
 
 from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
 from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import chosen, landmarks
+from semfov.detection.feature_maps import choose_layers, landmarks
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file
 from semfov.detection.onnx_file import OnnxSettings, check_canvas, names_beside, read_settings, with_input_size
-from semfov.detection.onnx_heads import HEADS, misplaced, recognise
+from semfov.detection.onnx_heads import HEADS, explain_misplacement, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.onnx_signature import Signature
 from semfov.detection.preprocessing import Preprocessing
@@ -129,7 +129,7 @@ class OnnxDetector(Detector):
         tensors = self._map_tensors(canvas, layers)
         # A further output is copied in every run, so a session returns only those that were asked for last.
         if not set(tensors.values()) <= {name for name, _ in self._map_session.outputs}:
-            self._map_session = self.session.widened([*tensors.values()])
+            self._map_session = self.session.with_outputs([*tensors.values()])
         outputs = self._map_session(self.preprocessing(canvas.detach()))
         return outputs, {layer: outputs[tensor] for layer, tensor in tensors.items()}
 
@@ -141,7 +141,7 @@ class OnnxDetector(Detector):
             self._tensors = {step.name: step.name for step in steps if step.stride is not None} | named
             self._named_layers = tuple(named)
         wanted = self._named_layers if layers is None else layers
-        return {layer: self._tensors[layer] for layer in chosen(wanted, [*self._tensors], self.name)}
+        return {layer: self._tensors[layer] for layer in choose_layers(wanted, [*self._tensors], self.name)}
 
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""
@@ -214,7 +214,7 @@ class OnnxDetector(Detector):
                 self._check_logits(output, "softmax or sigmoid", "export the model without it")
         if self.logits:
             self._check_logits(candidates.classes, "sigmoid", "set logits=False")
-        reason = misplaced(candidates.boxes, size)
+        reason = explain_misplacement(candidates.boxes, size)
         expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
         check_data(reason is None, self.name, expected, reason)
 

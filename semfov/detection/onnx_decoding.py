@@ -165,7 +165,9 @@ def decode_distances(
     point = grid[:, :2] * stride
     expected_bin = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     distance = expected_bin * stride
-    return Candidates(torch.cat([point - distance[..., :2], point + distance[..., 2:]], -1), scores)
+    upper_left = point - distance[..., :2]
+    lower_right = point + distance[..., 2:]
+    return Candidates(torch.cat([upper_left, lower_right], -1), scores)
 
 
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: Canvas) -> Candidates:

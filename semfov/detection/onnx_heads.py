@@ -160,10 +160,10 @@ def _places_boxes(head: Head, outputs: _Outputs, signature: Signature) -> bool:
         candidates = head.decode(outputs, signature.canvas, signature.classes)
     except InputError:
         return False
-    return misplaced(candidates.boxes, signature.canvas) is None
+    return explain_misplacement(candidates.boxes, signature.canvas) is None
 
 
-def misplaced(boxes: Tensor, canvas: Canvas) -> str | None:
+def explain_misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
     """Describe what boxes of one pass look like if another head has made them, and what to do.
 
     Args:

@@ -80,6 +80,9 @@ def _down_along_rows(boxes: Tensor, canvas: Canvas) -> bool:
         return False
     columns, rows = cells(canvas, STRIDES[0])
     cell = torch.arange(columns * rows)
-    places = torch.stack([(boxes[0, cell, side] + boxes[0, cell, side + 2]).detach().cpu() for side in (0, 1)])
-    correlation = torch.corrcoef(torch.cat([places.double(), torch.stack([cell % columns, cell // columns])]))
+    column = (cell % columns).double()
+    row = (cell // columns).double()
+    boxes_of_level = boxes[0, : columns * rows].detach().cpu()
+    x, y = (boxes_of_level[:, :2] + boxes_of_level[:, 2:]).double().T  # twice the middles, which correlate alike
+    correlation = torch.corrcoef(torch.stack([x, y, column, row]))
     return bool((correlation[0, 3] > _ALONG_CELLS) & (correlation[1, 2] > _ALONG_CELLS))

@@ -214,8 +214,11 @@ class OnnxSession:
         if self.open_ended and fixed is None:
             size = 1  # so that an image has all the memory
         runs = [self._run(part.contiguous()) for part in source.split(size)]
-        joined = runs[0] if len(runs) == 1 else {name: torch.cat([run[name] for run in runs]) for name in runs[0]}
-        return {name: joined[name][:batch].to(image) for name, _ in self.outputs}
+        outputs = {}
+        for name, _ in self.outputs:
+            rows = runs[0][name] if len(runs) == 1 else torch.cat([run[name] for run in runs])
+            outputs[name] = rows[:batch].to(image)
+        return outputs
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model once, on images `(B, 3, H, W)` on the CPU in the dtype of its input."""
@@ -251,7 +254,7 @@ class OnnxSession:
     def __reduce__(self) -> tuple[Callable[[], OnnxSession], tuple[()]]:
         return partial(self._again, further=self._further), ()
 
-    def widened(self, further: Sequence[str]) -> OnnxSession:
+    def with_outputs(self, further: Sequence[str]) -> OnnxSession:
         """Open the model once more, with the same settings, so that it also returns tensors inside it.
 
         Args:
@@ -274,8 +277,9 @@ class OnnxSession:
         stated = {name: [size for size in shape[1:] if size is not None] for name, shape in self.outputs}
         for name, sizes in stated.items():
             check_elements(f"{self.path.name}: output {name!r}", sizes)
-        complete = all(shape and len(stated[name]) == len(shape) - 1 for name, shape in self.outputs)
-        if complete and not self.open_ended:
+        # The first size is that of the batch.
+        all_stated = all(shape and None not in shape[1:] for _, shape in self.outputs)
+        if all_stated and not self.open_ended:
             return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
         width, height = size
         return self(torch.zeros(1, 3, height, width))

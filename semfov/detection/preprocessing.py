@@ -102,6 +102,13 @@ class Preprocessing:
 
 
 def check_bytes(canvas: Tensor) -> None:
-    """Raise `InputError` unless a canvas is `(B, 3, H, W)`, bytes."""
+    """Check a canvas of bytes.
+
+    Args:
+        canvas: `(B, 3, H, W)`, bytes.
+
+    Raises:
+        InputError: it has another shape or dtype.
+    """
     is_rgb_bytes = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
     check(is_rgb_bytes, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")

@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_onnx import OnnxTwin, network_digest, parameter_versions
 from semfov.detection.detector import Detector
-from semfov.detection.feature_maps import chosen, recorded
+from semfov.detection.feature_maps import choose_layers, record_maps
 from semfov.detection.scores import HALVES, Candidates
 from semfov.errors import check
 from semfov.sensor.lines import constant
@@ -79,11 +79,14 @@ def decode_yolo(
     cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
     sizes = tuple((width, height) for width, height in anchors)
     corner, step, halves = _cells((columns, rows), (canvas[0], canvas[1]), sizes, raw.dtype, raw.device)
-    centre = (cells[..., 0:2].sigmoid() * scale - (scale - 1) / 2 + corner) * step
+    shift = cells[..., 0:2].sigmoid() * scale - (scale - 1) / 2
+    centre = (shift + corner) * step
     half = cells[..., 2:4].exp() * halves
     boxes = torch.cat([centre - half, centre + half], -1)
     scores = cells[..., 4:].sigmoid()
-    return Candidates(boxes.reshape(batch, -1, 4), scores[..., 1:].flatten(1, 3), scores[..., 0].flatten(1))
+    objectness = scores[..., 0].flatten(1)
+    classes = scores[..., 1:].flatten(1, 3)
+    return Candidates(boxes.reshape(batch, -1, 4), classes, objectness)
 
 
 class YoloV3(Detector):
@@ -136,7 +139,7 @@ class YoloV3(Detector):
         named = self.network.landmarks()
         numbers = {**{str(number): number for number in range(len(self.network.layers))}, **named}
         wanted = [*named] if layers is None else layers
-        return self._compute(canvas, {layer: numbers[layer] for layer in chosen(wanted, [*numbers], self.name)})
+        return self._compute(canvas, {layer: numbers[layer] for layer in choose_layers(wanted, [*numbers], self.name)})
 
     def _compute(self, canvas: Tensor, layers: Mapping[str, int]) -> tuple[Candidates, dict[str, Tensor]]:
         """Compute all boxes of all heads, and the maps of layers by name, by the runtime that this canvas allows."""
@@ -145,7 +148,7 @@ class YoloV3(Detector):
         if twin is not None and self._choose_runtime(twin.obstacle_here(self.network, canvas)) == "onnxruntime":
             return twin(self.network, canvas, layers)
         modules = {layer: self.network.layers[number] for layer, number in layers.items()}
-        with recorded(modules) as maps_by_layer:
+        with record_maps(modules) as maps_by_layer:
             raw_maps = self.network(canvas.to(next(self.network.parameters()).dtype))
         size = (canvas.shape[-1], canvas.shape[-2])
         boxes = []

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import onnx_decoding as decoding
-from semfov.detection.onnx_heads import HEADS, Head, misplaced, recognise
+from semfov.detection.onnx_heads import HEADS, Head, explain_misplacement, recognise
 from semfov.detection.onnx_signature import Signature
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
@@ -270,17 +270,19 @@ def test_selected_outputs_are_one_hot_vectors():
     ],
 )
 def test_boxes_of_another_head_are_told_by_their_places(box, message):
-    found = misplaced(torch.tensor([[box]]), (64, 64))
+    found = explain_misplacement(torch.tensor([[box]]), (64, 64))
     assert found is None if message is None else re.search(message, found)
 
 
 def test_corners_that_were_read_as_centres_and_sizes_are_told():
     low, size = 64 * noise(1, 84, 2).sigmoid(), 20 * noise(1, 84, 2, seed=1).sigmoid()
     rows = torch.cat([low, low + size, noise(1, 84, 3).sigmoid()], -1)
-    assert misplaced(torch.cat([low, low + size], -1), (64, 64)) is None
-    assert "corners" in misplaced(decoding.decode_yolov8(rows.mT).boxes, (64, 64))
-    assert "comes first" in misplaced(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
-    assert misplaced(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
+    assert explain_misplacement(torch.cat([low, low + size], -1), (64, 64)) is None
+    assert "corners" in explain_misplacement(decoding.decode_yolov8(rows.mT).boxes, (64, 64))
+    assert "comes first" in explain_misplacement(torch.tensor([[[20.0, 20, 20, 20], [40, 40, 20, 20]]]), (64, 64))
+    assert (
+        explain_misplacement(torch.tensor([[[20.0, 20, 20, 20], [30, 30, 40, 40], [9, 9, 20, 20]]]), (64, 64)) is None
+    )
 
 
 def test_boxes_with_y_before_x_are_told():
@@ -289,8 +291,8 @@ def test_boxes_with_y_before_x_are_told():
         cells = torch.tensor(cell_list(canvas, (8, 16, 32)), dtype=torch.float32)
         middle = (cells[:, :2] + 0.5) * cells[:, 2:] + noise(len(cells), 2, dtype=torch.float32)
         boxes = torch.cat([middle - 9, middle + 9], -1)[None]
-        assert misplaced(boxes, canvas) is None
-        assert "y comes before x; export" in misplaced(boxes[..., [1, 0, 3, 2]], canvas)
+        assert explain_misplacement(boxes, canvas) is None
+        assert "y comes before x; export" in explain_misplacement(boxes[..., [1, 0, 3, 2]], canvas)
     wide = torch.tensor([[[200.0, 8.0, 220.0, 30.0], [150.0, 1.0, 170.0, 9.0]]])
-    assert misplaced(wide, (240, 32)) is None
-    assert "y comes before x" in misplaced(wide[..., [1, 0, 3, 2]], (240, 32))
+    assert explain_misplacement(wide, (240, 32)) is None
+    assert "y comes before x" in explain_misplacement(wide[..., [1, 0, 3, 2]], (240, 32))
