@@ -15,6 +15,7 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 import json
 import platform
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
@@ -22,7 +23,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
-from torch import Tensor
 
 from semfov.errors import check
 from semfov.fit.observation import count_misses, fit_published, statistics_of
@@ -117,15 +117,21 @@ class FitFomConfig(FitConfig):
         return self.sensor.level_edges(self.levels, self.width)
 
 
+_TRAINED = ("discriminative", "search")
+"""Methods that maximise the probability of the true class, from the published fit on."""
+
+_SEARCHED_CELLS = (10, 10)  # columns and rows of the searches that the fit through the belief learns from
+
+
 def _fitted_name(config: FitFomConfig) -> str:
-    """Name in tables of the model that is saved, or that the fit through the belief starts from."""
-    trained = config.method in ("discriminative", "search")
-    return "discriminative" if trained else f"Dirichlet, {config.method}"
+    """Return the name in tables of the model that is saved, or that the fit through the belief starts from."""
+    return "discriminative" if config.method in _TRAINED else f"Dirichlet, {config.method}"
 
 
 def _judgement(config: FitFomConfig, figures: dict[str, Calibration]) -> str:
     """Say whether the saved model is better than raw scores on held-out photographs."""
-    raw, fitted = figures["raw scores"], figures[_fitted_name(config)]
+    raw = figures["raw scores"]
+    fitted = figures[_fitted_name(config)]
     measured = f"Brier {fitted.brier:.3f} and NLL {fitted.nll:.3f}, raw scores {raw.brier:.3f} and {raw.nll:.3f}"
     if fitted.brier <= raw.brier and fitted.nll <= raw.nll:
         return f"The model is better than raw scores on held-out photographs: {measured}."
@@ -135,122 +141,133 @@ def _judgement(config: FitFomConfig, figures: dict[str, Calibration]) -> str:
     )
 
 
-def _report_markdown(
-    config: FitFomConfig,
-    model: FovealObservationModel,
-    figures: dict[str, Calibration],
-    likelihood: dict[str, float],
-    by_level: list[list[str]],
-    fitted: int,
-) -> str:
+class _Evaluation:
+    """Models on held-out samples.
+
+    Attributes:
+        model: the model that is saved, or that the fit through the belief starts from.
+        judged: M labelled detections.
+        predictions: posteriors of the class by the name of the model, `(M, K+1)`.
+        likelihood: mean log likelihood of the scores given the true class.
+        figures: measures of the posteriors.
+    """
+
+    def __init__(self, model: FovealObservationModel, models: _Models, judged: Samples) -> None:
+        self.model = model
+        self.judged = judged
+        labels = judged.labels[:, None]
+        with torch.inference_mode():
+            self.predictions = {name: other.calibrate(judged.scores, judged.distance) for name, other in models.items()}
+            self.likelihood = {
+                name: float(other.log_likelihood(judged.scores, judged.distance).gather(1, labels).mean())
+                for name, other in models.items()
+            }
+        self.figures = {name: calibration(posterior, judged.labels) for name, posterior in self.predictions.items()}
+
+    def model_rows(self) -> list[list[str]]:
+        """Make rows of a table of the measures of each model."""
+        rows = [["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]]
+        for name, figures in self.figures.items():
+            measures = (figures.nll, figures.brier, figures.ece)
+            rows.append(
+                [
+                    name,
+                    f"{self.likelihood[name]:.2f}",
+                    *(f"{measure:.3f}" for measure in measures),
+                    f"{figures.classwise_ece:.4f}",
+                    f"{figures.accuracy:.3f}",
+                ]
+            )
+        return rows
+
+    def level_rows(self, axis: str) -> list[list[str]]:
+        """Make rows of a table of counts and measures at each level."""
+        counts = torch.tensor(self.model.metadata["counts"])
+        borders = ["0", *(f"{edge:.3f}" for edge in self.model.edges.tolist()), "…"]
+        rows = [[axis, "background", "objects", "with levels", "NLL, raw", "NLL", "ECE, raw", "ECE"]]
+        for level, (low, high) in enumerate(pairwise(borders)):
+            background = int(counts[0, level])
+            objects = int(counts[1:, level].sum())
+            levels = self._levels_together(level)
+            rows.append([f"{low} - {high}", str(background), str(objects), levels, *self._figures_at(level)])
+        return rows
+
+    def _levels_together(self, level: int) -> str:
+        """The first and the last of the levels that a level is fitted with; empty where it is fitted alone."""
+        pooled = self.model.metadata["pooled"]
+        if str(level) not in pooled:
+            return ""
+        levels = pooled[str(level)]
+        return f"{levels[0]} to {levels[-1]}"
+
+    def _figures_at(self, level: int) -> list[str]:
+        """NLL and ECE of raw scores and of the fitted model at a level, as cells of a table."""
+        is_at_level = self.model.level(self.judged.distance) == level
+        if not is_at_level.any():
+            return [""] * 4
+        first, *_, last = self.predictions.values()
+        labels = self.judged.labels[is_at_level]
+        raw = calibration(first[is_at_level], labels)
+        fitted = calibration(last[is_at_level], labels)
+        return [f"{value:.3f}" for value in (raw.nll, fitted.nll, raw.ece, fitted.ece)]
+
+
+def _report_markdown(config: FitFomConfig, evaluation: _Evaluation) -> str:
     """Write the report as Markdown: the measures of each model, then counts and measures by level."""
-    judged = next(iter(figures.values())).count
-    head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
-    rows = [
-        [name, f"{likelihood[name]:.2f}", *(f"{value:.3f}" for value in (f.nll, f.brier, f.ece)),
-         f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
-        for name, f in figures.items()
-    ]  # fmt: skip
-    summary = table([head, *rows])
-    counts = torch.tensor(model.metadata["counts"])
-    pooled = model.metadata["pooled"]
-    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
-    levels = [
-        [
-            f"{low} - {high}",
-            str(int(counts[0, n])),
-            str(int(counts[1:, n].sum())),
-            "{} to {}".format(*[pooled[str(n)][end] for end in (0, -1)]) if str(n) in pooled else "",
-            *by_level[n],
-        ]
-        for n, (low, high) in enumerate(pairwise(edges))
-    ]
-    axis = "reduction in octaves" if config.mosaics else "distance"
-    where = (
-        "the number of octaves by which the picture is reduced"
-        if config.mosaics
-        else "distance to the fixation in units of the image's longer side"
-    )
-    head = [axis, "background", "objects", "with levels", "NLL, raw", "NLL", "ECE, raw", "ECE"]
+    if config.mosaics:
+        axis = "reduction in octaves"
+        words = "the number of octaves by which the picture is reduced"
+    else:
+        axis = "distance"
+        words = "distance to the fixation in units of the image's longer side"
     return "\n".join(
         [
-            f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
-            f"{config.holdout}). The log likelihood is that of the scores given the true class. The other measures are "
-            "of the posterior of the class, background included.",
+            f"Fitted on {evaluation.model.metadata['samples']} detections, evaluated on {len(evaluation.judged)} "
+            f"detections in held-out photographs (one in {config.holdout}). The log likelihood is that of the scores "
+            "given the true class. The other measures are of the posterior of the class, background included.",
             "",
-            *summary,
+            *table(evaluation.model_rows()),
             "",
-            _judgement(config, figures),
+            _judgement(config, evaluation.figures),
             "",
-            f"Number of detections in the fit, by {where}. Levels with too few objects are fitted with their "
+            f"Number of detections in the fit, by {words}. Levels with too few objects are fitted with their "
             "neighbours. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
             "",
-            *table([head, *levels]),
+            *table(evaluation.level_rows(axis)),
             "",
         ]
     )
 
 
-def _figures_by_level(
-    model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples
-) -> list[list[str]]:
-    """Compute NLL and ECE of raw scores and of the fitted model at each level; predictions `(M, K+1)`."""
-    first, *_, last = predictions.values()
-    level = model.level(judged.distance)
-    rows = []
-    for n in range(len(model.edges) + 1):
-        here = level == n
-        if not here.any():
-            rows.append([""] * 4)
-            continue
-        raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
-        rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
-    return rows
-
-
-def _write_report(
-    config: FitFomConfig,
-    model: FovealObservationModel,
-    models: _Models,
-    judged: Samples,
-    landing: str,
-) -> list[Path]:
-    """Evaluate the models (the fitted one last) on held-out samples, print the tables, and write all files."""
-    with torch.inference_mode():
-        predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
-        likelihood = {
-            name: float(m.log_likelihood(judged.scores, judged.distance).gather(1, judged.labels[:, None]).mean())
-            for name, m in models.items()
-        }
-    figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
-    by_level = _figures_by_level(model, predictions, judged)
-    text = landing + _report_markdown(config, model, figures, likelihood, by_level, model.metadata["samples"])
+def _write_report(config: FitFomConfig, evaluation: _Evaluation, landing: str) -> list[Path]:
+    """Print the report, and write it with counts, settings, measures and a reliability diagram; returns the files."""
+    model = evaluation.model
+    text = landing + _report_markdown(config, evaluation)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
-    metadata = {key: value for key, value in model.metadata.items() if key != "counts"}
-    write_text(
-        config.out / "manifest.json",
-        json.dumps(
-            {
-                "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
-                "commit": commit(),
-                "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
-                "model": metadata,
-                "held_out": {name: asdict(figure) for name, figure in figures.items()},
-            },
-            indent=2,
-        )
-        + "\n",
-    )
-    last = list(models)[-1]
+    write_text(config.out / "manifest.json", json.dumps(_manifest(evaluation), indent=2) + "\n")
     classes = ("background", *model.classes)
     counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
-    head = ["class", *(f"level {n}" for n in range(len(model.edges) + 1))]
+    head = ["class", *(f"level {level}" for level in range(len(model.edges) + 1))]
     write_text(config.out / "counts.csv", csv_text([head, *counts]))
-    figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
+    last = list(evaluation.predictions)[-1]
+    compared = {name: (evaluation.predictions[name], evaluation.judged.labels) for name in ("raw scores", last)}
+    figure = save_figure(plot_reliability(compared), config.out / "reliability.png")
     names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
-    return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
+    return [*(config.out / name for name in names), figure]
+
+
+def _manifest(evaluation: _Evaluation) -> dict[str, object]:
+    """Describe the run: the command, the versions, and the model with its measures."""
+    metadata = evaluation.model.metadata
+    return {
+        "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
+        "commit": commit(),
+        "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
+        "model": {name: value for name, value in metadata.items() if name != "counts"},
+        "held_out": {name: asdict(figures) for name, figures in evaluation.figures.items()},
+    }
 
 
 def _fit_to_search(
@@ -259,60 +276,85 @@ def _fit_to_search(
     """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
     searches: dict[int, SearchedLooks] = {}
     for shard in sampler.by_shard():
-        searches |= searched_looks(sampler.scenes, shard, (10, 10), config.max_target_area)
-    fitted = [each for index, each in searches.items() if index % config.holdout]
-    judged = [each for index, each in searches.items() if index % config.holdout == 0]
+        searches |= searched_looks(sampler.scenes, shard, _SEARCHED_CELLS, config.max_target_area)
+    training = [looks for index, looks in searches.items() if index % config.holdout]
+    judged = [looks for index, looks in searches.items() if index % config.holdout == 0]
     options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}
-    better = fit_through_belief(model, fitted, **options, search={**options, "photographs": len(fitted)})
+    fitted = fit_through_belief(model, training, **options, search={**options, "photographs": len(training)})
     if not judged:
-        return better, ""
-    losses = [mean_landing_loss(each, judged, config.looks) for each in (starting_model(model), better)]
-    return better, (
+        return fitted, ""
+    before = mean_landing_loss(starting_model(model), judged, config.looks)
+    after = mean_landing_loss(fitted, judged, config.looks)
+    return fitted, (
         f"Searches of {len(judged)} held-out photographs: the negative log of the target's share of the belief in "
-        f"cells not fixated yet is {losses[1]:.3f} on average, before the fit through the belief {losses[0]:.3f}.\n\n"
+        f"cells not fixated yet is {after:.3f} on average, before the fit through the belief {before:.3f}.\n\n"
     )
 
 
 def fit_fom(config: FitFomConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     check(not (config.mosaics and config.method == "search"), "method", "another one with mosaics", config.method)
-    folder, kind = (config.cache or config.out) / "samples", MosaicSampler if config.mosaics else Sampler
-    sampler = collect_samples(config, folder, "looking", kind)
+    kind = MosaicSampler if config.mosaics else Sampler
+    sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking", kind)
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
+    published = _published_fit(config, sampler)
+    model = _fit_model(config, samples[~held_out], published)
+    misses = _count_misses(config, sampler, model)
+    model.miss_rate = misses.rates().to(model.edges)
+    if config.mosaics:
+        model.metadata["cells"] = misses.total.sum(1).tolist()
+    saved = model
+    landing = ""
+    if config.method == "search":
+        saved, landing = _fit_to_search(config, sampler, model)
+    path = model_path(config, sampler.eye.detector.name)
+    saved.save(path)
+    models = _compared_models(config, published, model)
+    written = _write_report(config, _Evaluation(model, models, samples[held_out]), landing)
+    print("written:", *(f"  {file}" for file in [path, *written]), sep="\n")
+
+
+def _published_fit(config: FitFomConfig, sampler: Sampler) -> Callable[..., FovealObservationModel]:
+    """Return the published fit to all detections in photographs that are not held out; its options are to be given."""
     training = (shard[shard.scene % config.holdout != 0] for shard in sampler.by_shard())
-    edges, classes = config.edges, sampler.eye.detector.classes
-    statistics = statistics_of(edges, classes, training)
-    noted = {name: getattr(config, name) for name in ("minimum", "shrinkage", "enough", "fixations", "seed")}
-    published = partial(fit_published, sampler.eye, sampler.scenes, statistics, edges, **noted)
-    if config.method in ("discriminative", "search"):
-        fitted, start = samples[~held_out], published(expected="empirical")
-        model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
-    else:
-        model = published(method=config.method)
+    statistics = statistics_of(config.edges, sampler.eye.detector.classes, training)
+    options = {name: getattr(config, name) for name in ("minimum", "shrinkage", "enough", "fixations", "seed")}
+    return partial(fit_published, sampler.eye, sampler.scenes, statistics, config.edges, **options)
+
+
+def _fit_model(
+    config: FitFomConfig, training: Samples, published: Callable[..., FovealObservationModel]
+) -> FovealObservationModel:
+    """Fit the model by the method of the settings."""
+    if config.method not in _TRAINED:
+        return published(method=config.method)
+    start = published(expected="empirical")
+    return fit_discriminative(start, training.scores, training.distance, training.labels)
+
+
+def _count_misses(config: FitFomConfig, sampler: Sampler, model: FovealObservationModel) -> MissCounts:
+    """Count cells without any detection in photographs that are not held out."""
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     counts = (
         count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
     )
-    misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
-    model.miss_rate = misses.rates().to(model.edges)
-    if config.mosaics:
-        model.metadata["cells"] = misses.total.sum(1).tolist()
-    saved, landing = _fit_to_search(config, sampler, model) if config.method == "search" else (model, "")
-    path = model_path(config, sampler.eye.detector.name)
-    saved.save(path)
-    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
+    return MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
+
+
+def _compared_models(
+    config: FitFomConfig, published: Callable[..., FovealObservationModel], model: FovealObservationModel
+) -> _Models:
+    """Return the models in the report: raw scores first, and the discriminative one last."""
+    models = {"raw scores": FovealObservationModel.identity(model.classes, config.edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
         models[f"Dirichlet, {method}"] = published(method=method)
     models["Dirichlet with class prior"] = published(prior=True)
     models["the same, tempered 0.1"] = published(prior=True, tempering=0.1)
-    if config.method in ("discriminative", "search"):
+    if config.method in _TRAINED:
         models["discriminative"] = model
-    written = _write_report(config, model, models, samples[held_out], landing)
-    print("written:")
-    for file in [path, *written]:
-        print(f"  {file}")
+    return models
 
 
 main = command(fit_fom, FitFomConfig, __doc__)

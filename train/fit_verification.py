@@ -21,7 +21,8 @@ from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
 from semfov.fit.searches import open_photographs
 from semfov.fit.training import training_of
-from semfov.fit.verification import VerificationConfig, fit_in_folds, verification_report
+from semfov.fit.verification import VerificationConfig, fit_in_folds
+from semfov.fit.verification_report import verification_report
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
@@ -66,12 +67,12 @@ def fit_verification(config: FitVerificationConfig) -> None:
     folder, components = store_folder(config.cache) / "searches", len(eye.detector.classes) + 1
     store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
     photographs = open_photographs(eye, scenes, chosen, config, store=store)
-    model, folds, closer, searches = fit_in_folds(photographs, evidence, config)
-    model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
+    fitted = fit_in_folds(photographs, evidence, config)
+    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
-    model.save(path)
-    text, figures = verification_report(model, folds, closer, searches, f"{len(photographs)} photographs")
-    write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)
+    fitted.model.save(path)
+    report = verification_report(fitted, f"{len(photographs)} photographs")
+    write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)
 
 
 main = command(fit_verification, FitVerificationConfig, __doc__)

@@ -13,10 +13,12 @@ continue.
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import get_args
 
 import torch
+from torch import Tensor
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
@@ -50,96 +52,161 @@ _JUDGED = ("judged", "judged far", "judged crowded")
 
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
-    fit = PicturesFit(config)
-    lines, figures = list[str](), "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
-    looked: list[str] = ["near", "far", "judged"] * bool(refit & {"presence", "survey"})
-    looked += ["crowded", "judged crowded"] * ("survey" in refit)
-    looked += [*config.kinds] * ("presence" in refit)
-    looked += [f"judged {kind}" for kind in PICTURE_KINDS] * ("presence" in refit and config.evidence is not None)
-    examples = fit.look(looked)
-    if config.evidence is None:
-        model = fit.closer(examples)
-        text, figures = judge_windows(model, examples["judged"])
-        tried = choose_patience(model, fit)
-        lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
-    else:
-        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
-        model.check_compatible(fit.eye.settings())
-        if "presence" in refit:
-            lines += _fit_further(config, model, examples)
-    if "survey" in refit:
-        fit.survey(model, examples)
-        held = {"": examples["judged"], ", crowded": examples["judged crowded"]}
-        measured = {
-            name: value for each in held for name, value in judge_survey(model.survey, held[each], each).items()
-        }
-        figures = json.dumps({**json.loads(figures), **measured}, indent=1)
-        tried = choose_foresight(model, fit, _JUDGED)
-        chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
-        rows = ([name, f"{value:.4f}"] for name, value in measured.items())
-        lines += [*table([["measure", "value"], *rows]), "", chosen, "", *table(tried), ""]
-    if "decision" in refit:
-        lines += fit.decisions(model)
+    fit = PicturesFit(config)
+    parts: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
+    examples = fit.look(_looked_at(config, parts))
+    report = _Report()
+    model = _start(config, fit, parts, examples, report)
+    if "survey" in parts:
+        _fit_survey(fit, model, examples, report)
+    if "decision" in parts:
+        report.lines += fit.fit_decisions(model)
         # A verification belongs to the probability that it was fitted with.
         model.verification = None
         model.metadata.pop("verification", None)
-    if "verification" in refit:
+    if "verification" in parts:
         check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
-        lines += fit.verification(model)
-    if "certainty" in refit:
-        lines += fit.certainty(model)
-    elif "spread" in refit:
+        report.lines += fit.fit_verification(model)
+    if "certainty" in parts:
+        report.lines += fit.fit_certainty(model)
+    elif "spread" in parts:
         check(model.certainty is not None, "evidence", "a model whose certainty was fitted", config.evidence)
         prepare_worker()
-        lines += spread_again(model, explorations_of_kinds(model, fit.explored()[0], config.passes), config.passes)
-    if "photograph" in refit and config.photographs:
+        fitted, _ = fit.explored_pictures()
+        report.lines += spread_again(model, explorations_of_kinds(model, fitted, config.passes), config.passes)
+    if "photograph" in parts and config.photographs:
         scenes = make_scenes(config.data, fit.eye.detector.classes)
-        lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
+        report.lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
     settings = training_of(config, fit.mosaics["near"])["training"]
-    model.metadata |= {part: settings for part in refit if part != "photograph"}
+    model.metadata |= {part: settings for part in parts if part != "photograph"}
     path = inside(config.out, f"{fit.eye.detector.name}.safetensors")
     model.save(path)
-    write_outputs(config, "\n".join(lines), ("figures.json", figures), path)
+    write_outputs(config, "\n".join(report.lines), ("figures.json", report.figures), path)
+
+
+@dataclass
+class _Report:
+    """The report of a fit, as far as it is written.
+
+    Attributes:
+        lines: lines of Markdown.
+        figures: the measures as JSON.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    figures: str = "{}"
+
+
+def _looked_at(config: FitZoomConfig, parts: Collection[RefitPart]) -> list[str]:
+    """List the kinds of pictures that must be looked at to fit some parts."""
+    kinds: list[str] = []
+    if "presence" in parts or "survey" in parts:
+        kinds += ["near", "far", "judged"]
+    if "survey" in parts:
+        kinds += ["crowded", "judged crowded"]
+    if "presence" in parts:
+        kinds += config.kinds
+    if "presence" in parts and config.evidence is not None:
+        kinds += [f"judged {kind}" for kind in PICTURE_KINDS]
+    return kinds
+
+
+def _start(
+    config: FitZoomConfig,
+    fit: PicturesFit,
+    parts: Collection[RefitPart],
+    examples: Mapping[str, list[ZoomExample]],
+    report: _Report,
+) -> GlimpseEvidence:
+    """Fit the prediction of closer looks, or read a model that was fitted before and fit it further."""
+    if config.evidence is None:
+        model = fit.fit_prediction(examples)
+        text, report.figures = judge_windows(model, examples["judged"])
+        tried = choose_patience(model, fit)
+        report.lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
+        return model
+    model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
+    model.check_compatible(fit.eye.settings())
+    if "presence" in parts:
+        report.lines += _fit_further(config, model, examples)
+    return model
+
+
+def _fit_survey(
+    fit: PicturesFit, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]], report: _Report
+) -> None:
+    """Fit the numbers of objects of any class, evaluate them, and choose the foresight of the search."""
+    fit.fit_survey(model, examples)
+    measures = judge_survey(model.survey, examples["judged"])
+    measures |= judge_survey(model.survey, examples["judged crowded"], ", crowded")
+    report.figures = json.dumps({**json.loads(report.figures), **measures}, indent=1)
+    tried = choose_foresight(model, fit, _JUDGED)
+    rows = [["measure", "value"], *([name, f"{value:.4f}"] for name, value in measures.items())]
+    report.lines += [
+        *table(rows),
+        "",
+        f"Foresight chosen for finding all objects: {model.survey.foresight:g}.",
+        "",
+        *table(tried),
+        "",
+    ]
 
 
 @torch.no_grad()
 def judge_survey(survey: Survey, examples: Sequence[ZoomExample], where: str = "") -> dict[str, float]:
-    """Mean loss on mosaics that were held out, by the overview and by closer looks."""
+    """Average the losses on mosaics that were held out, by the overview and by closer looks.
+
+    Args:
+        survey: predicts the numbers of objects of any class.
+        examples: the mosaics.
+        where: what is added to the names of the measures.
+
+    Returns:
+        The measures by name.
+    """
     name = "objects of any class, mean negative log likelihood"
-    first, later = [], []
+    of_overviews = []
+    of_closer_looks = []
     for example in map(SurveyExample.of, examples):
         overview, *closer = example.losses(survey, example.closer)
-        first.append(overview)
-        later += closer
-    figures = {f"{name}, overview{where}": float(torch.stack(first).mean())}
-    if later:
-        figures[f"{name}, closer looks{where}"] = float(torch.stack(later).mean())
+        of_overviews.append(overview)
+        of_closer_looks += closer
+    figures = {f"{name}, overview{where}": float(torch.stack(of_overviews).mean())}
+    if of_closer_looks:
+        figures[f"{name}, closer looks{where}"] = float(torch.stack(of_closer_looks).mean())
     return figures
 
 
 def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
     """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
     torch.manual_seed(config.seed)
-    judged = {kind: pair_windows(some) for kind, some in examples.items() if some and kind.startswith("judged")}
+    judged = {
+        kind: pair_windows(of_kind) for kind, of_kind in examples.items() if of_kind and kind.startswith("judged")
+    }
     before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
-    looks = [each for kind in ("near", "far", *config.kinds) for each in examples[kind]]
-    fit_presence(model.requires_grad_(True), pair_windows(looks), config.steps, rate=_FURTHER)
+    training = [example for kind in ("near", "far", *config.kinds) for example in examples[kind]]
+    fit_presence(model.requires_grad_(True), pair_windows(training), config.steps, rate=_FURTHER)
     model.requires_grad_(False)
     rows = [["", "overview, before", "after", "closer looks, before", "after"]]
     for kind, windows in judged.items():
-        pairs = zip(before[kind], _cross_entropies(model, windows), strict=True)
-        rows.append([kind, *(f"{each:.4f}" for pair in pairs for each in pair)])
+        overview_before, closer_before = before[kind]
+        overview, closer = _cross_entropies(model, windows)
+        values = (overview_before, overview, closer_before, closer)
+        rows.append([kind, *(f"{value:.4f}" for value in values)])
     return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
 
 
 @torch.no_grad()
 def _cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
-    """The cross-entropy of whether a closer look shows a class, by overviews and by closer looks (NaN without any)."""
-    rows = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    first, later = (float(presence_loss(model, windows, some)) if len(some) else float("nan") for some in rows)
-    return first, later
+    """Compute the cross-entropy of whether a closer look shows a class, by overviews and by closer looks, or NaN."""
+    overview = _mean_loss(model, windows, windows.of_overviews)
+    return overview, _mean_loss(model, windows, windows.of_closer_looks)
+
+
+def _mean_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> float:
+    """Average the loss over some pairs, by number `(n,)`; NaN without any."""
+    return float(presence_loss(model, windows, rows)) if len(rows) else float("nan")
 
 
 main = command(fit_zoom, FitZoomConfig, __doc__)

@@ -5,7 +5,7 @@ from itertools import chain, islice
 
 import torch
 
-from semfov.data.scene import Annotation
+from semfov.data.mosaics import Mosaics
 from semfov.fit.windows import MosaicFit
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
@@ -24,23 +24,30 @@ def choose_foresight(model: GlimpseEvidence, fit: MosaicFit, kinds: Sequence[str
 
     The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of mosaics
     differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
+
+    Args:
+        model: evidence by magnification, with a survey.
+        fit: the mosaics and their looks.
+        kinds: kinds of mosaics.
+
+    Returns:
+        Rows of a table of the recalls.
     """
-    chosen, opened = [fit.mosaics[kind] for kind in kinds], [fit.opened(kind) for kind in kinds]
-    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in chosen]
-    rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
+    opened = {kind: fit.opened(kind) for kind in kinds}
+    rows = [["foresight", *(f"recall, {kind}" for kind in kinds)]]
     recalls: dict[float, list[float]] = {}
     for value in track(_FORESIGHTS, "choosing foresight", "value"):
         model.survey.foresight = value
-        recalls[value] = [
-            _mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
-            for looks, annotations, mosaics in zip(opened, objects, chosen, strict=True)
-        ]
+        recalls[value] = [_mean_recall(model, looks, fit.mosaics[kind]) for kind, looks in opened.items()]
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
-        for source in chain.from_iterable(opened):
-            source.save()
-    most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
-    share = {value: sum(r / m for r, m in zip(by_kind, most, strict=True)) for value, by_kind in recalls.items()}
-    model.survey.foresight = max(share, key=share.__getitem__)
+        for looks in chain.from_iterable(opened.values()):
+            looks.save()
+    highest = [max(*of_kind, 1e-9) for of_kind in zip(*recalls.values(), strict=True)]
+    shares = {
+        value: sum(recall / high for recall, high in zip(by_kind, highest, strict=True))
+        for value, by_kind in recalls.items()
+    }
+    model.survey.foresight = max(shares, key=shares.__getitem__)
     return rows
 
 
@@ -49,46 +56,59 @@ def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
     """Set `patience` to the value with which a class is found soonest.
 
     The measure is the mean number of passes until a look at a photograph that shows the class.
+
+    Args:
+        model: evidence by magnification.
+        fit: the mosaics and their looks.
+
+    Returns:
+        Rows of a table of the numbers of passes.
     """
-    near, opened = fit.mosaics["judged"], fit.opened("judged")
-    slots = [[Window.around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
+    mosaics = fit.mosaics["judged"]
+    opened = fit.opened("judged")
+    slots = [
+        [Window.around(looks.lattice, tile.slot) for tile in mosaics.tiles(index)] for index, looks in enumerate(opened)
+    ]
     passes: dict[float, float] = {}
     for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value
         passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.least)
-        for source in opened:
-            source.save()
+        for looks in opened:
+            looks.save()
     model.patience = min(passes, key=passes.__getitem__)
-    return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
+    rows = [[f"{value:g}", f"{number:.3f}"] for value, number in passes.items()]
+    return [["patience", "passes to the first hit"], *rows]
 
 
-def _mean_recall(
-    model: GlimpseEvidence, sources: Sequence[WindowLooks], objects: Sequence[Annotation], passes: int
-) -> float:
+def _mean_recall(model: GlimpseEvidence, opened: Sequence[WindowLooks], mosaics: Mosaics) -> float:
     """Compute the mean recall over passes of an exploration that looks for all objects."""
-    total = 0
-    for looks, annotation in zip(sources, objects, strict=True):
+    passes = len(mosaics.tiles(0)) + 1
+    found = 0
+    objects = 0
+    for index, looks in enumerate(opened):
+        annotation = mosaics.annotation(index)
+        objects += len(annotation.boxes)
         history: list[WindowLook] = []
-        path = find_everything(looks, model)
+        steps = find_everything(looks, model)
         count = 0
         for _ in range(passes):
-            step = next(path, None)
+            step = next(steps, None)
             if step is not None:
                 history.append(step.look)
                 count = int(found_in(history, annotation).sum())
             # When no window is left, the number of found objects stays the same for the remaining passes.
-            total += count
-    return total / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
+            found += count
+    return found / max(passes * objects, 1)
 
 
 def _mean_passes(
-    model: GlimpseEvidence, sources: Sequence[WindowLooks], slots: Sequence[Sequence[Window]], least: float
+    model: GlimpseEvidence, opened: Sequence[WindowLooks], slots: Sequence[Sequence[Window]], least: float
 ) -> float:
     """Compute the mean number of passes until a look at a photograph that shows the target."""
     counts = []
-    for looks, photographs in zip(sources, slots, strict=True):
-        presence = torch.stack([look.show for look in looks.see(photographs)]) >= least
-        for target in (presence.any(0).nonzero()[:, 0] + 1).tolist():
-            path = look_for_slice(looks, model, target, photographs, least)
-            counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
+    for looks, photographs in zip(opened, slots, strict=True):
+        shows = torch.stack([look.show for look in looks.see(photographs)]) >= least
+        for target in (shows.any(0).nonzero()[:, 0] + 1).tolist():
+            steps = look_for_slice(looks, model, target, photographs, least)
+            counts.append(sum(1 for _ in islice(steps, len(photographs) + 1)))
     return sum(counts) / max(len(counts), 1)

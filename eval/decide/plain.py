@@ -12,7 +12,7 @@ from semfov.belief.verification import closer_features
 from semfov.decision import SAME, cell_of
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
-from semfov.fit.windows_certainty import logistic_regression
+from semfov.fit.logistic import logistic_regression
 from semfov.observation.matching import box_iou
 from semfov.runs.results import ResultRecord
 

@@ -1,6 +1,7 @@
 """What the reports of fitted models have in common: words, tables and plots."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,13 @@ from semfov.runs.tables import percent, plus_minus, table
 
 
 class Difference(NamedTuple):
-    """The difference between a measure with fitted models and with raw scores, paired over photographs."""
+    """The difference between a measure with fitted models and with raw scores, paired over photographs.
+
+    Attributes:
+        mean: mean of the paired differences; positive where the fitted models are better.
+        error: its standard error.
+        photographs: number of photographs.
+    """
 
     mean: float
     error: float
@@ -29,9 +36,11 @@ class Difference(NamedTuple):
         return math.isfinite(self.error) and self.mean > 0 and self.mean > self.error
 
     def in_words(self, unit: str, scale: float = 1.0) -> str:
-        """The difference times `scale`, with its unit, its standard error and its number of photographs."""
-        shown = plus_minus(scale * self.mean, scale * self.error, 1 if scale > 1 else 3, sign="+")
-        return f"{shown} {unit} on {self.photographs} held-out photograph{'s' if self.photographs != 1 else ''}"
+        """Write the difference times `scale`, with its unit, its standard error and its number of photographs."""
+        digits = 1 if scale > 1 else 3
+        difference = plus_minus(scale * self.mean, scale * self.error, digits, sign="+")
+        plural = "s" if self.photographs != 1 else ""
+        return f"{difference} {unit} on {self.photographs} held-out photograph{plural}"
 
 
 def mean_percent(values: FloatArray) -> str:
@@ -41,16 +50,32 @@ def mean_percent(values: FloatArray) -> str:
 
 def section(text: str, rows: list[list[str]]) -> str:
     """Return a paragraph of Markdown, followed by a table if there are rows."""
-    return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
+    if not rows:
+        return f"{text}\n"
+    return "\n".join([text, "", *table(rows), ""])
 
 
-def curves_figure(curves: dict[str, FloatArray], task: Task) -> Any:
+def curves_table(head: list[str], curves: Mapping[str, FloatArray], numbers: Sequence[int]) -> list[list[str]]:
+    """Make rows of the means of curves over photographs, in percent with their standard errors.
+
+    Args:
+        head: the first row.
+        curves: `(P, shifts+1)` by name.
+        numbers: the columns of a curve to show.
+
+    Returns:
+        The head, and a row for each curve.
+    """
+    return [head, *([name, *(mean_percent(curve[:, n]) for n in numbers)] for name, curve in curves.items())]
+
+
+def curves_figure(curves: Mapping[str, FloatArray], task: Task) -> Any:
     """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
     from semfov.viz import plot_curves
 
     means = {name: curve.mean(0) for name, curve in curves.items()}
     errors = {name: standard_error(curve) for name, curve in curves.items()}
     title = f"Held-out photographs ({len(curves['raw'])})"
-    searched = task == "search"
-    label, most = ("targets found (%)", 102) if searched else ("cells with the right class (%)", None)
-    return plot_curves(means, errors, label=label, title=title, most=most)
+    if task == "search":
+        return plot_curves(means, errors, label="targets found (%)", title=title, most=102)
+    return plot_curves(means, errors, label="cells with the right class (%)", title=title, most=None)

@@ -16,6 +16,8 @@ from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, 
 
 _EVENTS = 12  # fixations of a picture in a pass of the fit of oculomotor biases
 _SCORED = 40  # fixations of a picture on which conditional densities are scored, drawn at random
+_STANDARDISED = 60  # pictures of a group from which the means of channels are taken, about
+_EVERY = 2  # the fit of oculomotor biases computes every second row and column of cells
 
 _MapsOfPicture = Tensor | Callable[[Events], Tensor]
 """Map of a picture, `(1, rows, columns)`, one for each person, or what gives one for each event."""
@@ -50,13 +52,23 @@ class GazeFit(Settings):
 
 
 def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, title: str) -> FixationDensity:
-    """Fit a model to some pictures of each group, with progress bars."""
+    """Fit a model to some pictures of each group, with progress bars.
+
+    Args:
+        fit: settings of the fit.
+        groups: pictures of one size each, with everybody's scanpaths.
+        pictures: numbers of the pictures of each group to fit to.
+        title: what is fitted to, for the progress bars.
+
+    Returns:
+        The model, whose parameters need no gradient.
+    """
     torch.manual_seed(fit.seed)
-    channels = {name: each.shape[1] for name, each in groups[0].features.maps.items()}
+    channels = {name: maps.shape[1] for name, maps in groups[0].features.maps.items()}
     centre = log_centre(groups, pictures)
     model = FixationDensity(channels, readouts=fit.readouts, units=fit.units, centre=centre)
     _fit_map(model, groups, pictures, fit, f"map, {title}")
-    maps = [maps_of(model, group, some) for group, some in zip(groups, pictures, strict=True)]
+    maps = [maps_of(model, group, numbers) for group, numbers in zip(groups, pictures, strict=True)]
     fit_oculomotor(model, groups, maps, pictures, fit, title=f"saccades, {title}")
     return model.requires_grad_(False)
 
@@ -66,60 +78,67 @@ def _fit_map(
 ) -> None:
     """Fit map and weight of the centre bias to fixations; each readout has its likelihood and reads random channels."""
     generator = torch.Generator().manual_seed(fit.seed)
-    scale, batches = _standardise(model, groups, pictures), _batches(pictures, fit.batch, generator)
-    parts = model.out.shape[0]
+    scale = _standardise(model, groups, pictures)
+    batches = _batches(pictures, fit.batch, generator)
+    readouts, units = model.out.shape[:2]
 
     def loss_of(_: int) -> Tensor:
-        number, some = next(batches)
+        number, batch = next(batches)
         group = groups[number]
-        kept = torch.rand(parts, 1, model.read.shape[1], generator=generator) >= fit.dropout
-        mask = (kept / (1 - fit.dropout)).expand(-1, model.out.shape[1], -1).flatten(0, 1) / scale
-        values = blurred(model.readouts(group.some(some), group.size, model.read * mask), model.blur.exp())
-        values = values + model.centre_bias(group.size)
-        log = values - values.flatten(2).logsumexp(2)[..., None, None]
-        seen = group.counts[torch.as_tensor(some)]
+        is_read = torch.rand(readouts, 1, model.read.shape[1], generator=generator) >= fit.dropout
+        mask = (is_read / (1 - fit.dropout)).expand(-1, units, -1).flatten(0, 1) / scale
+        maps = blurred(model.readouts(group.some(batch), group.size, model.read * mask), model.blur.exp())
+        values = maps + model.centre_bias(group.size)
+        log_density = values - values.flatten(2).logsumexp(2)[..., None, None]
+        counts = group.counts[torch.as_tensor(batch)]
         # All pictures count alike.
-        return -((log * seen[:, None]).sum((2, 3)).mean(1) / seen.sum((1, 2)).clamp(min=1)).mean()
+        likelihood = (log_density * counts[:, None]).sum((2, 3)).mean(1) / counts.sum((1, 2)).clamp(min=1)
+        return -likelihood.mean()
 
     # Only weights of channels decay.
-    own = [
-        {"params": each, "weight_decay": fit.decay * (name in ("read", "mix", "out"))}
-        for name, each in model.named_parameters()
+    parameters = [
+        {"params": parameter, "weight_decay": fit.decay * (name in ("read", "mix", "out"))}
+        for name, parameter in model.named_parameters()
     ]
     model.train()
-    descend(own, loss_of, fit.epochs * _steps(pictures, fit.batch), fit.rate, clip=5.0, rise=0.1, title=title)
+    steps = fit.epochs * _steps(pictures, fit.batch)
+    descend(parameters, loss_of, steps, fit.rate, clip=5.0, rise=0.1, title=title)
     with torch.no_grad():
+        # From now on the model reads channels as they are.
         model.read.div_(scale)
     model.eval()
 
 
 def _steps(pictures: _Pictures, batch: int) -> int:
     """Number of batches of pictures in an epoch."""
-    return sum(-(-len(some) // batch) for some in pictures)
+    return sum(-(-len(numbers) // batch) for numbers in pictures)
 
 
 def _batches(pictures: _Pictures, batch: int, generator: torch.Generator) -> Iterator[tuple[int, list[int]]]:
     """Random batches of pictures of one group, with its number, in random order, epoch after epoch."""
     while True:
-        batches = list[tuple[int, list[int]]]()
-        for group, some in enumerate(pictures):
-            order = [some[int(place)] for place in torch.randperm(len(some), generator=generator)]
+        batches: list[tuple[int, list[int]]] = []
+        for group, numbers in enumerate(pictures):
+            order = [numbers[int(place)] for place in torch.randperm(len(numbers), generator=generator)]
             batches += [(group, order[start : start + batch]) for start in range(0, len(order), batch)]
-        yield from (batches[place] for place in torch.randperm(len(batches), generator=generator).tolist())
+        for place in torch.randperm(len(batches), generator=generator).tolist():
+            yield batches[place]
 
 
 def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures) -> Tensor:
-    """Standard deviations of all channels; the readouts begin with the mean of each channel at 0."""
-    means, deviations = [], []
+    """Let the readouts begin with the mean of each channel at 0; returns the standard deviations of all channels."""
+    means = []
+    deviations = []
     for name in model.layers:
-        some = [
-            group.features.maps[name][torch.as_tensor(which[:: max(1, len(which) // 60)])].float()
-            for group, which in zip(groups, pictures, strict=True)
-            if len(which)
-        ]
-        flat = torch.cat([each.transpose(0, 1).flatten(1) for each in some], 1)
-        means.append(flat.mean(1))
-        deviations.append(flat.std(1).clamp(min=1e-3))
+        values = []
+        for group, numbers in zip(groups, pictures, strict=True):
+            if len(numbers):
+                chosen = numbers[:: max(1, len(numbers) // _STANDARDISED)]
+                maps = group.features.maps[name][torch.as_tensor(chosen)].float()
+                values.append(maps.transpose(0, 1).flatten(1))
+        by_channel = torch.cat(values, 1)
+        means.append(by_channel.mean(1))
+        deviations.append(by_channel.std(1).clamp(min=1e-3))
     scale = torch.cat(deviations)
     with torch.no_grad():
         model.shift.sub_((model.read / scale) @ torch.cat(means))
@@ -128,9 +147,22 @@ def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pi
 
 @torch.no_grad()
 def maps_of(model: FixationDensity, group: Viewed, pictures: Sequence[int], batch: int = 16) -> list[Tensor]:
-    """The map of each picture, `(1, rows, columns)`."""
-    parts = [pictures[start : start + batch] for start in range(0, len(pictures), batch)]
-    return [each[None] for part in parts for each in model.map(group.some(part), group.size)]
+    """Compute the map of each picture.
+
+    Args:
+        model: the model.
+        group: pictures of one size.
+        pictures: numbers of the pictures.
+        batch: number of pictures that are computed together.
+
+    Returns:
+        Maps `(1, rows, columns)`.
+    """
+    maps: list[Tensor] = []
+    for start in range(0, len(pictures), batch):
+        of_batch = model.map(group.some(pictures[start : start + batch]), group.size)
+        maps += [of_picture[None] for of_picture in of_batch]
+    return maps
 
 
 def fit_oculomotor(
@@ -143,43 +175,73 @@ def fit_oculomotor(
     rate: float = 0.03,
     title: str = "saccades",
 ) -> None:
-    """Fit oculomotor biases and gains to the next fixations; maps `(1, rows, columns)`, or one for each person."""
+    """Fit oculomotor biases and gains to the next fixations, given the maps.
+
+    Args:
+        model: the model; its oculomotor biases begin anew.
+        groups: pictures of one size each.
+        maps: maps of the pictures of each group, `(1, rows, columns)` or one for each person.
+        pictures: numbers of the pictures of each group to fit to.
+        fit: settings of the fit.
+        rate: highest learning rate.
+        title: title of the progress bar.
+    """
     generator = torch.Generator().manual_seed(fit.seed)
     model.oculomotor = OculomotorBias()
-    places = [{picture: row for row, picture in enumerate(some)} for some in pictures]
-    events = [
-        {picture: Events.of(group.paths[picture], group.size, cells_of(group.size)) for picture in some}
-        for group, some in zip(groups, pictures, strict=True)
+    map_of = [dict(zip(numbers, of_group, strict=True)) for numbers, of_group in zip(pictures, maps, strict=True)]
+    events_of = [
+        {picture: Events.of(group.paths[picture], group.size, cells_of(group.size)) for picture in numbers}
+        for group, numbers in zip(groups, pictures, strict=True)
     ]
-
     batches = _batches(pictures, fit.batch, generator)
 
     def loss_of(_: int) -> Tensor | None:
-        number, some = next(batches)
+        number, batch = next(batches)
         size = groups[number].size
         centre = model.centre_bias(size).detach()
         losses = []
-        for picture in some:
-            # Random events on every second row and column of cells: a quarter of the computation. The likelihood of
-            # a fixation given that it is on these cells has the same parameters.
-            every = events[number][picture]
-            top, left = (int(each) for each in torch.randint(2, (2,), generator=generator))
-            rows, columns = every.cell // cells_of(size)[1], every.cell % cells_of(size)[1]
-            there = ((rows % 2 == top) & (columns % 2 == left)).nonzero()[:, 0]
-            chosen = every.some(there[torch.randperm(len(there), generator=generator)[:_EVENTS]])
-            if not len(chosen.cell):
-                continue
-            longest = int((~chosen.before[..., 0].isnan()).sum(1).max())
-            chosen, corner = chosen._replace(before=chosen.before[:, -longest:]), (top, left, 2)
-            terms = {"map": _for_events(maps[number][places[number][picture]], chosen), "centre bias": centre[None]}
-            log = torch.stack([*model.given(terms, size, chosen.before, corner).values()]).sum(0)
-            rows, columns = chosen.cell // cells_of(size)[1], chosen.cell % cells_of(size)[1]
-            target = rows // corner[2] * log.shape[-1] + columns // corner[2]
-            losses.append(F.cross_entropy(log.flatten(1), target))
+        for picture in batch:
+            # A quarter of the computation: the likelihood of a fixation given that it is on these cells has the same
+            # parameters.
+            corner = _drawn_corner(generator)
+            events = _events_on(events_of[number][picture], corner, size, generator)
+            if len(events.cell):
+                losses.append(_saccade_loss(model, map_of[number][picture], centre, events, size, corner))
         return torch.stack(losses).mean() if losses else None
 
-    steps, own = fit.saccade_epochs * _steps(pictures, fit.batch), model.oculomotor.parameters()
-    descend(own, loss_of, steps, rate, clip=None, decay=1e-3, rise=0.2, title=title)
+    steps = fit.saccade_epochs * _steps(pictures, fit.batch)
+    descend(model.oculomotor.parameters(), loss_of, steps, rate, clip=None, decay=1e-3, rise=0.2, title=title)
+
+
+def _drawn_corner(generator: torch.Generator) -> tuple[int, int]:
+    """Draw the first row and column of every second one."""
+    row, column = torch.randint(_EVERY, (2,), generator=generator).tolist()
+    return row, column
+
+
+def _events_on(events: Events, corner: tuple[int, int], size: tuple[int, int], generator: torch.Generator) -> Events:
+    """Draw events on every second row and column of cells, without fixations that none of them has before it."""
+    columns = cells_of(size)[1]
+    is_on = (events.cell // columns % _EVERY == corner[0]) & (events.cell % columns % _EVERY == corner[1])
+    numbers = is_on.nonzero()[:, 0]
+    drawn = events.some(numbers[torch.randperm(len(numbers), generator=generator)[:_EVENTS]])
+    if not len(drawn.cell):
+        return drawn
+    longest = int((~drawn.before[..., 0].isnan()).sum(1).max())
+    return drawn._replace(before=drawn.before[:, -longest:])
+
+
+def _saccade_loss(
+    model: FixationDensity, maps: Tensor, centre: Tensor, events: Events, size: tuple[int, int], corner: tuple[int, int]
+) -> Tensor:
+    """Mean negative log likelihood of events by all terms, on every second row and column of cells."""
+    terms = {"map": _for_events(maps, events), "centre bias": centre[None]}
+    conditional = model.given(terms, size, events.before, (*corner, _EVERY))
+    log_density = torch.stack([*conditional.values()]).sum(0)
+    columns = cells_of(size)[1]
+    row = events.cell // columns // _EVERY
+    column = events.cell % columns // _EVERY
+    return F.cross_entropy(log_density.flatten(1), row * log_density.shape[-1] + column)
 
 
 def _for_events(maps: _MapsOfPicture, events: Events) -> Tensor:
@@ -200,32 +262,53 @@ def score(
     without: Sequence[Sequence[str]] = ((),),
     raster: tuple[int, int] = (40, 30),
 ) -> list[Tensor]:
-    """NSS, AUC and log likelihood in bits above uniform of the fixations of pictures, means of each `(P, 3)`.
+    """Score a model on the fixations of pictures, all but the first of each path.
 
-    One result for each set of terms to leave out. Densities are sums over the bins of a raster of `(columns, rows)`;
-    fixations are all but the first of each path, and of these some where the scanpath is given.
+    Args:
+        model: gives centre bias and oculomotor biases.
+        group: pictures of one size.
+        maps: the map of each picture.
+        pictures: numbers of the pictures, P.
+        conditional: whether the scanpath before a fixation is given; then some fixations are drawn.
+        without: sets of terms to leave out.
+        raster: `(columns, rows)` of the bins; densities are sums over them.
+
+    Returns:
+        For each set of terms NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`.
     """
-    size, generator = group.size, torch.Generator().manual_seed(0)
+    size = group.size
+    generator = torch.Generator().manual_seed(0)
+    centre = model.centre_bias(size)[None]
     rows: list[list[Tensor]] = [[] for _ in without]
-    terms = {"centre bias": model.centre_bias(size)[None]}
-    for one, picture in zip(maps, pictures, strict=True):
+    for maps_of_picture, picture in zip(maps, pictures, strict=True):
         events = Events.of(group.paths[picture], size, raster[::-1])
         if conditional:
             events = events.some(torch.randperm(len(events.cell), generator=generator)[:_SCORED])
-        given: dict[str, Tensor] = {**terms, "map": _for_events(one, events)}
-        given = model.given(given, size, events.before) if conditional else given
-        for left_out, scored in zip(without, rows, strict=True):
-            kept = [term for name, term in given.items() if name not in left_out]
-            log = sum(kept, torch.zeros_like(given["map"][:1]))
-            density = cell_saliency((log - log.flatten(1).logsumexp(1)[:, None, None]).exp(), *raster)
-            density = (density / density.sum(1, keepdim=True)).expand(len(events.cell), -1)
-            scored.append(_scores(density, events.cell))
-    return [torch.stack(scored) if scored else torch.zeros(0, 3) for scored in rows]
+        terms = {"centre bias": centre, "map": _for_events(maps_of_picture, events)}
+        if conditional:
+            terms = model.given(terms, size, events.before)
+        for names, scores in zip(without, rows, strict=True):
+            density = _density(terms, names, raster).expand(len(events.cell), -1)
+            scores.append(_scores(density, events.cell))
+    return [torch.stack(scores) if scores else torch.zeros(0, 3) for scores in rows]
+
+
+def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[int, int]) -> Tensor:
+    """Density in the bins of a raster, `(E, N)` or `(1, N)`, by terms `(E or 1, rows, columns)` without some."""
+    log_density = torch.zeros_like(terms["map"][:1])
+    for name, term in terms.items():
+        if name not in left_out:
+            log_density = log_density + term
+    log_density = log_density - log_density.flatten(1).logsumexp(1)[:, None, None]
+    density = cell_saliency(log_density.exp(), *raster)
+    return density / density.sum(1, keepdim=True)
 
 
 def _scores(density: Tensor, cell: Tensor) -> Tensor:
     """Means of NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`."""
-    at = density.gather(1, cell[:, None])[:, 0]
-    z = (at - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
-    below = (density < at[:, None]).float().mean(1) + (density == at[:, None]).float().mean(1) / 2
-    return torch.stack([z.mean(), below.mean(), (at * density.shape[1]).log2().mean()])
+    at_fixation = density.gather(1, cell[:, None])[:, 0]
+    z = (at_fixation - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
+    lower = (density < at_fixation[:, None]).float().mean(1)
+    equal = (density == at_fixation[:, None]).float().mean(1)
+    bits = (at_fixation * density.shape[1]).log2()
+    return torch.stack([z.mean(), (lower + equal / 2).mean(), bits.mean()])

@@ -26,12 +26,24 @@ ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases
 
 
 class Fold:
-    """Pictures that are held out in one of `count` folds, and those a model is fitted to; looked at when needed."""
+    """Pictures that are held out in one of `count` folds, and those a model is fitted to; looked at when needed.
+
+    Attributes:
+        groups: gives the pictures, with the fixations that models are fitted to.
+        number: number of the fold, from 0.
+        count: number of folds.
+        settings: how models are fitted.
+        title: the fold in words.
+        judges: gives the same pictures, with the fixations that are predicted.
+    """
 
     def __init__(self, groups: _Groups, number: int, count: int, settings: GazeFit) -> None:
-        self.groups, self.number, self.count, self.settings = groups, number, count, settings
+        self.groups = groups
+        self.number = number
+        self.count = count
+        self.settings = settings
         self.title = f"fold {number + 1} of {count}"
-        self.judges = groups  # the same pictures, with the fixations that are predicted
+        self.judges = groups
 
     @property
     def what(self) -> dict[str, object]:
@@ -41,60 +53,70 @@ class Fold:
     @cached_property
     def _split(self) -> list[tuple[list[int], list[int]]]:
         """For each group the other pictures and those held out."""
-        before: dict[int, int] = {}
+        pictures_before: dict[int, int] = {}  # of the data set in earlier groups
         split = []
-        for group in self.groups():  # the pictures of one size, of which every `count`-th of the data set is held out
-            first = before.get(group.source, 0)
-            held = [*range((self.number - first) % self.count, len(group), self.count)]
-            split.append(([each for each in range(len(group)) if each not in set(held)], held))
-            before[group.source] = first + len(group)
+        for group in self.groups():
+            # Every `count`-th picture of the data set is held out, whatever the sizes of its pictures.
+            first = pictures_before.get(group.source, 0)
+            held_out = [*range((self.number - first) % self.count, len(group), self.count)]
+            others = [picture for picture in range(len(group)) if picture not in set(held_out)]
+            split.append((others, held_out))
+            pictures_before[group.source] = first + len(group)
         return split
 
     def fitted(self, source: int | None = None) -> list[list[int]]:
         """The pictures of each group that models are fitted to, of one data set or of all."""
-        pairs = zip(self.groups(), self._split, strict=True)
-        return [fitted if source in (None, group.source) else [] for group, (fitted, _) in pairs]
+        return [
+            others if source in (None, group.source) else []
+            for group, (others, _) in zip(self.groups(), self._split, strict=True)
+        ]
 
     @cached_property
     def centres(self) -> dict[int, Tensor]:
         """Log density of the centre bias of each data set."""
-        sources = {each.source for each in self.groups()}
+        sources = {group.source for group in self.groups()}
         return {source: log_centre(self.groups(), self.fitted(source)) for source in sources}
 
     def fit(self) -> FixationDensity:
-        """The model that is fitted to the other pictures."""
+        """Fit a model to the other pictures."""
         return fitted_density(self.settings, self.groups(), self.fitted(), self.title)
 
     def maps(self, model: FixationDensity, group: Viewed, pictures: Sequence[int]) -> list[Tensor]:
-        """The maps of some pictures of a group."""
+        """Compute the maps of some pictures of a group."""
         return maps_of(model, group, pictures)
 
     def scores(self, model: FixationDensity) -> Scores:
-        """Scores on the held-out pictures with and without each term, and of the centre bias of each data set."""
+        """Score a model on the held-out pictures with and without each term, and the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, seen, (_, some) in zip(self.groups(), self.judges(), self._split, strict=True):
-            known = self.maps(model, group, some)
-            bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
-            flat = [torch.zeros(1, *cells_of(group.size))] * len(some)
-            found = {CENTRE: score(bias, seen, flat, some, conditional=False)[0]}
-            for conditional, names in ROWS.items():
-                if self.settings.saccade_epochs or not conditional:
-                    scored = score(model, seen, known, some, conditional=conditional, without=((CENTRE,), ()))
-                    found |= dict(zip(names, scored, strict=True))
-            for name, each in found.items():
-                scores.setdefault((name, group.source), []).append(each)
+        for group, judge, (_, held_out) in zip(self.groups(), self.judges(), self._split, strict=True):
+            for row, of_pictures in self._group_scores(model, group, judge, held_out).items():
+                scores.setdefault((row, group.source), []).append(of_pictures)
         return {key: torch.cat(parts) for key, parts in scores.items()}
+
+    def _group_scores(
+        self, model: FixationDensity, group: Viewed, judge: Viewed, pictures: list[int]
+    ) -> dict[str, Tensor]:
+        """Scores on pictures of one size by row, each `(P, 3)`."""
+        maps = self.maps(model, group, pictures)
+        bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
+        flat_maps = [torch.zeros(1, *cells_of(group.size))] * len(pictures)
+        scores = {CENTRE: score(bias, judge, flat_maps, pictures, conditional=False)[0]}
+        for conditional, rows in ROWS.items():
+            if self.settings.saccade_epochs or not conditional:
+                of_rows = score(model, judge, maps, pictures, conditional=conditional, without=((CENTRE,), ()))
+                scores |= dict(zip(rows, of_rows, strict=True))
+        return scores
 
 
 class FoldStore:
     """Models of folds and what is computed of them, in a folder, once for the same data, settings and program."""
 
     def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
-        self.folder, code = folder, modules_digest("semfov.gaze.saliency", __name__)
-        self.what = {**what, "code": code}
+        self.folder = folder
+        self.what = {**what, "code": modules_digest("semfov.gaze.saliency", __name__)}
 
     def model(self, name: str, fold: Fold) -> FixationDensity:
-        """The model of a fold, read or fitted."""
+        """Read the model of a fold, or fit and write it."""
         key = digest_of({**self.what, "name": name, **fold.what})
         path = self.folder / f"{name} {fold.title} model.safetensors"
         try:
@@ -109,27 +131,46 @@ class FoldStore:
         return model
 
     def scores(self, name: str, folds: Iterable[Fold]) -> Scores:
-        """The scores of folds as one, read or computed."""
+        """Read or compute the scores of folds, and join them.
 
-        def computed(fold: Fold) -> dict[str, Tensor]:
-            scores = fold.scores(self.model(name, fold))
-            return {f"{row}/{source}": each for (row, source), each in scores.items()}
+        Args:
+            name: name of the models.
+            folds: the folds.
 
-        parts: dict[str, list[Tensor]] = {}
+        Returns:
+            The scores of all folds.
+        """
+        parts: dict[tuple[str, int], list[Tensor]] = {}
         for fold in folds:
-            kept = self.kept(f"{name} {fold.title}", {"name": name, **fold.what}, partial(computed, fold))
-            for key, each in kept.items():
-                parts.setdefault(key, []).append(each)
-        named = ((*key.rpartition("/")[::2], torch.cat(each)) for key, each in parts.items())
-        return {(row, int(source)): each for row, source, each in named}
+            what = {"name": name, **fold.what}
+            tensors = self.kept(f"{name} {fold.title}", what, partial(self._scores_of, name, fold))
+            for key, tensor in tensors.items():
+                row, _, source = key.rpartition("/")
+                parts.setdefault((row, int(source)), []).append(tensor)
+        return {key: torch.cat(of_folds) for key, of_folds in parts.items()}
+
+    def _scores_of(self, name: str, fold: Fold) -> dict[str, Tensor]:
+        """Compute the scores of a fold, by row and data set in one name."""
+        scores = fold.scores(self.model(name, fold))
+        return {f"{row}/{source}": tensor for (row, source), tensor in scores.items()}
 
     def kept(
         self, name: str, what: Mapping[str, object], compute: Callable[[], dict[str, Tensor]]
     ) -> dict[str, Tensor]:
-        """Tensors that depend on `what`, read from the file of this name, or computed and written."""
-        key, path = digest_of({**self.what, **what}), self.folder / f"{name}.safetensors"
-        kept = read_tensors(path, key)
-        if kept is None:
-            kept = compute()
-            write_tensors(path, key, kept)
-        return kept
+        """Read tensors from a file, or compute and write them.
+
+        Args:
+            name: name of the file.
+            what: what the tensors depend on.
+            compute: computes them.
+
+        Returns:
+            The tensors by name.
+        """
+        key = digest_of({**self.what, **what})
+        path = self.folder / f"{name}.safetensors"
+        tensors = read_tensors(path, key)
+        if tensors is None:
+            tensors = compute()
+            write_tensors(path, key, tensors)
+        return tensors

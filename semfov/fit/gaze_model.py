@@ -1,6 +1,6 @@
 """A model of where people look for a detector: fitted to all pictures, and evaluated on folds of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from semfov.data.fixations import Fixations
 from semfov.detection.detector import Detector
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, fitted_density
@@ -16,6 +17,8 @@ from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.runs.settings import Whole
 from semfov.runs.tables import table
+
+_DURATIONS = 5  # numbers of fixations with a duration of their own; later ones have that of the last
 
 
 @dataclass(frozen=True)
@@ -43,69 +46,126 @@ class GazeModelFit(ViewingData):
 
 def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
     """Set first fixations, durations and pauses of a model to those of all people."""
-    firsts, left, lengths = [], [], []
-    logs: list[list[Tensor]] = [[] for _ in range(5)]
+    _describe_starts(model, groups)
+    logs: list[list[Tensor]] = [[] for _ in range(_DURATIONS)]
+    pauses = []
+    for group in groups:
+        for scanpath in _timed(group):
+            durations = torch.from_numpy(scanpath.durations).float()
+            for number, log in enumerate(durations[:LONGEST].clamp(min=1).log()):
+                logs[min(number, _DURATIONS - 1)].append(log)
+            # The time that no fixation takes, for each of them.
+            pauses.append((1000 * group.seconds - durations.sum()) / len(durations))
+    if pauses:
+        by_number = [torch.stack(of_number) for of_number in logs if of_number]
+        model.duration = torch.stack([torch.stack([log.mean(), log.std(correction=0)]) for log in by_number])
+        model.pause = torch.stack(pauses).mean().clamp(min=0)
+
+
+def _describe_starts(model: FixationDensity, groups: Sequence[Viewed]) -> None:
+    """Set mean and standard deviation of first fixations, in shares of width and height."""
+    starts = []
     for group in groups:
         height, width = group.size
-        firsts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
-        for each in (one for people in group.people for one in people if one.durations is not None):
-            lasting = torch.from_numpy(each.durations).float()
-            for number, log in enumerate(lasting[:LONGEST].clamp(min=1).log()):
-                logs[min(number, 4)].append(log)
-            left.append(1000 * group.seconds - lasting.sum())
-            lengths.append(len(lasting))
-    first = torch.stack(firsts)
-    model.start = torch.stack([first.mean(0), first.std(0, correction=0)]).clamp(0, 1)
-    if left:
-        times = [torch.stack(each) for each in logs if each]
-        model.duration = torch.stack([torch.stack([each.mean(), each.std(correction=0)]) for each in times])
-        pauses = torch.stack([time / number for time, number in zip(left, lengths, strict=True)])
-        model.pause = pauses.mean().clamp(min=0)
+        starts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
+    start = torch.stack(starts)
+    model.start = torch.stack([start.mean(0), start.std(0, correction=0)]).clamp(0, 1)
+
+
+def _timed(group: Viewed) -> Iterator[Fixations]:
+    """The scanpaths of a group with durations."""
+    for people in group.people:
+        for scanpath in people:
+            if scanpath.durations is not None:
+                yield scanpath
 
 
 def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tuple[FixationDensity, Scores]:
-    """Look at all pictures, evaluate on folds, whose models and scores are kept in a folder, and fit to all."""
+    """Look at all pictures, evaluate on folds, and fit to all.
+
+    Args:
+        config: pictures, fixations, and how the model is fitted.
+        detector: gives the feature maps.
+        store: folder that keeps models and scores of folds.
+
+    Returns:
+        The model, and the scores of models that were fitted without each fold.
+
+    Raises:
+        InputError: no file of fixations is given, or one has too few pictures for the folds.
+    """
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
     source = features_of(detector, config.layers)
     groups = look(config, source)
-    pictures = sum(map(len, groups))
-    fewest = min(sum(len(group) for group in groups if group.source == n) for n in range(len(config.fixations)))
-    least = max(config.folds, 1)
-    fewer = ", or fewer folds" * (config.folds > 0)
-    expected = f"in each file {least} or more pictures in which somebody made two fixations{fewer}"
-    check(fewest >= least, f"{config.within}fixations", expected, fewest)
+    _check_pictures(config, groups)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
     folds = [Fold(lambda: groups, number, config.folds, config.fit) for number in range(config.folds)]
-    scored = kept.scores(detector.name, folds)
+    scores = kept.scores(detector.name, folds)
     model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
     _describe_viewing(model, groups)
-    scanpaths = sum(len(some) for group in groups for some in group.people)
-    known = {name: detector.settings()[name] for name in ("name", "digest", "input_size", "stretch")}
-    training = {**config.fit.plain(), "pictures": pictures, "scanpaths": scanpaths}
-    model.metadata |= {"detector": known, "data": config.fingerprint, "training": training}
-    return model, scored
+    settings = detector.settings()
+    model.metadata |= {
+        "detector": {name: settings[name] for name in ("name", "digest", "input_size", "stretch")},
+        "data": config.fingerprint,
+        "training": {
+            **config.fit.plain(),
+            "pictures": sum(map(len, groups)),
+            "scanpaths": sum(len(people) for group in groups for people in group.people),
+        },
+    }
+    return model, scores
 
 
-def summaries(scored: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
-    """Means over the held-out pictures, by number of the data set and row, of NSS, AUC and information gain."""
-    found: dict[str, dict[str, Mapping[str, float]]] = {}
-    for source in sorted({source for _, source in scored}):
-        rows = found[str(source + 1)] = {}
-        for row in (CENTRE, *ROWS[False], *ROWS[True]):
-            if (row, source) in scored:
-                metrics = scored[row, source]
-                gain = float((metrics[:, 2] - scored[CENTRE, source][:, 2]).mean())
-                means = {"NSS": float(metrics[:, 0].mean()), "AUC": float(metrics[:, 1].mean()), "gain": gain}
-                rows[row] = {**means, "pictures": len(metrics)}
-    return found
+def _check_pictures(config: GazeModelFit, groups: Sequence[Viewed]) -> None:
+    """Check that each data set has pictures for all folds."""
+    counts = [0] * len(config.fixations)
+    for group in groups:
+        counts[group.source] += len(group)
+    least = max(config.folds, 1)
+    remedy = ", or fewer folds" if config.folds else ""
+    expected = f"in each file {least} or more pictures in which somebody made two fixations{remedy}"
+    check(min(counts) >= least, f"{config.within}fixations", expected, min(counts))
 
 
-def gaze_report(scored: Scores) -> str:
-    if not scored:
+def summaries(scores: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
+    """Average the scores over the held-out pictures.
+
+    Args:
+        scores: scores by row and data set.
+
+    Returns:
+        By number of the data set, from 1, and row: NSS, AUC, information gain over the centre bias, and pictures.
+    """
+    means: dict[str, dict[str, Mapping[str, float]]] = {}
+    for source in sorted({source for _, source in scores}):
+        centre = scores[CENTRE, source]
+        means[str(source + 1)] = {
+            row: _summary(scores[row, source], centre)
+            for row in (CENTRE, *ROWS[False], *ROWS[True])
+            if (row, source) in scores
+        }
+    return means
+
+
+def _summary(metrics: Tensor, centre: Tensor) -> dict[str, float]:
+    """Means of a row `(P, 3)`, with its gain over the centre bias `(P, 3)`."""
+    return {
+        "NSS": float(metrics[:, 0].mean()),
+        "AUC": float(metrics[:, 1].mean()),
+        "gain": float((metrics[:, 2] - centre[:, 2]).mean()),
+        "pictures": len(metrics),
+    }
+
+
+def gaze_report(scores: Scores) -> str:
+    """Report the scores of folds in Markdown."""
+    if not scores:
         return "fitted to all pictures; no folds were held out\n"
     lines = []
-    for source, rows in summaries(scored).items():
-        body = [[name, *(f"{row[figure]:.3f}" for figure in ("NSS", "AUC", "gain"))] for name, row in rows.items()]
+    for source, rows in summaries(scores).items():
+        cells = [["", "NSS", "AUC", "gain over the centre bias, bit/fixation"]]
+        for name, row in rows.items():
+            cells.append([name, *(f"{row[figure]:.3f}" for figure in ("NSS", "AUC", "gain"))])
         lines += [f"Data set {source}: {rows[CENTRE]['pictures']} pictures, each held out once", ""]
-        lines += [*table([["", "NSS", "AUC", "gain over the centre bias, bit/fixation"], *body]), ""]
+        lines += [*table(cells), ""]
     return "\n".join(lines)

@@ -15,6 +15,7 @@ from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
+from semfov.metrics.episodes import FloatArray
 from semfov.observation import DirichletStatistics, FovealObservationModel, MissCounts, fit_discriminative
 from semfov.runs.samples import Samples, all_cells
 from semfov.viz import plot_reliability, save_figure
@@ -28,17 +29,38 @@ _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 def fit_published(
     eye: Eye | WindowEye, scenes: Scenes, statistics: DirichletStatistics, edges: Sequence[float], **options: Any
 ) -> FovealObservationModel:
-    """Fit Dirichlet distributions to the scores of each class and level; those with few detections are shrunk."""
+    """Fit Dirichlet distributions to the scores of each class and level; those with few detections are shrunk.
+
+    Args:
+        eye: the eye that made the detections; its settings are saved with the model.
+        scenes: the photographs; their digest is saved with the model.
+        statistics: sufficient statistics of the detections.
+        edges: borders between the levels.
+        options: options of `FovealObservationModel.fit`, and JSON values to save with the model.
+
+    Returns:
+        The model, in `eval` mode.
+    """
     model = FovealObservationModel.identity(eye.detector.classes, edges)
-    samples, data = int(statistics.count.sum()), scenes.fingerprint
+    samples = int(statistics.count.sum())
     with warnings.catch_warnings():
         # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
-        return model.fit(statistics, **options, **eye.settings(), samples=samples, data=data).eval()
+        model = model.fit(statistics, **options, **eye.settings(), samples=samples, data=scenes.fingerprint)
+    return model.eval()
 
 
 def statistics_of(edges: Sequence[float], classes: Sequence[str], shards: Iterable[Samples]) -> DirichletStatistics:
-    """Sum the sufficient statistics of detections by class and level, shard by shard."""
+    """Sum the sufficient statistics of detections by class and level, shard by shard.
+
+    Args:
+        edges: borders between the levels.
+        classes: names of the K classes.
+        shards: labelled detections.
+
+    Returns:
+        The statistics, of shape `(K+1, N)`.
+    """
     model = FovealObservationModel.identity(classes, edges)
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
@@ -50,23 +72,37 @@ def statistics_of(edges: Sequence[float], classes: Sequence[str], shards: Iterab
 def count_misses(
     photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: _CellsOfLook
 ) -> MissCounts:
-    """Count cells without any detection over all looks at some photographs; edges `(N-1,)`."""
-    counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
+    """Count cells without any detection over all looks at some photographs.
+
+    Args:
+        photographs: all photographs.
+        samples: labelled detections, with the looks that they come from.
+        scenes: numbers of the photographs that count.
+        edges: `(N-1,)`, borders between the levels.
+        cells: gives the cells that a look shows.
+
+    Returns:
+        The counts by class and level.
+    """
     misses = MissCounts(samples.scores.shape[-1], len(edges) + 1)
-    for look, boxes in enumerate(samples.boxes.split(counts)):
+    detections = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
+    for look, boxes in enumerate(samples.boxes.split(detections)):
         index = int(samples.scenes[look])
         if index not in scenes:
             continue
         annotation = photographs.annotation(index)
         grid, distance, in_view = cells(annotation.size, samples.fixations[look])
         level = torch.bucketize(distance, edges)[in_view]
-        detected, objects = grid.footprint(boxes).any(0), grid.footprint(annotation.boxes)
+        detected = grid.footprint(boxes).any(0)
+        objects = grid.footprint(annotation.boxes)
         misses.update(detected[in_view], objects[:, in_view], annotation.labels, level)
     return misses
 
 
 class ObservationFit(PartFit):
     """Fit the observation model with its miss rates."""
+
+    settings: dict[str, Any]
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
@@ -75,43 +111,54 @@ class ObservationFit(PartFit):
 
     def fit(self) -> PartResult:
         """Fit the model, and compare its posteriors of the true class with those of raw scores."""
-        config, run, samples = self.config, self.run, self.inputs.samples
-        holdout, edges = self.settings["holdout"], config.sensor.level_edges()
-        held_out = split(samples.scene, holdout)
-        judged, fitted = samples[held_out], samples[~held_out]
-        statistics = statistics_of(edges, run.eye.detector.classes, [fitted])
-        noted = {"expected": "empirical", "fixations": config.fixations, "seed": config.seed}
-        start = fit_published(run.eye, run.scenes, statistics, edges, **noted)
-        model = fit_discriminative(start, fitted.scores, fitted.distance, fitted.labels)
-        fitted_on = {index for index in range(len(run.scenes)) if index % holdout}
-        misses = count_misses(run.scenes, samples, fitted_on, model.edges, partial(all_cells, cells=config.cells))
-        model.miss_rate = misses.rates().to(model.edges)
-        raw = FovealObservationModel.identity(run.scenes.classes, edges).eval()
+        samples = self.inputs.samples
+        held_out = split(samples.scene, self.settings["holdout"])
+        judged = samples[held_out]
+        model = self._fit_model(samples, samples[~held_out])
+        raw = FovealObservationModel.identity(self.run.scenes.classes, self._edges).eval()
         with torch.inference_mode():
             posteriors = {
-                name: m.calibrate(judged.scores, judged.distance) for name, m in (("raw", raw), ("fitted", model))
+                "raw": raw.calibrate(judged.scores, judged.distance),
+                "fitted": model.calibrate(judged.scores, judged.distance),
             }
-        cost = {name: surprisal(p.double().gather(1, judged.labels[:, None])[:, 0]) for name, p in posteriors.items()}
-        photographs = judged.scene.unique().tolist()
-        means = {
-            name: torch.stack([each[judged.scene == scene].mean() for scene in photographs]).numpy()
-            for name, each in cost.items()
-        }
-        gain = Difference.of(means["raw"], means["fitted"])
-        figures = {name: calibration(p, judged.labels) for name, p in posteriors.items()}
-        rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
-        rows += [
-            [name, f"{f.nll:.3f}", f"{f.brier:.3f}", f"{f.ece:.3f}", f"{f.accuracy:.3f}"] for name, f in figures.items()
-        ]
+        gain = Difference.of(_mean_costs(posteriors["raw"], judged), _mean_costs(posteriors["fitted"], judged))
+        figures = {name: calibration(posterior, judged.labels) for name, posterior in posteriors.items()}
         why = (
             f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
             f"{figures['raw'].nll:.3f}; {gain.in_words('nats gained')}"
         )
-        figure = plot_reliability({name: (p, judged.labels) for name, p in posteriors.items()})
-        save_figure(figure, self.config.out / "reliability.png")
+        diagram = plot_reliability({name: (posterior, judged.labels) for name, posterior in posteriors.items()})
+        save_figure(diagram, self.config.out / "reliability.png")
+        rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
+        for name, figure in figures.items():
+            measures = (figure.nll, figure.brier, figure.ece, figure.accuracy)
+            rows.append([name, *(f"{measure:.3f}" for measure in measures)])
         report = section(
             f"Predicted probability of the true class of a detection: fitted on {len(samples) - len(judged)} "
-            f"detections, evaluated on {len(judged)} detections in {len(photographs)} held-out photographs.",
+            f"detections, evaluated on {len(judged)} detections in {len(judged.scene.unique())} held-out photographs.",
             rows,
         )
         return PartResult(self.write("observation", model, gain.better, why), report, ["reliability.png"])
+
+    @property
+    def _edges(self) -> list[float]:
+        return self.config.sensor.level_edges()
+
+    def _fit_model(self, samples: Samples, training: Samples) -> FovealObservationModel:
+        """Fit scores and miss rates to the detections in the photographs that are not held out."""
+        run = self.run
+        statistics = statistics_of(self._edges, run.eye.detector.classes, [training])
+        options = {"expected": "empirical", "fixations": self.config.fixations, "seed": self.config.seed}
+        start = fit_published(run.eye, run.scenes, statistics, self._edges, **options)
+        model = fit_discriminative(start, training.scores, training.distance, training.labels)
+        fitted_on = {index for index in range(len(run.scenes)) if index % self.settings["holdout"]}
+        cells = partial(all_cells, cells=self.config.cells)
+        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        model.miss_rate = misses.rates().to(model.edges)
+        return model
+
+
+def _mean_costs(posterior: Tensor, judged: Samples) -> FloatArray:
+    """Mean surprisal of the true class in each photograph, `(P,)`; posterior `(M, K+1)`."""
+    cost = surprisal(posterior.double().gather(1, judged.labels[:, None])[:, 0])
+    return torch.stack([cost[judged.scene == scene].mean() for scene in judged.scene.unique().tolist()]).numpy()

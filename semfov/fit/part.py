@@ -1,4 +1,11 @@
-"""What all parts of a model folder share: how a part is fitted, and the data and the earlier parts that it may use."""
+"""What all parts of a model folder share: how a part is fitted, and the data and the earlier parts that it may use.
+
+A part is fitted to stored looks:
+
+    photographs ─► Looking: every look, stored ─► PartInputs ─► PartFit.fit() ─► PartResult
+                                                      ▲                              │
+                                                      └── the parts before it ◄──────┘
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,15 +30,22 @@ from semfov.runs.seeds import generator_for
 
 _Config = TypeVar("_Config", bound=FitConfig)
 
-_FEW = 8  # detectors with fewer classes also learn from photographs that contain none of them
 FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
+
+_FEW = 8  # detectors with fewer classes also learn from photographs that contain none of them
 _MANY = 100  # with at least this many photographs, one in five is held out and training takes all its steps
-_LONGEST = 15  # maximum number of gaze shifts in the searches and explorations that are compared
+_MOST_SHIFTS = 15  # maximum number of gaze shifts in the searches and explorations that are compared
 
 
 class PartResult(NamedTuple):
-    """A fitted part with its report."""
+    """A fitted part with its report.
+
+    Attributes:
+        part: its entry in the manifest.
+        report: its section of the report, in Markdown.
+        figures: names of the files of its figures, in the folder.
+    """
 
     part: Part
     report: str
@@ -39,11 +53,23 @@ class PartResult(NamedTuple):
 
 
 class PartInputs:
-    """The looks that all parts are fitted to, and the parts that are finished."""
+    """The looks that all parts are fitted to, and the parts that are finished.
+
+    Attributes:
+        run: the photographs, and their looks from every cell of a grid.
+        config: the settings of the whole fit, with numbers of steps for so many photographs.
+        components: number of scores in all, K + 1.
+        absent: number of absent classes to search for in a photograph; None: as many as present ones.
+        protocol: the searches and explorations by which parts are compared.
+        compared_at: number of gaze shifts after which they are compared.
+        held_out: numbers of the photographs that are held out.
+        judged: those of them on which searches and explorations are compared.
+        results: the parts that are finished, by name.
+    """
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
-        share = min(len(run.scenes) / _MANY, 1)
         self.run = run
+        share = min(len(run.scenes) / _MANY, 1)
         self.config = replace(
             config,
             holdout=config.holdout or (3 if share < 1 else 5),
@@ -51,9 +77,8 @@ class PartInputs:
             map_steps=config.map_steps or max(300, round(1000 * share)),
         )
         self.components = len(run.scenes.classes) + 1
-        self.absent = 2 if self.components <= _FEW else None  # absent classes in a photograph; None: as many as present
-        shifts = min(_LONGEST, self.config.columns * self.config.rows - 1)
-        # The searches and explorations that are compared, and the number of shifts and the photographs for that.
+        self.absent = 2 if self.components <= _FEW else None
+        shifts = min(_MOST_SHIFTS, self.config.columns * self.config.rows - 1)
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
         self.compared_at = min(5, shifts)
         self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
@@ -61,9 +86,9 @@ class PartInputs:
         self.results: dict[str, PartResult] = {}
 
     def settings(self, kind: type[_Config], **own: Any) -> _Config:
-        """The settings of a part: those of the whole fit by their names, except its `own`."""
-        names = {each.name for each in fields(self.config)} & {each.name for each in fields(kind)}
-        return kind(**{name: getattr(self.config, name) for name in names} | own)
+        """Make the settings of a part: those of the whole fit by their names, except its `own`."""
+        shared = {field.name for field in fields(self.config)} & {field.name for field in fields(kind)}
+        return kind(**{name: getattr(self.config, name) for name in shared} | own)
 
     def model(self, name: str) -> Pretrained | None:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
@@ -87,13 +112,14 @@ class PartInputs:
     @cached_property
     def samples(self) -> Samples:
         """Labelled detections from a few random cells of each photograph."""
-        samples, run = [], self.run
+        run = self.run
+        samples = []
         for index in range(len(run.scenes)):
             grid = run.grid(index)
             generator = generator_for("cells", self.config.seed, run.scenes.ids[index])
             cells = torch.randperm(len(grid), generator=generator)[: self.config.fixations]
-            detections, annotation = run.detections(index)[cells], run.scenes.annotation(index)
-            samples.append(Samples.of(detections, grid.centres[cells], annotation, index, iou=0.5))
+            detections = run.detections(index)[cells]
+            samples.append(Samples.of(detections, grid.centres[cells], run.scenes.annotation(index), index, iou=0.5))
         return Samples.join(samples)
 
 
@@ -106,14 +132,31 @@ class PartFit(ABC):
     """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds on one core."""
 
     def __init__(self, inputs: PartInputs) -> None:
-        self.inputs, self.config, self.run = inputs, inputs.config, inputs.run
+        self.inputs = inputs
+        self.config = inputs.config
+        self.run = inputs.run
 
     @abstractmethod
     def fit(self) -> PartResult:
         """Fit the part."""
 
     def write(self, name: str, model: Pretrained, used: bool, why: str) -> Part:
-        """Write the model of a part and return its entry in the manifest."""
+        """Write the model of a part.
+
+        Args:
+            name: name of the part.
+            model: its fitted model.
+            used: whether the agent should use it.
+            why: sentence about the comparison with the agent without it.
+
+        Returns:
+            The entry of the part in the manifest.
+        """
         file = f"{name}.safetensors"
         model.save(self.config.out / file)
         return Part(file, sha256(self.config.out / file), used, why)
+
+    @staticmethod
+    def left_out(why: str) -> PartResult:
+        """Make the result of a part that is not fitted, with the reason."""
+        return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,9 +10,12 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
+from semfov.detection.detections import Detections
+from semfov.fit.logistic import logistic_regression
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import choose_confirm, examine, fit, verification_report, verify
-from semfov.fit.windows_certainty import Exploration, fit_spread, left_out, logistic_regression
+from semfov.fit.verification import VerificationInFolds, choose_confirm, examine, fit_to_closer_looks, verify
+from semfov.fit.verification_report import verification_report
+from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes, numbers_drawn
@@ -39,7 +42,15 @@ _AREA = 0.2  # classes that cover a larger share of a photograph are not searche
 
 
 class _WholeSearch(TargetSearch[SearchLook]):
-    """A search of a photograph after the look at the whole; objects `(M, 4)`."""
+    """A search of a photograph after the look at the whole.
+
+    Attributes:
+        source: the looks at the photograph.
+        whole: the look at the whole.
+        objects: `(M, 4)`, annotated boxes of the class.
+        evidence: tells the probability of the class after the look.
+        best: highest score of the class.
+    """
 
     after = (1,)
     most = MOST_IN_PHOTOGRAPH
@@ -51,25 +62,52 @@ class _WholeSearch(TargetSearch[SearchLook]):
         source: WindowLooks,
         whole: WindowLook,
         objects: Tensor,
-        model: PhotographEvidence,
+        evidence: PhotographEvidence,
         *,
         spare: bool = False,
     ) -> None:
-        self.picture, self.target, self.present, self.spare = number, target, len(objects) > 0, spare
-        self.candidates = partial(PhotographPlaces, target, source.lattice, window=model.window)
-        self.close_up = lambda box: look_closely(source, box, model.window).candidates
-        self.steps, self.objects, self.model = (whole,), objects, model
-        self.best = float(whole.show[target - 1])  # highest score of the target
+        self.picture = number
+        self.target = target
+        self.present = len(objects) > 0
+        self.spare = spare
+        self.source = source
+        self.whole = whole
+        self.objects = objects
+        self.evidence = evidence
+        self.best = float(whole.show[target - 1])
+
+    def __len__(self) -> int:
+        return 1
 
     def look(self, index: int, number: int) -> SearchLook:
-        """The look at the whole, with the probability after it."""
-        presence = self.model.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return SearchLook(self.steps[0].candidates, number, float(presence), self.best, 0.0)
+        """Return the look at the whole, with the probability after it."""
+        presence = self.evidence.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
+        return SearchLook(self.whole.candidates, number, float(presence), self.best, 0.0)
+
+    def candidates(self) -> PhotographPlaces:
+        return PhotographPlaces(self.target, self.source.lattice, window=self.evidence.window)
+
+    def close_up(self, box: Tensor) -> Detections:
+        return look_closely(self.source, box, self.evidence.window).candidates
 
     def right(self, box: Tensor) -> bool:
-        """Whether the centre of a box `(4,)` lies in an annotated box of the class."""
+        """Tell whether the centre of a box `(4,)` lies in an annotated box of the class."""
         centre = (box[:2] + box[2:]) / 2
         return bool(((self.objects[:, :2] <= centre) & (centre <= self.objects[:, 2:])).all(-1).any())
+
+
+class _PhotographLooks(NamedTuple):
+    """What the looks at P photographs give to fit to.
+
+    Attributes:
+        scores: `(P, K)`, highest score of each class in the look at the whole.
+        searches: searches for present and for absent classes.
+        explored: what the looks show of all classes, and of the most frequent one, by fold.
+    """
+
+    scores: Tensor
+    searches: list[_WholeSearch]
+    explored: dict[str, list[Exploration]]
 
 
 def fit_photographs(
@@ -79,65 +117,116 @@ def fit_photographs(
     config: FitMosaicsConfig,
     prior: Verification | None = None,
 ) -> str:
-    """Fit the evidence for photographs on those with most pixels, in folds, and add it to the model; the report."""
-    canvas = eye.detector.input_size
-    single = [n for n in range(len(pictures)) if Lattice.over(pictures.annotation(n).size, canvas).levels == 1]
-    if not single:
+    """Fit the evidence for photographs on those with most pixels, in folds, and add it to a model.
+
+    Args:
+        model: evidence by magnification; it gets the evidence for photographs.
+        pictures: photographs; the frequencies of classes are those in all of them.
+        eye: looks at windows.
+        config: how many photographs are looked at, and the settings of closer looks.
+        prior: centre of the prior of the verification (None: a weak one around 0).
+
+    Returns:
+        The report in Markdown.
+    """
+    looked = _single_look_photographs(pictures, eye)[: config.photographs]
+    if not looked:
         return "None, since no photograph is shown at more than half its size by one look.\n"
-    # Enlarged windows need pixels.
-    single.sort(key=lambda n: -max(pictures.annotation(n).size))
-    count, held = len(pictures), torch.zeros(len(pictures), model.classes, dtype=torch.bool)
-    for index in range(count):
-        held[index, pictures.annotation(index).labels - 1] = True
+    held = _classes_held(pictures, model.classes)
     evidence = PhotographEvidence(model.classes, window=config.window).eval().requires_grad_(False)
-    evidence.usual.copy_(_usual(held.sum(0), count))
+    evidence.usual.copy_(_log_odds_held(held.sum(0), len(pictures)))
+    looks = _look_at(pictures, looked, eye, evidence, config)
+    report_on_spread = _fit_certainty(evidence, looks.explored)
+    _fit_whole(evidence, looks.searches, held)
+    drawn = shares_by_frequency(evidence.usual, pictures)
+    evidence.shares = measured_shares(evidence, looks.scores, held[looked], drawn)
+    report = _fit_closer_looks(evidence, looks.searches, config, prior)
+    model.photograph = evidence
+    model.metadata["photograph"] = {"photographs": len(looked), "frequencies": len(pictures)}
+    return "\n".join([report, *report_on_spread])
+
+
+def _single_look_photographs(pictures: Scenes, eye: WindowEye) -> list[int]:
+    """Find the photographs that one look shows at more than half their size; those with most pixels come first."""
+    canvas = eye.detector.input_size
+    sizes = [pictures.annotation(index).size for index in range(len(pictures))]
+    single = [index for index, size in enumerate(sizes) if Lattice.over(size, canvas).levels == 1]
+    # Enlarged windows need pixels.
+    return sorted(single, key=lambda index: -max(sizes[index]))
+
+
+def _classes_held(pictures: Scenes, classes: int) -> Tensor:
+    """Tell which classes each photograph holds, `(photographs, K)` boolean."""
+    held = torch.zeros(len(pictures), classes, dtype=torch.bool)
+    for index in range(len(pictures)):
+        held[index, pictures.annotation(index).labels - 1] = True
+    return held
+
+
+def _look_at(
+    pictures: Scenes, looked: Sequence[int], eye: WindowEye, evidence: PhotographEvidence, config: FitMosaicsConfig
+) -> _PhotographLooks:
+    """Look at the whole of photographs and at all their slices, and draw searches of them."""
+    scores: list[Tensor] = []
     searches: list[_WholeSearch] = []
-    shown: list[Tensor] = []
-    looked = single[: config.photographs]
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
     for number, index in enumerate(track(looked, "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
         source = StoredWindowLooks(eye, pictures, index, None)
         with torch.inference_mode():
             looks = source.see([Window.overview(source.lattice), *usual_slices(source.lattice)])
-        shown.append(looks[0].show)
-        usual = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
+        whole = looks[0]
+        scores.append(whole.show)
+        counted = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
-        more = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
-        for place, target in enumerate(more):
-            boxes, spare = annotation.boxes[annotation.labels == target], place >= len(usual)
-            searches.append(_WholeSearch(number, target, source, looks[0], boxes, evidence, spare=spare))
+        targets = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
+        for place, target in enumerate(targets):
+            objects = annotation.boxes[annotation.labels == target]
+            spare = place >= len(counted)
+            searches.append(_WholeSearch(number, target, source, whole, objects, evidence, spare=spare))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, source.lattice, annotation)
+    return _PhotographLooks(torch.stack(scores), searches, explored)
+
+
+def _fit_certainty(evidence: PhotographEvidence, explored: dict[str, list[Exploration]]) -> list[str]:
+    """Fit the probability of an object, and the spread of expected numbers in folds; returns lines of Markdown."""
     numbers = left_out(explored, _fit_objects, _CHECKED)
-    told: list[str] = []
-    evidence.certainty = certainty = _fit_objects([each for fold in explored.values() for each in fold])
-    if numbers:
-        spread, told = fit_spread(numbers)
-        evidence.certainty = replace(certainty, spread=spread)
-    # After the look at the whole, with frequencies in the other photographs.
-    total, some = held.sum(0), [each for each in searches if not each.spare]
-    best = torch.tensor([search.best for search in some], dtype=torch.float64)
-    present = torch.tensor([search.present for search in some])
-    holding = torch.tensor([int(total[search.target - 1]) for search in some])
-    others = _usual(holding - present.long(), count - 1)
-    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), others], -1), present)
+    certainty = _fit_objects([exploration for fold in explored.values() for exploration in fold])
+    evidence.certainty = certainty
+    if not numbers:
+        return []
+    spread, report = fit_spread(numbers)
+    evidence.certainty = replace(certainty, spread=spread)
+    return report
+
+
+def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], held: Tensor) -> None:
+    """Fit the probability of a class after the look at the whole, with its frequency in the other photographs."""
+    counted = [search for search in searches if not search.spare]
+    totals = held.sum(0)
+    best = torch.tensor([search.best for search in counted], dtype=torch.float64)
+    present = torch.tensor([search.present for search in counted])
+    holding = torch.tensor([int(totals[search.target - 1]) for search in counted])
+    in_others = _log_odds_held(holding - present.long(), len(held) - 1)
+    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), in_others], -1), present)
     evidence.whole.weight.copy_(torch.tensor([weights]))
     evidence.whole.bias.fill_(offset)
-    drawn = shares_by_frequency(evidence.usual, pictures)
-    evidence.shares = measured_shares(evidence, torch.stack(shown), held[looked], drawn)
-    text = _fit_closer(evidence, searches, config, prior)
-    model.photograph = evidence
-    model.metadata["photograph"] = {"photographs": len(looked), "frequencies": count}
-    return "\n".join([text, *told])
 
 
 def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
-    r"""Share π of the searches for each class whose target is there, `(K,)`, as the frequency alone predicts it.
+    r"""Share π of the searches for each class whose target is there, as the frequency alone predicts it.
 
     .. math:: \operatorname{logit} \pi_t = b_0 \operatorname{logit} q_t + c_0
 
     `PhotographEvidence` knows of a class no more than its frequency q, so that this is the prior that it has learned.
     The shares of single classes differ: those that fill a photograph are not searched for there.
+
+    Args:
+        usual: `(K,)`, log odds of the frequencies q.
+        pictures: the photographs.
+
+    Returns:
+        The shares, `(K,)`.
     """
     there, missing = numbers_drawn(pictures, _PRESENT, _AREA)
     present = torch.cat([torch.ones(len(there)), torch.zeros(len(missing))])
@@ -146,7 +235,7 @@ def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
 
 
 def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, shares: Tensor) -> Tensor:
-    r"""Shares `(K,)` with which searches of all photographs for each class have the right probabilities, near others.
+    r"""Shares with which searches of all photographs for each class have the right probabilities, near others.
 
     Some classes are hinted at more often than others where they are not, such as chairs: their score tells less than
     that of a class as frequent. The shift δ of the log odds of each class maximises the likelihood of all photographs,
@@ -156,15 +245,23 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
 
     with the share q of these photographs, and gives :math:`\operatorname{logit} q_t - \delta_t` as log odds.
 
-    Shapes: scores `(P, K)`, highest ones in the looks at the whole; held `(P, K)`; shares `(K,)`.
+    Args:
+        evidence: the evidence for photographs, with its probability after the look at the whole.
+        scores: `(P, K)`, highest ones in the looks at the whole.
+        held: `(P, K)` boolean, the classes of each photograph.
+        shares: `(K,)`, shares π to stay near.
+
+    Returns:
+        The shares, `(K,)`.
     """
-    odds = evidence.presence(scores, (torch.arange(scores.shape[-1]) + 1).expand(scores.shape)).double()
+    classes = torch.arange(scores.shape[-1]) + 1
+    log_odds = evidence.presence(scores, classes.expand(scores.shape)).double()
     present = held.double()
-    usual = _usual(held.sum(0), len(held))
+    usual = _log_odds_held(held.sum(0), len(held))
     expected = usual - shares.double().logit()
     shift = expected.clone()
     for _ in range(_NEWTON_STEPS):
-        chance = (odds + shift).sigmoid()
+        chance = (log_odds + shift).sigmoid()
         gradient = (present - chance).sum(0) - _NEAR * (shift - expected)
         curvature = (chance * (1 - chance)).sum(0) + _NEAR
         shift = shift + (gradient / curvature).clamp(-1, 1)
@@ -173,37 +270,44 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
 
 def _explored(looks: Sequence[WindowLook], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
     """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
-    labels = annotation.labels
-    for target in (None, *([int(labels.mode().values)] if len(labels) else [])):
-        nothing, none = [(0.0, 0.0)] * len(looks), [0.0] * len(looks)
-        yield Exploration.of(target, looks, {1, len(looks)}, lattice, annotation, nothing, none)
+    targets: list[int | None] = [None]
+    if len(annotation.labels):
+        targets.append(int(annotation.labels.mode().values))
+    for target in targets:
+        # After all slices, no look is left that could show more.
+        remaining = [(0.0, 0.0)] * len(looks)
+        promised = [0.0] * len(looks)
+        yield Exploration.of(target, looks, {1, len(looks)}, lattice, annotation, remaining, promised)
 
 
 def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
     """Fit the probability of objects of all classes; looks at all slices leave nothing to expect."""
-    after = [seen for each in explored if each.target is None for seen in each.objects.values()]
-    facts, right = (torch.cat(column) for column in zip(*after, strict=True))
-    offset, *weights = logistic_regression(facts[right >= 0], right[right >= 0] > 0)
+    objects = [
+        of_look for exploration in explored if exploration.target is None for of_look in exploration.objects.values()
+    ]
+    facts, right = (torch.cat(column) for column in zip(*objects, strict=True))
+    counted = right >= 0  # not in a crowd
+    offset, *weights = logistic_regression(facts[counted], right[counted] > 0)
     return Certainty(offset, tuple(weights), strength=1.0)
 
 
-def _usual(held: Tensor, count: int) -> Tensor:
+def _log_odds_held(held: Tensor, count: int) -> Tensor:
     """Log odds that a photograph holds each class, half a photograph for and against added."""
     return ((held + 0.5) / (count + 1)).double().logit()
 
 
-def _fit_closer(
+def _fit_closer_looks(
     evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitMosaicsConfig, prior: Verification | None
 ) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
-    closer = examine(searches, _FOLDS)
-    if closer is None:
+    closer_looks = examine(searches, _FOLDS)
+    if closer_looks is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
-    chosen = [fit(closer, closer.fold != fold, prior) for fold in range(_FOLDS)]
-    decisions = list(verify(searches, chosen, Thresholds(1.0, config.worth, config.worth), None))
+    folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(_FOLDS)]
+    decisions = list(verify(searches, folds, Thresholds(1.0, config.worth, config.worth), None))
     confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
-    fitted = fit(closer, closer.fold >= 0, prior)
+    fitted = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
     fitted.thresholds = Thresholds(confirm, config.worth, config.worth)
     evidence.verification = fitted
-    pictures = f"{len({each.picture for each in searches})} photographs"
-    return verification_report(fitted, chosen, closer, decisions, pictures)[0]
+    pictures = f"{len({search.picture for search in searches})} photographs"
+    return verification_report(VerificationInFolds(fitted, folds, closer_looks, decisions), pictures).text

@@ -3,8 +3,8 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, partial
-from typing import Any, ClassVar, Generic
+from functools import cached_property
+from typing import ClassVar, Generic, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.scene import Scenes
 from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
-from semfov.decision.candidates import LookAt, LookType
+from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
 from semfov.eye import Eye
@@ -28,8 +28,30 @@ from semfov.runs.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
 
 
+class SearchEnd(NamedTuple):
+    """End of a search.
+
+    Attributes:
+        right: whether the target is at the place that the search found; None if it found none.
+        looks: number of looks until then, with closer looks.
+    """
+
+    right: bool | None
+    looks: int
+
+
 class TargetSearch(ABC, Generic[LookType]):
-    """Base of the searches for a class in a picture, with all `steps`: decisions do not move the gaze."""
+    """Base of the searches for a class in a picture, with all their looks: decisions do not move the gaze.
+
+    Attributes:
+        after: numbers of looks after which places are examined for the fit.
+        most: largest number of closer looks.
+        picture: number of the picture among those of the fit.
+        target: the class, 1..K.
+        present: whether the picture holds the class.
+        spare: whether the search serves only to choose thresholds.
+        passes: largest number of looks, with closer looks.
+    """
 
     after: ClassVar[tuple[int, ...]]
     most: ClassVar[int] = MOST_CLOSER
@@ -38,21 +60,45 @@ class TargetSearch(ABC, Generic[LookType]):
     present: bool
     spare: bool = False
     passes: float = math.inf
-    steps: Any
-    candidates: Callable[[], CandidatePlaces[LookType]]
-    close_up: LookAt
 
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of looks, without closer looks."""
+
+    @abstractmethod
     def look(self, index: int, number: int) -> LookType:
         """Return the look of this index; `number` looks of both kinds were made up to it."""
-        return self.steps[index]
+
+    @abstractmethod
+    def candidates(self) -> CandidatePlaces[LookType]:
+        """Make the places that seem to hold the target, before any look."""
+
+    @abstractmethod
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`."""
 
     @abstractmethod
     def right(self, box: Tensor) -> bool:
-        """Whether the target is at a box `(4,)`."""
+        """Tell whether the target is at a box `(4,)`."""
 
-    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
-        """The outcome after a look without closer looks, 0 to go on, and whether the target is at the place found."""
-        return 0, None
+    def outcome(self, index: int, thresholds: Thresholds) -> int:
+        """Decide after a look by the evidence alone: the outcome's number in `OUTCOMES`, 0 to go on."""
+        return 0
+
+    def found_right(self, index: int) -> bool:
+        """Tell whether the target is at the place that a search finds after a look by the evidence alone."""
+        raise NotImplementedError(f"{type(self).__name__} finds no place without closer looks")
+
+    def unverified_end(self, thresholds: Thresholds | None) -> SearchEnd:
+        """Decide along the looks without closer looks; nothing is found without thresholds."""
+        if thresholds is not None:
+            for index in range(len(self)):
+                outcome = self.outcome(index, thresholds)
+                if OUTCOMES[outcome] == "found":
+                    return SearchEnd(self.found_right(index), index + 1)
+                if outcome:
+                    return SearchEnd(None, index + 1)
+        return SearchEnd(None, len(self))
 
 
 class SearchedPhotograph:
@@ -68,30 +114,86 @@ class SearchedPhotograph:
         targets: tuple[DrawnSearch, ...],
         store: DetectionStore | None = None,
     ) -> None:
-        self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.targets = grid, targets
+        self.eye = eye
+        self.scenes = scenes
+        self.index = index
+        self.number = number
+        self.grid = grid
+        self.targets = targets
         self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
-            lambda: photograph_looks(eye, lambda: scenes[index].image[None], grid), store, lambda: scenes.digest(index)
+            self._open, store, lambda: scenes.digest(index)
         )
+
+    def _open(self) -> Callable[[int | tuple[float, ...]], Detections]:
+        return photograph_looks(self.eye, lambda: self.scenes[self.index].image[None], self.grid)
+
+
+class DrawingSettings(Protocol):
+    """Settings by which classes to search for are drawn, as those of a `VerificationConfig`."""
+
+    @property
+    def columns(self) -> int:
+        """Columns of the grid."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of the grid."""
+
+    @property
+    def classes(self) -> int:
+        """Largest number of present classes in each photograph."""
+
+    @property
+    def absent(self) -> int | None:
+        """Largest number of absent classes; None: as many as present ones."""
+
+    @property
+    def max_target_area(self) -> float:
+        """Share of the image from which on a class is too large to be searched for."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the draw."""
 
 
 def open_photographs(
-    eye: Eye, scenes: Scenes, chosen: Sequence[int], config: Any, *, store: DetectionStore | None = None, spare: int = 0
+    eye: Eye,
+    scenes: Scenes,
+    chosen: Sequence[int],
+    config: DrawingSettings,
+    *,
+    store: DetectionStore | None = None,
+    spare: int = 0,
 ) -> list[SearchedPhotograph]:
-    """Draw classes to search for in photographs, by a `VerificationConfig`."""
-    photographs, seed, area = list[SearchedPhotograph](), config.seed, config.max_target_area
-    protocol = ProtocolConfig(seed=seed)
+    """Draw classes to search for in photographs.
+
+    Args:
+        eye: looks at the photographs.
+        scenes: the photographs.
+        chosen: numbers of those to search.
+        config: how classes are drawn.
+        store: keeps the looks on disk (None: they stay in memory).
+        spare: number of further absent classes in each photograph, which serve only to choose thresholds.
+
+    Returns:
+        The photographs that hold or lack a class to search for.
+    """
+    photographs: list[SearchedPhotograph] = []
+    protocol = ProtocolConfig(seed=config.seed)
     for index in chosen:
         annotation = scenes.annotation(index)
         grid = Grid(config.columns, config.rows, annotation.size)
-        targets = choose_classes(scenes, index, annotation, config.classes, area, seed, config.absent)
+        targets = choose_classes(
+            scenes, index, annotation, config.classes, config.max_target_area, config.seed, config.absent
+        )
+        if not targets:
+            continue
         held = set(annotation.labels.tolist())
-        more = sum(target not in held for target in targets) + spare
+        absent = sum(target not in held for target in targets) + spare
         # The same draw with a larger number begins with the same classes.
-        wide = choose_searches(scenes, index, grid, protocol, config.classes, area, more)
-        drawn = tuple(search._replace(spare=number >= len(targets)) for number, search in enumerate(wide))
-        if targets:
-            photographs.append(SearchedPhotograph(eye, scenes, index, len(photographs), grid, drawn, store))
+        searches = choose_searches(scenes, index, grid, protocol, config.classes, config.max_target_area, absent)
+        drawn = tuple(search._replace(spare=place >= len(targets)) for place, search in enumerate(searches))
+        photographs.append(SearchedPhotograph(eye, scenes, index, len(photographs), grid, drawn, store))
     return photographs
 
 
@@ -101,42 +203,70 @@ class _PhotographSearch(TargetSearch[Step]):
     after = (1, 3, 5, 8, 12)
 
     def __init__(
-        self, photograph: SearchedPhotograph, target: DrawnSearch, evidence: TargetEvidence, looks: int
+        self, photograph: SearchedPhotograph, search: DrawnSearch, evidence: TargetEvidence, looks: int
     ) -> None:
-        self.picture, self.target = photograph.number, target.target
-        self.present, self.spare = target.present, target.spare
-        self.candidates = partial(CandidateCells, photograph.grid, target.target)
-        self.close_up = lambda box: photograph.looks(tuple(box.tolist()))
-        self.photograph, self.sought, self.evidence, self.most_looks = photograph, target, evidence, looks
+        self.picture = photograph.number
+        self.target = search.target
+        self.present = search.present
+        self.spare = search.spare
+        self.photograph = photograph
+        self.search = search
+        self.evidence = evidence
+        self.most_looks = looks
 
     @cached_property
     def steps(self) -> list[Step]:
-        """Looks where the class is most probable, at most as many as given."""
-        photograph, sought = self.photograph, self.sought
-        source = CellLooks(photograph.looks, photograph.grid, photograph.grid.centres, sought.target)
-        choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
-        observer, policy = Target(self.evidence), TargetPosterior(sought.target)
-        return list(rollout(source, observer, policy, sought.start, choice, most=self.most_looks))
+        """Looks where the class is most probable, at most `most_looks`."""
+        photograph = self.photograph
+        grid = photograph.grid
+        source = CellLooks(photograph.looks, grid, grid.centres, self.target)
+        choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), source.like))
+        observer = Target(self.evidence)
+        policy = TargetPosterior(self.target)
+        return list(rollout(source, observer, policy, self.search.start, choice, most=self.most_looks))
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def look(self, index: int, number: int) -> Step:
+        return self.steps[index]
+
+    def candidates(self) -> CandidateCells:
+        return CandidateCells(self.photograph.grid, self.target)
+
+    def close_up(self, box: Tensor) -> Detections:
+        return self.photograph.looks(tuple(box.tolist()))
 
     def right(self, box: Tensor) -> bool:
-        """Whether an object of the class overlaps the cell of a box `(4,)`."""
-        return bool(self.sought.goal[cell_of(box, self.photograph.grid)])
+        """Tell whether an object of the class overlaps the cell of a box `(4,)`."""
+        return bool(self.search.goal[cell_of(box, self.photograph.grid)])
 
-    def decided(self, index: int, thresholds: Thresholds) -> tuple[int, bool | None]:
-        """The outcome by the belief alone; the place is right if an object overlaps the cell of strongest evidence."""
-        outcome = int(decide(self.steps[index], self.target, thresholds))
-        if OUTCOMES[outcome] != "found":
-            return outcome, None
+    def outcome(self, index: int, thresholds: Thresholds) -> int:
+        return int(decide(self.steps[index], self.target, thresholds))
+
+    def found_right(self, index: int) -> bool:
+        """Tell whether an object overlaps the cell of strongest evidence."""
         looks = [step.detections for step in self.steps[: index + 1]]
-        decision = conclude(1, self.steps[index].belief, looks, self.photograph.grid, self.target)
-        return outcome, bool(self.sought.goal[decision.cell])
+        found = OUTCOMES.index("found")
+        decision = conclude(found, self.steps[index].belief, looks, self.photograph.grid, self.target)
+        return bool(self.search.goal[decision.cell])
 
 
 def photograph_searches(
     photographs: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
 ) -> Iterator[_PhotographSearch]:
-    """Search photographs for all their classes; after the searches of one, its looks are stored and freed."""
+    """Search photographs for all their classes; after the searches of one, its looks are stored and freed.
+
+    Args:
+        photographs: photographs with the classes to search for.
+        evidence: tells from the looks where the class may be.
+        looks: largest number of looks in a search.
+        title: title of the progress bar.
+
+    Yields:
+        The searches, photograph by photograph.
+    """
     for photograph in track(photographs, title, "photograph"):
-        for target in photograph.targets:
-            yield _PhotographSearch(photograph, target, evidence, looks)
+        for search in photograph.targets:
+            yield _PhotographSearch(photograph, search, evidence, looks)
         photograph.looks.close()

@@ -1,7 +1,7 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -17,26 +17,55 @@ from semfov.io.manifest import Part
 from semfov.runs.progress import track
 from semfov.runs.samples import Samples
 
-_EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)  # values of the exponent to compare
+EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+"""Values of the exponent to compare."""
+
 _SETTINGS = ("columns", "rows", "fixations", "max_target_area", "holdout", "seed")
 """Settings of the fit that the exponent depends on."""
 
 
+class SearchSettings(Protocol):
+    """Settings of searches over stored looks."""
+
+    @property
+    def columns(self) -> int:
+        """Columns of the grid."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of the grid."""
+
+    @property
+    def max_target_area(self) -> float:
+        """Share of the image from which on a class is too large to be searched for."""
+
+
 def mean_hits(holdout: int, rates: dict[int, float]) -> dict[str, float]:
-    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones."""
-    means: dict[str, list[float]] = {"fitted": [], "held_out": []}
-    for index, share in rates.items():
-        means["held_out" if index % holdout == 0 else "fitted"].append(share)
-    if not all(means.values()):
+    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones.
+
+    Args:
+        holdout: one in every n photographs is held out.
+        rates: hit rates by the number of the photograph.
+
+    Returns:
+        The two means by name.
+
+    Raises:
+        DataError: one group has no photograph with a search.
+    """
+    groups: dict[str, list[float]] = {"fitted": [], "held_out": []}
+    for index, rate in rates.items():
+        groups["held_out" if index % holdout == 0 else "fitted"].append(rate)
+    if not all(groups.values()):
         raise DataError(
-            f"data: expected searches in photographs of both groups, got {len(means['fitted'])} photographs to choose "
-            f"by and {len(means['held_out'])} held-out ones; give more photographs"
+            f"data: expected searches in photographs of both groups, got {len(groups['fitted'])} photographs to choose "
+            f"by and {len(groups['held_out'])} held-out ones; give more photographs"
         )
-    return {name: sum(values) / len(values) for name, values in means.items()}
+    return {name: sum(values) / len(values) for name, values in groups.items()}
 
 
 def hit_rates(
-    config: Any,
+    config: SearchSettings,
     scenes: Scenes,
     samples: Samples,
     observer: Semantic,
@@ -45,9 +74,23 @@ def hit_rates(
     least: int,
     most: int | None = None,
 ) -> dict[int, float]:
-    """Share of next fixations that hit the target in each of `most` photographs with `least` objects."""
+    """Compute the share of next fixations that hit the target in each photograph.
+
+    Args:
+        config: grid and largest targets of the searches.
+        scenes: the photographs.
+        samples: labelled detections of their looks.
+        observer: makes the belief.
+        title: title of the progress bar.
+        least: least number of objects in a photograph.
+        most: use only the first so many photographs (None: all).
+
+    Returns:
+        The shares by the number of the photograph; those without searches are left out.
+    """
     rates = {}
-    for index in track(range(min(most or len(scenes), len(scenes))), title, "scene"):
+    count = len(scenes) if most is None else min(most, len(scenes))
+    for index in track(range(count), title, "scene"):
         annotation = scenes.annotation(index)
         targets = legal_targets(annotation, config.max_target_area)
         if len(annotation.labels) < least or not targets:
@@ -56,57 +99,76 @@ def hit_rates(
         grid = Grid(config.columns, config.rows, annotation.size)
         covered = grid.footprint(annotation.boxes)
         goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
-        share = hit_rate(observer, detections, fixations, grid, torch.tensor(targets), goal)
-        if share is not None:
-            rates[index] = share
+        rate = hit_rate(observer, detections, fixations, grid, torch.tensor(targets), goal)
+        if rate is not None:
+            rates[index] = rate
     return rates
 
 
 def hit_rate(
     observer: Semantic, detections: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
 ) -> float | None:
-    """Share of next fixations that hit the target, over targets and looks before they fixate it; goal `(T, X·Y)`."""
+    """Compute the share of next fixations that hit the target, over targets and looks before they fixate it.
+
+    Args:
+        observer: makes the belief.
+        detections: those of R looks at a photograph.
+        fixations: `(R, 2)`, in pixels.
+        grid: the cells.
+        targets: `(T,)`, classes 1..K.
+        goal: `(T, X·Y)` boolean, the cells that hold each of them.
+
+    Returns:
+        The share; None if the first look fixates all targets.
+    """
     evidence = observer.weigh(detections, fixations, grid)
     belief = observer.start(len(targets), grid, detections.scores)
     visited = torch.zeros_like(goal)
     hits = []
     for look, cell in enumerate(grid.cell_of(fixations).tolist()):
+        # Searches that fixate their target now are over.
         going = (~goal[:, cell]).nonzero()[:, 0]
         updated = observer.update(belief[going], evidence[torch.full_like(going, look)])
-        belief.beta[going], belief.closest[going] = updated.beta, updated.closest
+        belief.beta[going] = updated.beta
+        belief.closest[going] = updated.closest
         visited[going, cell] = True
         posterior = updated.probability(targets[going]).masked_fill(visited[going], -1)
-        best = posterior == posterior.amax(-1, keepdim=True)  # of which one is drawn
-        hits.append((best & goal[going]).sum(-1) / best.sum(-1))
-    share = torch.cat(hits)
-    return float(share.mean()) if len(share) else None
+        is_best = posterior == posterior.amax(-1, keepdim=True)  # of which one is drawn
+        hits.append((is_best & goal[going]).sum(-1) / is_best.sum(-1))
+    shares = torch.cat(hits)
+    return float(shares.mean()) if len(shares) else None
 
 
 class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
 
+    settings: dict[str, Any]
+
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
         self.settings = {name: getattr(self.config, name) for name in _SETTINGS}
-        tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in _EXPONENTS]
+        tried = [f"{scores} {exponent:g}" for scores in ("raw", "calibrated") for exponent in EXPONENTS]
         self.tasks = dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
 
     def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""
-        inputs, holdout = self.inputs, self.settings["holdout"]
-        measured = partial(hit_rates, self.config, self.run.scenes, inputs.samples, least=1)
-        ways = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
-        raw = measured(Semantic(inputs.components), "raw")
+        inputs = self.inputs
+        holdout = self.settings["holdout"]
+        rates_of = partial(hit_rates, self.config, self.run.scenes, inputs.samples, least=1)
+        kinds = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
+        raw = rates_of(Semantic(inputs.components), "raw")
         rates = {
-            (scores, exponent): measured(inputs.fusing(scores, exponent), f"{scores} {exponent:g}")
-            for scores in ways
-            for exponent in _EXPONENTS
+            (scores, exponent): rates_of(inputs.fusing(scores, exponent), f"{scores} {exponent:g}")
+            for scores in kinds
+            for exponent in EXPONENTS
         }
-        means = {way: mean_hits(holdout, each) for way, each in rates.items()}
-        scores, exponent = best = max(means, key=lambda way: means[way]["fitted"])
+        means = {pair: mean_hits(holdout, by_photograph) for pair, by_photograph in rates.items()}
+        best = max(means, key=lambda pair: means[pair]["fitted"])
+        scores, exponent = best
         held_out = [index for index in raw if index % holdout == 0]
-        shares = (torch.tensor([each[index] for index in held_out]).numpy() for each in (rates[best], raw))
-        gain = Difference.of(*shares)
+        fused_rates = torch.tensor([rates[best][index] for index in held_out]).numpy()
+        raw_rates = torch.tensor([raw[index] for index in held_out]).numpy()
+        gain = Difference.of(fused_rates, raw_rates)
         before = mean_hits(holdout, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
@@ -116,7 +178,8 @@ class TemperingFit(PartFit):
             ["scores", "exponent", "next fixations that hit, %"],
             ["raw, every cell of a box", "1", f"{100 * before:.1f}"],
         ]
-        rows += [[way[0], f"{way[1]:g}", f"{100 * mean['held_out']:.1f}"] for way, mean in means.items()]
+        for (kind, value), mean in means.items():
+            rows.append([kind, f"{value:g}", f"{100 * mean['held_out']:.1f}"])
         report = section(
             f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
             f"photographs; the table shows results on {len(held_out)} held-out photographs.",

@@ -17,14 +17,31 @@ _Model = TypeVar("_Model", bound=Pretrained)
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
-    """Build the metadata of a model about its training: the photographs, and the settings that the model depends on."""
+    """Build the metadata of a model about its training.
+
+    Args:
+        config: settings of the fit.
+        scenes: the photographs.
+        besides: settings on which the model does not depend, beside those of data, detector, sensor and workers.
+
+    Returns:
+        The digest of the photographs (`data`), and the settings that the model depends on (`training`).
+    """
     left_out = {*WHERE, "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in config.plain().items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
 
 
 class Fit(NamedTuple, Generic[_Model]):
-    """The result of a fit."""
+    """The result of a fit.
+
+    Attributes:
+        model: the fitted model.
+        judged: measures on held-out photographs, a row for each number of looks.
+        trained: number of examples that it was fitted to.
+        held_out: number of examples that were held out.
+        report: the evaluation, in Markdown.
+    """
 
     model: _Model
     judged: list[dict[str, float]]
@@ -34,7 +51,18 @@ class Fit(NamedTuple, Generic[_Model]):
 
 
 def split(scene: Tensor, holdout: int) -> Tensor:
-    """Select the examples to hold out; scene `(E,)` → `(E,)`."""
+    """Select the examples to hold out.
+
+    Args:
+        scene: `(E,)`, number of the photograph of each example.
+        holdout: one in every n photographs is held out.
+
+    Returns:
+        `(E,)` boolean, true for held-out examples.
+
+    Raises:
+        DataError: all examples are of one kind.
+    """
     held_out = scene % holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(
@@ -55,9 +83,21 @@ def descend(
     rise: float = 0.3,
     title: str = "training",
 ) -> None:
-    """Train with AdamW and one cycle of the rate (Smith and Topin, 2019); a step without a loss is left out."""
+    """Train with AdamW and one cycle of the rate (Smith and Topin, 2019).
+
+    Args:
+        parameters: parameters, or groups of them with their own options, as for an optimiser.
+        loss_of: computes the loss of a step, by its number; a step without a loss (None) is left out.
+        steps: number of steps.
+        rate: highest learning rate.
+        clip: largest norm of the gradient (None: any).
+        decay: weight decay.
+        rise: share of the steps in which the rate rises.
+        title: title of the progress bar.
+    """
     optimiser = torch.optim.AdamW(parameters, lr=rate, weight_decay=decay)
-    trained = [each for group in optimiser.param_groups for each in group["params"]]
+    trained = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    # The cycle needs two steps at least.
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(steps, 2), pct_start=rise)
     with closing(task_bar(steps, title, "step")) as bar:
         for number in range(steps):

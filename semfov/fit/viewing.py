@@ -1,11 +1,12 @@
 """People who view pictures: their fixations, and the maps of the pictures, each looked at once."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,7 +28,9 @@ from semfov.runs.settings import Count, Range, Settings
 from semfov.runs.store import SceneStore
 
 LONGEST = 20  # number of fixations of a scanpath that are used, the first ones
+_SECONDS = 3.0  # time for which people view a picture, where none is given
 
+_UNIFORM = 0.02  # share of a uniform density in the centre bias, which keeps its logarithm finite
 _LAYERS = ("backbone8", "backbone16", "backbone32", "head8", "head16", "head32")
 
 
@@ -56,11 +59,12 @@ class ViewingData(Settings):
     def __post_init__(self) -> None:
         """Check that every data set has its pictures, and all or none of them a frame and a time."""
         super().__post_init__()
-        number = len(self.fixations)
-        for name, what in {"pictures": "folder", "sizes": "frame", "seconds": "time"}.items():
-            given, expected = len(getattr(self, name)), f"a {what} for each of {number} files of fixations"
-            none = not number or (not given and name != "pictures")
-            check(none or given == number, f"{self.within}{name}", expected, given)
+        files = len(self.fixations)
+        for name, thing in {"pictures": "folder", "sizes": "frame", "seconds": "time"}.items():
+            count = len(getattr(self, name))
+            may_lack = not files or (not count and name != "pictures")
+            expected = f"a {thing} for each of {files} files of fixations"
+            check(may_lack or count == files, f"{self.within}{name}", expected, count)
 
     @property
     def fingerprint(self) -> list[str]:
@@ -71,19 +75,31 @@ class ViewingData(Settings):
         ]
 
     def people(self, number: int) -> dict[str, list[Fixations]]:
-        """The scanpaths of more than one fixation of a data set, by picture."""
-        size = self.sizes[number] if number < len(self.sizes) else None
-        everyone = read_fixations(self.fixations[number], **({} if size is None else {"size": frame_of(size)}))
-        return dict([*by_picture(each for each in everyone if len(each) > 1).items()][: self.limit])
+        """Read the scanpaths of more than one fixation of a data set, by picture."""
+        options = {"size": frame_of(self.sizes[number])} if number < len(self.sizes) else {}
+        scanpaths = read_fixations(self.fixations[number], **options)
+        pictures = by_picture(scanpath for scanpath in scanpaths if len(scanpath) > 1)
+        return dict(islice(pictures.items(), self.limit))
+
+    def seconds_of(self, number: int) -> float:
+        """Time for which people viewed a picture of a data set."""
+        return self.seconds[number] if number < len(self.seconds) else _SECONDS
 
 
 @dataclass(frozen=True)
 class Viewed:
-    """Pictures of one size with their feature maps `(P, C, h, w)` in half precision, and everybody's scanpaths."""
+    """P pictures of one size, and everybody's scanpaths.
+
+    Attributes:
+        features: their feature maps `(P, C, h, w)`, in half precision.
+        people: the scanpaths in each picture.
+        seconds: time for which people viewed a picture.
+        source: number of the data set.
+    """
 
     features: FeatureMaps
     people: tuple[tuple[Fixations, ...], ...]
-    seconds: float = 3.0
+    seconds: float = _SECONDS
     source: int = 0
 
     @property
@@ -97,12 +113,14 @@ class Viewed:
     @cached_property
     def paths(self) -> list[list[Tensor]]:
         """For each picture the first fixations of each person, `(n, 2)` in pixels of it."""
-        return [[torch.from_numpy(each.points[:LONGEST]).float() for each in some] for some in self.people]
+        return [
+            [torch.from_numpy(scanpath.points[:LONGEST]).float() for scanpath in scanpaths] for scanpaths in self.people
+        ]
 
     def some(self, pictures: Sequence[int]) -> FeatureMaps:
-        """The feature maps of some pictures, in single precision."""
-        place = torch.as_tensor(pictures)
-        return replace(self.features, maps={name: each[place].float() for name, each in self.features.maps.items()})
+        """Select the feature maps of some pictures, in single precision."""
+        numbers = torch.as_tensor(pictures)
+        return replace(self.features, maps={name: maps[numbers].float() for name, maps in self.features.maps.items()})
 
     @cached_property
     def counts(self) -> Tensor:
@@ -112,11 +130,20 @@ class Viewed:
 
 
 def counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
-    """Numbers of fixations of each path but its first in cells, `(paths, rows, columns)`."""
+    """Count the fixations of each path but its first in cells.
+
+    Args:
+        paths: fixations `(n, 2)` of each path, in pixels.
+        size: `(height, width)` of the picture.
+        cells: numbers of rows and columns.
+
+    Returns:
+        The counts, `(paths, rows, columns)`.
+    """
     counts = torch.zeros(len(paths), cells[0] * cells[1])
     for row, path in zip(counts, paths, strict=True):
-        at = _numbers_of_cells(path[1:], size, cells)
-        row.index_add_(0, at, torch.ones(len(at)))
+        numbers = _numbers_of_cells(path[1:], size, cells)
+        row.index_add_(0, numbers, torch.ones(len(numbers)))
     return counts.unflatten(1, cells)
 
 
@@ -128,7 +155,13 @@ def _numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, i
 
 
 class MapSource(NamedTuple):
-    """What gives the maps of pictures `(1, 3, H, W)`: their names, and the settings that they depend on."""
+    """What gives the maps of pictures.
+
+    Attributes:
+        layers: names of the maps.
+        maps: computes them of a picture `(1, 3, H, W)`.
+        what: the settings that they depend on.
+    """
 
     layers: tuple[str, ...]
     maps: Callable[[Tensor], FeatureMaps]
@@ -136,77 +169,117 @@ class MapSource(NamedTuple):
 
 
 def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
-    """Feature maps of a detector; without `layers` those of the shipped model, or else of its backbone and head."""
+    """Read feature maps of a detector.
+
+    Args:
+        detector: the detector.
+        layers: names of the maps (none: those of the shipped model, or else of the detector's backbone and head).
+
+    Returns:
+        The source of the maps.
+    """
     shipped = None if layers else FixationDensity.if_shipped(detector.name)
     if shipped is not None:
         layers = tuple(shipped.layers)
     if not layers:
-        have = detector.features(torch.zeros(1, 3, 64, 64)).maps
-        layers = tuple(name for name in _LAYERS if name in have) or tuple(have)
+        available = detector.features(torch.zeros(1, 3, 64, 64)).maps
+        layers = tuple(name for name in _LAYERS if name in available) or tuple(available)
     what = {"detector": detector.settings(), "layers": list(layers)}
     return MapSource(tuple(layers), lambda image: detector.features(image, [*layers]), what)
 
 
 def look(data: ViewingData, source: MapSource) -> list[Viewed]:
-    """Look at all pictures, or read their maps from the cache; those of one data set and size are together."""
-    # Dimensions are numbered, as a dash in the name of a layer would be a minus in theirs.
-    fields = {
-        name: Field((f"channels {n}", f"rows {n}", f"columns {n}"), torch.float16, finite=False)
-        for n, name in enumerate(source.layers)
-    }
-    schema = Schema(fields | {"placed": Field((8,), torch.float64)})
-    code = modules_digest(*LOOK_SOURCES, "semfov.gaze.saliency", "semfov.detection", __name__)
-    store = SceneStore(store_folder(data.cache) / "viewing", source.what, code, schema)
-    groups = []
+    """Look at all pictures, or read their maps from the cache.
+
+    Args:
+        data: pictures and fixations.
+        source: gives the maps.
+
+    Returns:
+        The pictures, those of one data set and size together.
+    """
+    store = _MapStore(data.cache, source)
+    groups: list[Viewed] = []
     for number, root in enumerate(data.pictures):
         people = data.people(number)
-        scenes = Pictures(root, people, ())
-
-        def seen(scenes: Pictures = scenes, people: Mapping[str, list[Fixations]] = people) -> Iterable[_Seen]:
-            for index, name in enumerate(tqdm(scenes.ids, desc="looking", unit="picture")):
-                digest = scenes.digest(index)
-                kept = store.read(digest)
-                if kept is None:
-                    features = source.maps(scenes[index].image[None])
-                    place = features.placement
-                    placed = [*place.size, *place.scale, *place.offset, *features.canvas]
-                    halves = {name: each[0].half() for name, each in features.maps.items()}
-                    kept = halves | {"placed": torch.tensor(placed, dtype=torch.float64)}
-                    store.write(digest, kept)
-                width, height, across, down, left, top, *canvas = kept["placed"].tolist()
-                placement = Placement((int(width), int(height)), (across, down), (left, top))
-                maps = {name: kept[name][None] for name in source.layers}
-                yield (
-                    FeatureMaps(maps, (int(canvas[0]), int(canvas[1])), placement, Detections.empty(0, 0)),
-                    people[str(name)],
-                )
-
-        groups += _grouped(seen(), data.seconds[number] if number < len(data.seconds) else 3.0, number)
+        groups += _grouped(_looks(store, Pictures(root, people, ()), people), data.seconds_of(number), number)
     return groups
 
 
-_Seen = tuple[FeatureMaps, Sequence[Fixations]]  # the maps of a picture, and the fixations in it
+_ViewedPicture = tuple[FeatureMaps, Sequence[Fixations]]  # the maps of a picture, and the fixations in it
 
 
-def _grouped(seen: Iterable[_Seen], seconds: float = 3.0, source: int = 0) -> list[Viewed]:
-    """Pictures of one data set with the scanpaths in them, by the size of the pictures."""
-    kept: dict[Any, list[_Seen]] = {}
+def _looks(store: "_MapStore", scenes: Pictures, people: Mapping[str, Sequence[Fixations]]) -> Iterator[_ViewedPicture]:
+    """Look at the pictures of a data set, one after the other."""
+    for index, name in enumerate(tqdm(scenes.ids, desc="looking", unit="picture")):
+        yield store.maps(scenes, index), people[str(name)]
+
+
+class _MapStore:
+    """Maps of pictures in half precision, each computed once and kept on disk."""
+
+    def __init__(self, cache: Path | None, source: MapSource) -> None:
+        self.source = source
+        # Dimensions are numbered, as a dash in the name of a layer would be a minus in theirs.
+        fields = {
+            name: Field((f"channels {n}", f"rows {n}", f"columns {n}"), torch.float16, finite=False)
+            for n, name in enumerate(source.layers)
+        }
+        schema = Schema(fields | {"placed": Field((8,), torch.float64)})
+        code = modules_digest(*LOOK_SOURCES, "semfov.gaze.saliency", "semfov.detection", __name__)
+        self.store = SceneStore(store_folder(cache) / "viewing", source.what, code, schema)
+
+    def maps(self, scenes: Pictures, index: int) -> FeatureMaps:
+        """Read the maps of a picture, `(1, C, h, w)`, or compute and store them."""
+        digest = scenes.digest(index)
+        tensors = self.store.read(digest)
+        if tensors is None:
+            tensors = _pack(self.source.maps(scenes[index].image[None]))
+            self.store.write(digest, tensors)
+        return _unpack(tensors, self.source.layers)
+
+
+def _pack(features: FeatureMaps) -> dict[str, Tensor]:
+    """Convert the maps of one picture to tensors for a file."""
+    placement = features.placement
+    numbers = [*placement.size, *placement.scale, *placement.offset, *features.canvas]
+    maps = {name: batch[0].half() for name, batch in features.maps.items()}
+    return maps | {"placed": torch.tensor(numbers, dtype=torch.float64)}
+
+
+def _unpack(tensors: Mapping[str, Tensor], layers: Sequence[str]) -> FeatureMaps:
+    """Convert the tensors of `_pack` back to maps."""
+    width, height, x_scale, y_scale, left, top, canvas_width, canvas_height = tensors["placed"].tolist()
+    placement = Placement((int(width), int(height)), (x_scale, y_scale), (left, top))
+    maps = {name: tensors[name][None] for name in layers}
+    return FeatureMaps(maps, (int(canvas_width), int(canvas_height)), placement, Detections.empty(0, 0))
+
+
+def _grouped(looks: Iterable[_ViewedPicture], seconds: float = _SECONDS, source: int = 0) -> list[Viewed]:
+    """Collect the pictures of one data set with the scanpaths in them, by the size of the pictures."""
+    by_size: dict[tuple[Placement, tuple[int, int]], list[_ViewedPicture]] = {}
     with torch.inference_mode():
-        for features, people in seen:
+        for features, people in looks:
             size = features.placement.size
-            moved = tuple(each.resized(size) for each in people)
-            kept.setdefault((features.placement, features.canvas), []).append((features, moved))
+            scanpaths = tuple(scanpath.resized(size) for scanpath in people)
+            by_size.setdefault((features.placement, features.canvas), []).append((features, scanpaths))
     groups = []
-    for several in kept.values():
-        first = several[0][0]
-        maps = {name: torch.cat([features.maps[name].half() for features, _ in several]) for name in first.maps}
-        everyone = tuple(tuple(some) for _, some in several)
-        groups.append(Viewed(replace(first, maps=maps, detections=Detections.empty(0, 0)), everyone, seconds, source))
+    for pictures in by_size.values():
+        first, _ = pictures[0]
+        maps = {name: torch.cat([features.maps[name].half() for features, _ in pictures]) for name in first.maps}
+        features = replace(first, maps=maps, detections=Detections.empty(0, 0))
+        groups.append(Viewed(features, tuple(tuple(people) for _, people in pictures), seconds, source))
     return groups
 
 
 class Events(NamedTuple):
-    """Fixations to be predicted, all but the first of a path: those before `(E, N, 2)`, cell and person."""
+    """E fixations to be predicted, all but the first of a path.
+
+    Attributes:
+        before: `(E, N, 2)`, the fixations before each, the last one last; NaN where there were fewer.
+        cell: `(E,)`, number of the cell.
+        person: `(E,)`, number of the path.
+    """
 
     before: Tensor
     cell: Tensor
@@ -214,25 +287,37 @@ class Events(NamedTuple):
 
     @classmethod
     def of(cls, paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> "Events":
-        """The events of a picture of `(height, width)` with cells `(rows, columns)`."""
+        """Make the events of a picture of `(height, width)` with cells `(rows, columns)`."""
         before = [torch.zeros(0, LONGEST - 1, 2)]
         for path in paths:
             padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
             before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
-        cell = _numbers_of_cells(torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)]), size, cells)
-        person = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(path) - 1 for path in paths]).long())
-        return cls(torch.cat(before), cell, person)
+        points = torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)])
+        counts = torch.tensor([len(path) - 1 for path in paths]).long()
+        person = torch.arange(len(paths)).repeat_interleave(counts)
+        return cls(torch.cat(before), _numbers_of_cells(points, size, cells), person)
 
     def some(self, index: Tensor) -> "Events":
-        return Events(*(each[index] for each in self))
+        """Select events by number."""
+        return Events(self.before[index], self.cell[index], self.person[index])
 
 
 def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, blur: float = 2.5) -> Tensor:
-    """Log density of all fixations of data sets, all alike, blurred and mixed with 2 % uniform, on 39 × 52 cells."""
-    total, floor = torch.zeros(39, 52), 0.02
-    for group, some in zip(groups, pictures, strict=True):
-        if len(some):
-            seen = group.counts[torch.as_tensor(some)].sum(0)
-            smooth = blurred(F.interpolate(seen[None, None], total.shape, mode="bilinear")[0, 0], torch.tensor(blur))
+    """Compute the log density of all fixations, blurred and mixed with 2 % uniform; all groups count alike.
+
+    Args:
+        groups: pictures of one size each, with everybody's scanpaths.
+        pictures: numbers of the pictures of each group.
+        blur: standard deviation of the blur, in cells.
+
+    Returns:
+        The log density, `(39, 52)`.
+    """
+    total = torch.zeros(39, 52)
+    for group, numbers in zip(groups, pictures, strict=True):
+        if len(numbers):
+            counts = group.counts[torch.as_tensor(numbers)].sum(0)
+            resized = F.interpolate(counts[None, None], total.shape, mode="bilinear")[0, 0]
+            smooth = blurred(resized, torch.tensor(blur))
             total += smooth / smooth.sum()
-    return ((1 - floor) * total / total.sum() + floor / total.numel()).log()
+    return ((1 - _UNIFORM) * total / total.sum() + _UNIFORM / total.numel()).log()

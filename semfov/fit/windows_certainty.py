@@ -1,4 +1,12 @@
-"""Fit the probability that an object of a large picture is there, on explorations of pictures."""
+"""Fit the probability that an object of a large picture is there, on explorations of pictures.
+
+The looks of an exploration merge to objects. Of each the merge tells facts (`semfov.zoom.certainty.FACTS`), and the
+annotation whether it is right:
+
+    looks 1 … n ─► merged objects ─► facts ─► probability that an object is there ─┐
+                                                                                    ├─► expected number, with a spread
+    remaining, promised ─► objects that no look has shown ──────────────────────────┘
+"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -10,6 +18,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.scene import Annotation, Scenes
+from semfov.fit.logistic import logistic_regression
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.progress import track
 from semfov.runs.tables import table
@@ -24,11 +33,12 @@ from semfov.zoom.objects import merge_with_facts
 _AFTER = (3, 6, 12, 24)  # numbers of looks after which objects are taken
 _EXPECTING = (1, 2, 4, 8, 16, 24)  # numbers of looks after which the number of further objects is taken
 _FURTHER = 2  # explorations are this many times as long as they may be for users, to see what further looks show
+
+# Values of the numbers of `Certainty` that are tried for objects that no look has shown.
 _SCALES = tuple(0.05 * 1.25**n for n in range(21))
 _STRENGTHS = tuple(2.0**n for n in range(-2, 9))
 _FAINT = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
 _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
-
 
 _SPREADS = tuple(0.05 * n for n in range(41))
 _FEW = 40  # below this number of claims the spread is not less than that of a model for which none was fitted
@@ -36,13 +46,24 @@ _CHECKED = (8, 24)
 """Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""
 _COVERED = 0.8  # share of the pictures in which the annotated number should be within two errors of the expected one
 
+PicturesByKind = Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]]
+"""Pictures by the name of their kind, with the looks at each."""
+
 
 class Exploration(NamedTuple):
-    """An exploration of a picture for all classes, or for a target of which it holds a number of objects."""
+    """An exploration of a picture, judged by its annotation.
+
+    Attributes:
+        target: class that it looks for; None for all classes.
+        held: number of objects of the target in the picture, without crowds.
+        objects: after some numbers of looks, facts about the objects `(n, 14)`, and whether they are right `(n,)`: 1,
+            0, or -1 in a crowd.
+        remaining: after each look, the numbers of objects that the evidence expects in clear and in faint cells.
+        promised: after each look, the number of objects that the looks so far were expected to show.
+    """
 
     target: int | None
     held: int
-    # After numbers of looks, facts about the objects `(n, 14)`, and whether they are right `(n,)`, -1 in a crowd.
     objects: dict[int, tuple[Tensor, Tensor]]
     remaining: list[tuple[float, float]]
     promised: list[float]
@@ -58,22 +79,23 @@ class Exploration(NamedTuple):
         remaining: list[tuple[float, float]],
         promised: list[float],
     ) -> Self:
-        """The exploration with some looks, judged after the given numbers of them."""
+        """Judge looks at a picture after the given numbers of them; the other arguments are attributes."""
         objects = {}
         for number in sorted(numbers):
-            found, facts = merge_with_facts(looks[:number], lattice, target)
-            objects[number] = facts, right_boxes(found, annotation)
+            merged, facts = merge_with_facts(looks[:number], lattice, target)
+            objects[number] = facts, right_boxes(merged, annotation)
         held = int(((annotation.labels == (target or 0)) & ~annotation.crowd).sum())
         return cls(target, held, objects, remaining, promised)
 
     @property
     def looks(self) -> int:
+        """Number of looks."""
         return len(self.promised)
 
-    def sums(self, certainty: Certainty, number: int) -> tuple[float, float]:
-        """The sums of the probabilities of the objects after the first look, and after a number of them."""
-        first, after = (float(certainty.probability(self.objects[n][0]).double().sum()) for n in (1, number))
-        return first, after
+    def sum_after(self, certainty: Certainty, number: int) -> float:
+        """Sum the probabilities of the objects after a number of looks."""
+        facts, _ = self.objects[number]
+        return float(certainty.probability(facts).double().sum())
 
     def number(self, certainty: Certainty, number: int) -> tuple[float, float] | None:
         """Mean and variance of the number of objects after some looks, without a spread; None where none is claimed."""
@@ -81,108 +103,135 @@ class Exploration(NamedTuple):
         chances = certainty.probability(facts)
         if not (chances >= 0.5).any() or not reacts(chances):
             return None
-        first, after = self.sums(certainty, number)
+        discoveries = self.sum_after(certainty, number) - self.sum_after(certainty, 1)
         unseen = certainty.unseen(
-            self.remaining[number - 1], promised=self.promised[number - 1], discoveries=max(after - first, 0.0)
+            self.remaining[number - 1], promised=self.promised[number - 1], discoveries=max(discoveries, 0.0)
         )
         return number_of(chances[right >= 0], unseen, 0.0)
 
 
 @torch.inference_mode()
 def explorations_of_kinds(
-    model: GlimpseEvidence, some: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]], passes: int
+    model: GlimpseEvidence, pictures: PicturesByKind, passes: int
 ) -> dict[str, list[Exploration]]:
-    """Explore pictures by kind, for objects of all classes and for those of the most frequent class of each."""
-    explored: dict[str, list[Exploration]] = {kind: [] for kind in some}
-    for kind, (pictures, opened) in some.items():
+    """Explore pictures by kind, for objects of all classes and for those of the most frequent class of each.
+
+    Args:
+        model: evidence by magnification, which chooses the looks.
+        pictures: the pictures, with their stored looks.
+        passes: number of looks that users may make; explorations are longer.
+
+    Returns:
+        The explorations by kind.
+    """
+    explored: dict[str, list[Exploration]] = {kind: [] for kind in pictures}
+    for kind, (scenes, opened) in pictures.items():
         for index, looks in enumerate(track(opened, f"exploring, {kind}", "picture")):
-            annotation = pictures.annotation(index)
+            annotation = scenes.annotation(index)
             for target in (None, int(annotation.labels.bincount().argmax())):
-                window_looks: list[WindowLook] = []
-                remaining, promised = [], [0.0]
-                for step in islice(find_everything(looks, model, target), _FURTHER * passes):
-                    window_looks.append(step.look)
-                    remaining.append(step.belief.remaining())
-                    promised.append(promised[-1] + (step.worth if len(window_looks) > 1 else 0.0))
-                counts = {min(n, len(window_looks)) for n in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
-                explored[kind].append(
-                    Exploration.of(target, window_looks, counts, looks.lattice, annotation, remaining, promised[1:])
-                )
+                explored[kind].append(_explore(model, looks, annotation, target, passes))
             looks.save()
     return explored
 
 
-def logistic_regression(
-    facts: Tensor, right: Tensor, *, times: Tensor | None = None, ridge: float = 1.0, steps: int = 30
-) -> list[float]:
-    """Fit a logistic regression by maximum likelihood, with Newton's method: offset and weights.
-
-    Shapes: facts `(n, m)`, right `(n,)`, times `(n,)`: how often each case counts; None: once.
-    """
-    # Half a case for and against without any facts keeps the result finite where all cases are right or all wrong.
-    inputs = torch.cat([facts.double(), facts.new_zeros(2, facts.shape[1], dtype=torch.float64)])
-    inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
-    there = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
-    weight = torch.ones(len(inputs), dtype=torch.float64)
-    weight[-2:] = 0.5
-    if times is not None:
-        weight[:-2] = times
-    prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
-    prior[0] = 1e-6
-    coefficients = torch.zeros_like(prior)
-    for _ in range(steps):
-        chance = (inputs @ coefficients).sigmoid()
-        gradient = inputs.T @ (weight * (there - chance)) - prior * coefficients
-        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
-        step = torch.linalg.solve(curvature, gradient).clamp(-2, 2)
-        coefficients = coefficients + step
-        if float(step.abs().max()) < 1e-9:
-            break
-    return coefficients.tolist()
+def _explore(
+    model: GlimpseEvidence, looks: StoredWindowLooks, annotation: Annotation, target: int | None, passes: int
+) -> Exploration:
+    """Explore a picture for all classes, or for a target."""
+    seen: list[WindowLook] = []
+    remaining: list[tuple[float, float]] = []
+    promised: list[float] = []
+    for step in islice(find_everything(looks, model, target), _FURTHER * passes):
+        seen.append(step.look)
+        remaining.append(step.belief.remaining())
+        # Nothing was promised before the look at the whole.
+        promised.append(promised[-1] + step.worth if promised else 0.0)
+    numbers = {min(number, len(seen)) for number in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
+    return Exploration.of(target, seen, numbers, looks.lattice, annotation, remaining, promised)
 
 
 def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tensor]:
     """Facts about the objects of explorations after some numbers of looks, and which are right, without crowds."""
-    after = [
-        each.objects[n]
-        for each in explored
-        for n in sorted({min(number, each.looks, passes) for number in (*_AFTER, passes)})
-    ]
+    after = []
+    for exploration in explored:
+        numbers = sorted({min(number, exploration.looks, passes) for number in (*_AFTER, passes)})
+        after += [exploration.objects[number] for number in numbers]
     facts, right = (torch.cat(column) for column in zip(*after, strict=True))
-    return facts[right >= 0], right[right >= 0] > 0
+    counted = right >= 0
+    return facts[counted], right[counted] > 0
 
 
-def _fitted(explored: Sequence[Exploration], passes: int) -> Certainty:
+def _fit_certainty(explored: Sequence[Exploration], passes: int) -> Certainty:
     """Fit the probability of objects, and then the number of objects that further looks show."""
     offset, *weights = logistic_regression(*_judged(explored, passes))
     return _fit_unseen(Certainty(offset, tuple(weights)), explored)
 
 
+class _Growth(NamedTuple):
+    """How the sum of probabilities grows from some look of an exploration to its end, or of n, each `(n,)`.
+
+    Attributes:
+        clear: objects that the evidence expects in clear cells.
+        faint: objects that it expects in faint cells.
+        promised: objects that the looks were expected to show.
+        discovered: objects that they showed beyond the first look.
+        now: sum of the probabilities.
+        last: sum of the probabilities after all looks.
+    """
+
+    clear: float
+    faint: float
+    promised: float
+    discovered: float
+    now: float
+    last: float
+
+
+def _growth_of(exploration: Exploration, certainty: Certainty) -> list[_Growth]:
+    """How the sum of probabilities grows after some numbers of looks of an exploration."""
+    numbers = [number for number in _EXPECTING if number < exploration.looks]
+    if not numbers:
+        return []
+    first = exploration.sum_after(certainty, 1)
+    last = exploration.sum_after(certainty, exploration.looks)
+    growth = []
+    for number in numbers:
+        clear, faint = exploration.remaining[number - 1]
+        now = exploration.sum_after(certainty, number)
+        discovered = max(now - first, 0.0)
+        growth.append(_Growth(clear, faint, exploration.promised[number - 1], discovered, now, max(last, now)))
+    return growth
+
+
 def _fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certainty:
     """Fit the number of objects that further looks show, by least squares of logarithms over a grid."""
-    cases = []
-    for each in explored:  # for all classes: of a single one some pictures hold hundreds of a few pixels
-        numbers = [n for n in _EXPECTING if n < each.looks] if each.target is None else []
-        end = each.sums(certainty, each.looks)[1] if numbers else 0.0
-        for number in numbers:
-            first, sums = each.sums(certainty, number)
-            shown = max(sums - first, 0.0), sums, max(end, sums)
-            cases.append((*each.remaining[number - 1], each.promised[number - 1], *shown))
-    if not cases:
+    growth: list[_Growth] = []
+    for exploration in explored:
+        # Of a single class some pictures hold hundreds of a few pixels.
+        if exploration.target is None:
+            growth += _growth_of(exploration, certainty)
+    if not growth:
         return certainty
-    clear, faint, promised, discoveries, now, last = torch.tensor(cases, dtype=torch.float64).unbind(-1)
+    clear, faint, promised, discovered, now, last = torch.tensor(growth, dtype=torch.float64).unbind(-1)
 
-    def error(scale: float, strength: float, share: float, promise: float) -> float:
-        factor = (strength * scale + discoveries) / (strength + promise * promised)
+    def error(numbers: tuple[float, float, float, float]) -> float:
+        scale, strength, share, promise = numbers
+        factor = (strength * scale + discovered) / (strength + promise * promised)
         expected = now + factor * (clear + share * faint)
         return float((expected.log1p() - last.log1p()).square().mean())
 
-    chosen = min(product(_SCALES, _STRENGTHS, _FAINT, _PROMISES), key=lambda four: error(*four))
-    return Certainty(certainty.offset, certainty.weights, *chosen)
+    best = min(product(_SCALES, _STRENGTHS, _FAINT, _PROMISES), key=error)
+    return Certainty(certainty.offset, certainty.weights, *best)
 
 
 class _Numbers(NamedTuple):
-    """Claimed numbers of pictures of a kind after some looks: mean, variance and the annotated number; each `(n,)`."""
+    """Claimed numbers of objects of n pictures of a kind after some looks, each `(n,)`.
+
+    Attributes:
+        mean: expected numbers.
+        variance: their variances.
+        held: annotated numbers.
+    """
 
     mean: Tensor
     variance: Tensor
@@ -199,39 +248,63 @@ def left_out(
     fit: Callable[[Sequence[Exploration]], Certainty],
     checked: Sequence[int] = _CHECKED,
 ) -> dict[tuple[str, int], _Numbers]:
-    """The numbers claimed in pictures of each kind, by kind and number of looks, fitted on the other kinds alone."""
+    """Claim numbers in pictures of each kind with a certainty that was fitted to the other kinds.
+
+    Args:
+        explored: explorations by kind.
+        fit: fits a certainty to explorations.
+        checked: numbers of looks after which numbers are claimed.
+
+    Returns:
+        The numbers by kind and number of looks.
+    """
     numbers = {}
-    for kind, some in explored.items():
-        others = [each for other, group in explored.items() if other != kind for each in group]
+    for kind, explorations in explored.items():
+        others = [exploration for other, group in explored.items() if other != kind for exploration in group]
         if not others:
             continue
         certainty = fit(others)
-        # Where all looks show less than half of the annotated objects, most are too small for any look.
-        shown = [each for each in some if 2 * int((each.objects[each.looks][1] > 0).sum()) >= each.held]
+        judged = [
+            exploration for exploration in explorations if exploration.target is not None and _shows_half(exploration)
+        ]
         for after in checked:
-            claims = [
-                (*claim, each.held)
-                for each in shown
-                if each.target is not None
-                for claim in [each.number(certainty, min(after, each.looks))]
-                if claim is not None
-            ]
-            if claims:
-                numbers[kind, after] = _Numbers(*torch.tensor(claims, dtype=torch.float64).unbind(-1))
+            rows = []
+            for exploration in judged:
+                claim = exploration.number(certainty, min(after, exploration.looks))
+                if claim is not None:
+                    rows.append((*claim, exploration.held))
+            if rows:
+                numbers[kind, after] = _Numbers(*torch.tensor(rows, dtype=torch.float64).unbind(-1))
     return numbers
 
 
+def _shows_half(exploration: Exploration) -> bool:
+    """Tell whether all looks show half of the annotated objects; where they do not, most are too small for any look."""
+    _, right = exploration.objects[exploration.looks]
+    return 2 * int((right > 0).sum()) >= exploration.held
+
+
 def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list[str]]:
-    """The least spread that covers enough of the pictures, in the mean over kinds and looks; and the report."""
-    least = SPREAD if sum(len(each.mean) for each in numbers.values()) < _FEW else 0.0
-    tried = (spread for spread in _SPREADS if spread >= least)
-    needed = _COVERED * len(numbers)
-    spread = next((s for s in tried if sum(each.covered(s) for each in numbers.values()) >= needed), _SPREADS[-1])
+    """Find the least spread that covers enough of the pictures, in the mean over kinds and looks.
+
+    Args:
+        numbers: claimed and annotated numbers by kind and number of looks.
+
+    Returns:
+        The spread, and lines of Markdown about it.
+    """
+    claims = sum(len(of_kind.mean) for of_kind in numbers.values())
+    least = SPREAD if claims < _FEW else 0.0
+    spread = _SPREADS[-1]
+    for candidate in _SPREADS:
+        covered = sum(of_kind.covered(candidate) for of_kind in numbers.values())
+        if candidate >= least and covered >= _COVERED * len(numbers):
+            spread = candidate
+            break
     rows = [["left out", "looks", "pictures", "within two errors", "with no spread"]]
-    rows += [
-        [kind, f"{after}", f"{len(each.mean)}", *(f"{each.covered(s):.2f}" for s in (spread, 0.0))]
-        for (kind, after), each in numbers.items()
-    ]
+    for (kind, after), of_kind in numbers.items():
+        shares = (of_kind.covered(spread), of_kind.covered(0.0))
+        rows.append([kind, f"{after}", f"{len(of_kind.mean)}", *(f"{share:.2f}" for share in shares)])
     return spread, [
         f"Spread of the expected number of objects of the most frequent class of a picture: {spread:.2f}. Pictures, of "
         "those in which the looks show at least half of these objects, in which the annotated number is within two "
@@ -243,9 +316,18 @@ def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list
 
 
 def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:
-    """Fit the spread on explorations; the report in Markdown."""
+    """Fit the spread of a model's certainty.
+
+    Args:
+        model: evidence by magnification, with a certainty.
+        explored: explorations by kind.
+        passes: number of looks that users may make.
+
+    Returns:
+        Lines of Markdown; none where no number is claimed.
+    """
     assert model.certainty is not None
-    numbers = left_out(explored, partial(_fitted, passes=passes))
+    numbers = left_out(explored, partial(_fit_certainty, passes=passes))
     if not numbers:
         return []
     spread, lines = fit_spread(numbers)
@@ -254,32 +336,40 @@ def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Explora
 
 
 def certainty_again(
-    model: GlimpseEvidence,
-    fitted: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]],
-    judged: Mapping[str, tuple[Scenes, Sequence[StoredWindowLooks]]],
-    *,
-    passes: int,
+    model: GlimpseEvidence, fitted: PicturesByKind, judged: PicturesByKind, *, passes: int
 ) -> list[str]:
-    """Fit the certainty of a model on some kinds of pictures, and evaluate it on others."""
-    kinds = explorations_of_kinds(model, fitted, passes)
-    training = [each for group in kinds.values() for each in group]
-    held_out = [each for group in explorations_of_kinds(model, judged, passes).values() for each in group]
-    model.certainty = _fitted(training, passes)
-    told = spread_again(model, kinds, passes)
+    """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
+
+    Args:
+        model: evidence by magnification; it gets the certainty.
+        fitted: pictures to fit on.
+        judged: pictures to evaluate on.
+        passes: number of looks that users may make.
+
+    Returns:
+        Lines of Markdown.
+    """
+    by_kind = explorations_of_kinds(model, fitted, passes)
+    training = [exploration for group in by_kind.values() for exploration in group]
+    held_out = [exploration for group in explorations_of_kinds(model, judged, passes).values() for exploration in group]
+    certainty = _fit_certainty(training, passes)
+    model.certainty = certainty
+    report_on_spread = spread_again(model, by_kind, passes)
     facts, right = _judged(held_out, passes)
-    chances = model.certainty.probability(facts)
-    sure, error = chances >= 0.5, BinarySums.of(chances, right).ece
-    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, model.certainty.weights, strict=True))
+    chances = certainty.probability(facts)
+    is_listed = chances >= 0.5
+    error = BinarySums.of(chances, right).ece
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, certainty.weights, strict=True))
     return [
         f"Probability of an object, fitted on {len(_judged(training, passes)[1])} objects: offset "
-        f"{model.certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {model.certainty.scale:.3f}, "
-        f"strength {model.certainty.strength:g}, faint cells {model.certainty.faint:g}, promises "
-        f"{model.certainty.promise:g}.",
+        f"{certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {certainty.scale:.3f}, "
+        f"strength {certainty.strength:g}, faint cells {certainty.faint:g}, promises "
+        f"{certainty.promise:g}.",
         "",
         f"Of {len(right)} objects in pictures of held-out photographs {int(right.sum())} are right and "
         f"{float(chances.sum()):.0f} are expected; the expected calibration error is {error:.3f}. Of the "
-        f"{int(sure.sum())} from probability 0.5 on, {int(right[sure].sum())} are right and "
-        f"{float(chances[sure].sum()):.0f} expected.",
+        f"{int(is_listed.sum())} from probability 0.5 on, {int(right[is_listed].sum())} are right and "
+        f"{float(chances[is_listed].sum()):.0f} expected.",
         "",
-        *told,
+        *report_on_spread,
     ]

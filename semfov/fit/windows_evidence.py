@@ -1,10 +1,19 @@
-"""Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find."""
+"""Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find.
+
+A picture is looked at in windows of all magnifications. Each look is paired with the closer windows inside it, whose
+results it should predict:
+
+    overview ──────────────────┐ predicts ┌► window, one octave closer ─┐ predicts ┌► window, two octaves closer
+    (its gist: scores by cell) ┘          └──── predicts, a step more ──┼──────────┘
+
+A prediction by a closer look builds on that of the overview for the same window (`before`).
+"""
 
 import json
 import random
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,9 +31,23 @@ from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLooks, half_steps
 
+_SHOWN_CLASSES, _HINTED_CLASSES = 8, 4
+"""Largest numbers of classes of a mosaic, shown clearly and only hinted at, whose rates are fitted in one step."""
+_HINT = 0.02  # score from which on a class is hinted at
+_CLOSER_LOOKS = 2
+"""Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
+_LEAST_RATE = 1e-6  # keeps logarithms of expected numbers finite
+
 
 class _WindowResult(NamedTuple):
-    """A look at a window and its results; show `(K,)`, found `(M,)`."""
+    """A look at a window of a picture with M objects.
+
+    Attributes:
+        window: the window.
+        gist: what the look hints at in its cells; None for the closest looks.
+        show: `(K,)`, highest score of each class.
+        found: `(M,)` boolean, the objects that a detection of their class shows.
+    """
 
     window: Window
     gist: Gist | None
@@ -33,7 +56,14 @@ class _WindowResult(NamedTuple):
 
 
 class ZoomExample(NamedTuple):
-    """A mosaic with looks at many windows; a look shows a class with a score of `least`; labels `(M,)`."""
+    """A picture with looks at many windows.
+
+    Attributes:
+        lattice: the lattice of its windows.
+        labels: `(M,)`, classes of its objects.
+        looks: the looks; the overview is the first with a gist.
+        least: score from which on a look shows a class.
+    """
 
     lattice: Lattice
     labels: Tensor
@@ -43,39 +73,79 @@ class ZoomExample(NamedTuple):
     @staticmethod
     def windows(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
         """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
-        tiles = pictures.tiles(index) if isinstance(pictures, Mosaics) else []
-        slots: Any = [tuple(map(float, tile.slot)) for tile in tiles]
-        return [*half_steps(lattice), *(Window.around(lattice, slot) for slot in slots)]
+        windows = [*half_steps(lattice)]
+        if isinstance(pictures, Mosaics):
+            for tile in pictures.tiles(index):
+                x1, y1, x2, y2 = map(float, tile.slot)
+                windows.append(Window.around(lattice, (x1, y1, x2, y2)))
+        return windows
 
     @classmethod
     def of(cls, pictures: Scenes, index: int, source: WindowLooks, least: float = LEAST) -> "ZoomExample":
         """Look at all windows of a picture, and collect which objects are shown with a detection of their class."""
-        annotation, looks = pictures.annotation(index), []
+        annotation = pictures.annotation(index)
+        looks = []
         for look in source.see(cls.windows(pictures, index, source.lattice)):
             detections = look.detections
-            sure = detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
-            boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
+            is_sure = detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
+            boxes = detections.boxes[0, is_sure]
+            labels = detections.labels[0, is_sure]
             hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
             looks.append(_WindowResult(look.window, look.gist, look.show, hits.any(0)))
         return cls(source.lattice, annotation.labels, tuple(looks), least)
 
+    @property
+    def predicting(self) -> list[_WindowResult]:
+        """The looks that predict closer ones, the overview first."""
+        return [look for look in self.looks if look.gist is not None]
 
-_Cells = tuple[int, int, int, int]  # first column and row, and those after the last
+
+class _CloserWindow(NamedTuple):
+    """A closer look inside a look.
+
+    Attributes:
+        number: its number among the looks of the picture.
+        result: the look.
+        steps: octaves by which it is closer.
+        cells: first column and row of the outer look's cells that it shows, and those after the last.
+    """
+
+    number: int
+    result: _WindowResult
+    steps: int
+    cells: tuple[int, int, int, int]
 
 
-def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[tuple[int, _WindowResult, int, _Cells]]:
-    """The closer looks inside a look, by number, as far as it predicts them (an overview all), and the cells shown."""
-    high, wide = (n * look.scale for n in look.scores.shape[:2])
-    for place, closer in enumerate(example.looks):
-        steps = closer.window.level - look.level
-        x1, y1, x2, y2 = (cell - first for cell, first in zip(closer.window.cells, look.first * 2, strict=True))
-        inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-        if 1 <= steps <= STEPS and (inside or look.level == 0):
-            yield place, closer, steps, (x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale))
+def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[_CloserWindow]:
+    """Find the closer looks inside a look, as far as it predicts them; an overview predicts all."""
+    rows, columns = look.scores.shape[:2]
+    height = rows * look.scale
+    width = columns * look.scale
+    left, top = look.first
+    for number, result in enumerate(example.looks):
+        steps = result.window.level - look.level
+        # In cells of the lattice, from the corner of the look.
+        x1, y1, x2, y2 = result.window.cells
+        x1, x2 = x1 - left, x2 - left
+        y1, y2 = y1 - top, y2 - top
+        is_inside = x1 >= 0 and y1 >= 0 and x2 <= width and y2 <= height
+        if 1 <= steps <= STEPS and (is_inside or look.level == 0):
+            cells = (x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale))
+            yield _CloserWindow(number, result, steps, cells)
 
 
 class Windows(NamedTuple):
-    """Pairs of a look and a closer window inside it; scores and presence `(N, K)`, summary `(N, 3)`, others `(N,)`."""
+    """N pairs of a look and a closer window inside it.
+
+    Attributes:
+        scores: `(N, K)`, scores of the look in the cells of the window, pooled.
+        summary: `(N, 3)`, what these cells hold of any class.
+        steps: `(N,)`, octaves by which the window is closer.
+        presence: `(N, K)` boolean, whether the closer look shows each class.
+        before: `(N,)`, number of the pair of the overview and this window; -1 for the pairs of overviews.
+        slot: `(N,)` boolean, whether the window is that of a photograph of a mosaic.
+        mosaic: `(N,)`, number of the picture.
+    """
 
     scores: Tensor
     summary: Tensor
@@ -85,31 +155,74 @@ class Windows(NamedTuple):
     slot: Tensor
     mosaic: Tensor
 
+    @property
+    def of_overviews(self) -> Tensor:
+        """Numbers of the pairs whose look is an overview."""
+        return (self.before < 0).nonzero()[:, 0]
 
-def pair_windows(examples: list[ZoomExample]) -> Windows:
-    """Pair every look with every closer window inside it."""
-    rows: list[tuple[Tensor, Tensor, int, Tensor, int, bool, int]] = []
+    @property
+    def of_closer_looks(self) -> Tensor:
+        """Numbers of the other pairs."""
+        return (self.before >= 0).nonzero()[:, 0]
+
+
+def pair_windows(examples: Sequence[ZoomExample]) -> Windows:
+    """Pair every look with every closer window inside it.
+
+    Args:
+        examples: pictures with looks at many windows.
+
+    Returns:
+        The pairs.
+    """
+    scores: list[Tensor] = []
+    summaries: list[Tensor] = []
+    steps: list[int] = []
+    presence: list[Tensor] = []
+    before: list[int] = []
+    slots: list[bool] = []
+    mosaics: list[int] = []
     for number, example in enumerate(examples):
-        first: dict[int, int] = {}
-        for look in (each.gist for each in example.looks if each.gist is not None):
-            for place, closer, steps, box in _closer_windows(example, look):
-                pooled, summary = pool(look.scores, box)
-                before = -1 if look.level == 0 else first.get(place, -1)
-                if look.level == 0:
-                    first[place] = len(rows)
-                elif before < 0:
+        by_overview: dict[int, int] = {}  # number of the overview's pair by that of the closer look
+        for look in example.predicting:
+            assert look.gist is not None
+            is_overview = look.gist.level == 0
+            for closer in _closer_windows(example, look.gist):
+                if is_overview:
+                    by_overview[closer.number] = len(scores)
+                elif closer.number not in by_overview:
                     continue
-                slot = closer.window.within is not None
-                rows.append((pooled, summary, steps, closer.show >= example.least, before, slot, number))
-    columns: list[Any] = [*zip(*rows, strict=True)]
-    whole = [torch.tensor(columns[place]) for place in (2, 4, 5, 6)]
-    return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
+                pooled, summary = pool(look.gist.scores, closer.cells)
+                scores.append(pooled)
+                summaries.append(summary)
+                steps.append(closer.steps)
+                presence.append(closer.result.show >= example.least)
+                before.append(-1 if is_overview else by_overview[closer.number])
+                slots.append(closer.result.window.within is not None)
+                mosaics.append(number)
+    return Windows(
+        torch.stack(scores),
+        torch.stack(summaries),
+        torch.tensor(steps),
+        torch.stack(presence),
+        torch.tensor(before),
+        torch.tensor(slots),
+        torch.tensor(mosaics),
+    )
 
 
 def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
-    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes."""
-    own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
-    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
+    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes.
+
+    Args:
+        model: evidence by magnification.
+        windows: pairs of a look and a closer window.
+        steps: number of training steps.
+        batch: number of pairs of overviews in a step; half as many of closer looks are added.
+        rate: highest learning rate.
+    """
+    first = windows.of_overviews
+    later = windows.of_closer_looks
 
     def loss_of(_: int) -> Tensor:
         loss = presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
@@ -117,162 +230,230 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
             loss = loss + presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
         return loss
 
+    parameters = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
     model.train()
-    descend(own, loss_of, steps, rate, clip=None, decay=1.0, title="learning what closer looks show")
+    descend(parameters, loss_of, steps, rate, clip=None, decay=1.0, title="learning what closer looks show")
     model.eval()
 
 
 def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the mean cross-entropy of `_presence_log_odds` over rows and classes."""
-    odds = _presence_log_odds(model, windows, rows)
-    return F.binary_cross_entropy_with_logits(odds, windows.presence[rows].to(odds))
+    """Compute the mean cross-entropy of whether closer looks show each class, over some pairs, by number `(n,)`."""
+    log_odds = _presence_log_odds(model, windows, rows)
+    return F.binary_cross_entropy_with_logits(log_odds, windows.presence[rows].to(log_odds))
 
 
 def _presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the log-odds that closer looks show each class."""
+    """Compute the log odds that closer looks show each class, `(n, K)`; those of closer looks build on the overview."""
     before = None
     if bool((windows.before[rows] >= 0).all()):
-        training = model.training
+        is_training = model.training
         model.eval()
         with torch.no_grad():
             before = _presence_log_odds(model, windows, windows.before[rows])
-        model.train(training)
+        model.train(is_training)
     return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
 
 
-def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
-    """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window."""
+def fit_rates(model: GlimpseEvidence, examples: Sequence[ZoomExample], steps: int, batch: int = 4) -> None:
+    """Fit the expected number of objects that closer looks find, by its Poisson likelihood in every window.
+
+    Args:
+        model: evidence by magnification.
+        examples: pictures with looks at many windows.
+        steps: number of training steps.
+        batch: number of pictures in a step.
+    """
 
     def loss_of(_: int) -> Tensor:
         chosen = random.sample(examples, min(batch, len(examples)))
         return torch.stack([_rate_loss(model, example) for example in chosen]).mean()
 
-    own = [*model.rate.parameters(), model.prior, model.border]
-    descend(own, loss_of, steps, 6e-3, decay=0.1, title="learning the expected number of objects")
+    parameters = [*model.rate.parameters(), model.prior, model.border]
+    descend(parameters, loss_of, steps, 6e-3, decay=0.1, title="learning the expected number of objects")
 
 
 def _rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
-    """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic."""
-    strongest = torch.stack([look.show for look in example.looks]).amax(0)
-    sure = strongest >= example.least
-    kinds = ((sure, 8), ((strongest >= 0.02) & ~sure, 4))
-    targets = torch.cat([_some(kind.nonzero()[:, 0] + 1, most) for kind, most in kinds])
-    if not len(targets):
-        targets = _some(torch.arange(len(strongest)) + 1, 1)
-    looks = [look for look in example.looks if look.gist is not None]
-    overview, *others = looks
+    """Compute the negative log likelihood of the numbers of objects found in the windows of a picture."""
+    targets = _drawn_targets(example)
+    overview, *others = example.predicting
     assert overview.gist is not None
-    logs = model.rates(overview.gist, targets)
-    losses = [_likelihood_loss(model, example, overview.gist, logs, targets, overview.found)]
-    for closer in random.sample(others, min(2, len(others))):
+    log_rates = model.rates(overview.gist, targets)
+    losses = [_likelihood_loss(model, example, overview.gist, log_rates, targets, overview.found)]
+    for closer in random.sample(others, min(_CLOSER_LOOKS, len(others))):
         assert closer.gist is not None
-        before = _rates_before(overview.gist, logs.detach(), closer.gist)
+        before = _rates_before(overview.gist, log_rates.detach(), closer.gist)
+        closer_log_rates = model.rates(closer.gist, targets, before)
         earlier = overview.found | closer.found
-        closer_logs = model.rates(closer.gist, targets, before)
-        losses.append(_likelihood_loss(model, example, closer.gist, closer_logs, targets, earlier))
+        losses.append(_likelihood_loss(model, example, closer.gist, closer_log_rates, targets, earlier))
     return torch.stack(losses).mean()
 
 
-def _some(values: Tensor, most: int) -> Tensor:
+def _drawn_targets(example: ZoomExample) -> Tensor:
+    """Draw classes of a picture, 1..K: some that its looks show, and some that they only hint at; at least one."""
+    strongest = torch.stack([look.show for look in example.looks]).amax(0)
+    is_shown = strongest >= example.least
+    is_hinted = (strongest >= _HINT) & ~is_shown
+    targets = torch.cat(
+        [
+            _drawn(is_shown.nonzero()[:, 0] + 1, _SHOWN_CLASSES),
+            _drawn(is_hinted.nonzero()[:, 0] + 1, _HINTED_CLASSES),
+        ]
+    )
+    return targets if len(targets) else _drawn(torch.arange(len(strongest)) + 1, 1)
+
+
+def _drawn(values: Tensor, most: int) -> Tensor:
+    """Draw at most so many of the values."""
     return values[torch.randperm(len(values))[:most]]
 
 
-def _rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
+def _rates_before(first: Gist, log_rates: Tensor, look: Gist) -> Tensor:
     """Rates of the overview `(T, 3, …)` in the cells of a closer look, for windows an octave closer, `(T, …)`."""
-    cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
-    rows, columns = (n * look.scale for n in look.scores.shape[:2])
-    part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
-    return torch.stack([before_of(one.numpy(), look) for one in part[:, min(look.level, STEPS - 1)]])
+    # The rate of a cell of the overview spreads over the cells of the lattice in it.
+    rates = log_rates.exp() / first.scale**2
+    cells = rates.repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
+    rows, columns = (count * look.scale for count in look.scores.shape[:2])
+    left, top = look.first
+    shown = cells[..., top : top + rows, left : left + columns]
+    return torch.stack([before_of(of_target.numpy(), look) for of_target in shown[:, min(look.level, STEPS - 1)]])
 
 
 def _likelihood_loss(
-    model: GlimpseEvidence, example: ZoomExample, look: Gist, logs: Tensor, targets: Tensor, earlier: Tensor
+    model: GlimpseEvidence, example: ZoomExample, look: Gist, log_rates: Tensor, targets: Tensor, earlier: Tensor
 ) -> Tensor:
-    """Compute the mean negative log likelihood over the closer windows inside a look."""
-    rates = logs.exp()
+    """Compute the mean negative log likelihood over the closer windows inside a look.
+
+    Shapes: log_rates `(T, 3, rows, columns)`, targets `(T,)`, earlier `(M,)`: the objects that were found before.
+    """
+    rates = log_rates.exp()
     terms = []
-    for _, closer, steps, (x1, y1, x2, y2) in _closer_windows(example, look):
-        if closer.window.within is not None:  # only windows of the lattice
+    for closer in _closer_windows(example, look):
+        if closer.result.window.within is not None:  # only windows of the lattice
             continue
+        x1, y1, x2, y2 = closer.cells
         weight = model.taper(x2 - x1)
-        part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
-        expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
-        new = example.labels[closer.found & ~earlier]
+        inside = rates[:, closer.steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
+        expected = torch.einsum("tyx,y,x->t", inside, weight[: inside.shape[1]], weight[: inside.shape[2]])
+        new = example.labels[closer.result.found & ~earlier]
         count = (new == targets[:, None]).sum(-1)
-        terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
-    return torch.stack(terms).mean() if terms else logs.sum() * 0
+        terms.append(_poisson_loss(expected, count).mean())
+    return torch.stack(terms).mean() if terms else log_rates.sum() * 0
+
+
+def _poisson_loss(expected: Tensor, count: Tensor) -> Tensor:
+    """Compute the negative log likelihood of counts by their expected numbers, up to a constant."""
+    return expected - count * expected.clamp(min=_LEAST_RATE).log()
+
+
+class _Counts(NamedTuple):
+    """Numbers of new objects that n closer looks of one size found, each `(n,)`.
+
+    Attributes:
+        rows: first row of the outer look's cells that they show.
+        columns: first column.
+        new: numbers of objects that no earlier look had found.
+    """
+
+    rows: Tensor
+    columns: Tensor
+    new: Tensor
 
 
 class _LookCounts(NamedTuple):
-    """A look, and how many new objects each of the closer looks inside it found; counts `(N,)`."""
+    """A look, and how many new objects each of the closer looks inside it found.
+
+    Attributes:
+        gist: the look.
+        counts: numbers by octaves and by the side of the closer looks, in cells.
+    """
 
     gist: Gist
-    counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
+    counts: dict[tuple[int, int], _Counts]
 
     @classmethod
-    def of(cls, example: ZoomExample, looked: _WindowResult, earlier: Tensor) -> "_LookCounts":
-        """Compare a look with all closer looks inside it; earlier `(M,)`."""
-        by_size = defaultdict(list)
-        assert looked.gist is not None
-        for _, closer, steps, (x1, y1, x2, _) in _closer_windows(example, looked.gist):
-            if closer.window.within is None:
-                by_size[steps, x2 - x1].append((y1, x1, int((closer.found & ~earlier).sum())))
-        counts = {key: torch.tensor(rows).unbind(-1) for key, rows in by_size.items()}
-        return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
+    def of(cls, example: ZoomExample, look: _WindowResult, earlier: Tensor) -> "_LookCounts":
+        """Compare a look with all closer looks inside it; earlier `(M,)`, the objects that were found before."""
+        assert look.gist is not None
+        by_size: dict[tuple[int, int], list[tuple[int, int, int]]] = defaultdict(list)
+        for closer in _closer_windows(example, look.gist):
+            if closer.result.window.within is None:
+                x1, y1, x2, _ = closer.cells
+                new = int((closer.result.found & ~earlier).sum())
+                by_size[closer.steps, x2 - x1].append((y1, x1, new))
+        return cls(look.gist, {size: _Counts(*torch.tensor(rows).unbind(-1)) for size, rows in by_size.items()})
 
-    def loss(self, survey: Survey, logs: Tensor) -> Tensor:
-        """Mean Poisson negative log likelihood of the numbers, up to a constant; logs `(3, rows, columns)`."""
-        rates = logs.exp()
+    def loss(self, survey: Survey, log_rates: Tensor) -> Tensor:
+        """Mean Poisson negative log likelihood of the numbers, up to a constant; log_rates `(3, rows, columns)`."""
+        rates = log_rates.exp()
         terms = []
-        for (steps, span), (rows, columns, new) in self.counts.items():
-            weight = survey.taper(span)
-            # Windows of an overview may reach beyond the picture.
-            low, left = min(int(rows.min()), 0), min(int(columns.min()), 0)
-            high, right = (
-                max(int(n.max()) + span - size, 0) for n, size in zip((rows, columns), rates.shape[1:], strict=True)
-            )
-            cells = F.pad(rates[None, steps - 1], (-left, right, -low, high))
-            sums = F.conv2d(F.conv2d(cells[None], weight[None, None, None]), weight[None, None, :, None])[0, 0]
-            expected = sums[rows - low, columns - left]
-            terms.append(expected - new * expected.clamp(min=1e-6).log())
-        return torch.cat(terms).mean() if terms else logs.sum() * 0
+        for (steps, span), counts in self.counts.items():
+            expected = _expected_in_windows(rates[steps - 1], survey.taper(span), counts.rows, counts.columns)
+            terms.append(_poisson_loss(expected, counts.new))
+        return torch.cat(terms).mean() if terms else log_rates.sum() * 0
+
+
+def _expected_in_windows(rates: Tensor, weight: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Sum rates over square windows, weighted towards their middle.
+
+    Args:
+        rates: `(height, width)`, rate of each cell.
+        weight: `(span,)`, weights along a side of a window.
+        rows: `(n,)`, first row of each window.
+        columns: `(n,)`, first column.
+
+    Returns:
+        The sums, `(n,)`.
+    """
+    height, width = rates.shape
+    span = len(weight)
+    # Windows of an overview may reach beyond the picture, where nothing is expected.
+    above = max(-int(rows.min()), 0)
+    before = max(-int(columns.min()), 0)
+    below = max(int(rows.max()) + span - height, 0)
+    after = max(int(columns.max()) + span - width, 0)
+    cells = F.pad(rates[None], (before, after, above, below))
+    sums = F.conv2d(F.conv2d(cells[None], weight[None, None, None]), weight[None, None, :, None])[0, 0]
+    return sums[rows + above, columns + before]
 
 
 class SurveyExample(NamedTuple):
-    """A mosaic: its overview and its closer looks, each with the numbers of new objects that looks inside it found."""
+    """A picture: its overview and its closer looks, each with the numbers of new objects that looks inside it found."""
 
     overview: _LookCounts
     closer: tuple[_LookCounts, ...]
 
     @classmethod
     def of(cls, example: ZoomExample) -> "SurveyExample":
-        """Prepare a mosaic for the fit."""
-        overview, *others = (look for look in example.looks if look.gist is not None)
-        first = overview.found
-        closer = (_LookCounts.of(example, look, first | look.found) for look in others)
-        return cls(_LookCounts.of(example, overview, first), tuple(closer))
+        """Prepare a picture for the fit."""
+        overview, *others = example.predicting
+        closer = (_LookCounts.of(example, look, overview.found | look.found) for look in others)
+        return cls(_LookCounts.of(example, overview, overview.found), tuple(closer))
 
     def losses(self, survey: Survey, closer: Sequence[_LookCounts]) -> list[Tensor]:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
-        first = self.overview.gist
-        logs = survey.rates(first)
-        losses = [self.overview.loss(survey, logs[0])]
-        for counted in closer:
-            before = _rates_before(first, logs.detach(), counted.gist)
-            losses.append(counted.loss(survey, survey.rates(counted.gist, before=before)[0]))
+        overview = self.overview.gist
+        log_rates = survey.rates(overview)
+        losses = [self.overview.loss(survey, log_rates[0])]
+        for look in closer:
+            before = _rates_before(overview, log_rates.detach(), look.gist)
+            losses.append(look.loss(survey, survey.rates(look.gist, before=before)[0]))
         return losses
 
 
-_LATER = 2  # closer looks of a mosaic, beside its overview, whose predictions are fitted in one step
-
-
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:
-    """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood."""
+    """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood.
+
+    Args:
+        survey: predicts the numbers of objects of any class.
+        examples: pictures with the numbers of new objects that their looks found.
+        steps: number of training steps.
+        batch: number of pictures in a step.
+    """
 
     def loss_of(_: int) -> Tensor:
         losses = []
         for example in random.sample(examples, min(batch, len(examples))):
-            closer = random.sample(example.closer, min(_LATER, len(example.closer)))
+            closer = random.sample(example.closer, min(_CLOSER_LOOKS, len(example.closer)))
             losses.append(torch.stack(example.losses(survey, closer)).mean())
         return torch.stack(losses).mean()
 
@@ -280,28 +461,47 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
 
 
 @torch.no_grad()
-def judge_windows(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
+def judge_windows(model: GlimpseEvidence, examples: Sequence[ZoomExample]) -> tuple[str, str]:
+    """Evaluate the prediction of closer looks on held-out pictures.
+
+    Args:
+        model: evidence by magnification.
+        examples: mosaics of held-out photographs with looks at many windows.
+
+    Returns:
+        The report in Markdown, and its measures as JSON.
+    """
     windows = pair_windows(examples)
-    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
+    later = windows.of_closer_looks
+    figures = {"cross-entropy, overview": float(presence_loss(model, windows, windows.of_overviews))}
     if len(later):
         figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
         figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
-    slots = first[windows.slot[first]]
-    odds, presence = _presence_log_odds(model, windows, slots), windows.presence[slots]
-    passes: dict[str, list[int]] = defaultdict(list)
-    for mosaic in windows.mosaic[slots].unique():
-        here = windows.mosaic[slots] == mosaic
-        for target in presence[here].any(0).nonzero()[:, 0].tolist():
-            hits = presence[here, target]
-            for name, value in (("evidence", odds), ("raw score", windows.scores[slots])):
-                order = value[here, target].argsort(descending=True, stable=True)
-                passes[name].append(2 + int(hits[order].int().argmax()))
-    for name, counts in passes.items():
-        figures[f"passes to the first hit, {name}"] = sum(counts) / len(counts)
+    for name, passes in _passes_to_first_hit(model, windows).items():
+        figures[f"passes to the first hit, {name}"] = sum(passes) / len(passes)
     losses = torch.stack([_rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
-    lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
     rows = [["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())]
-    lines += [*table(rows), ""]
-    return "\n".join(lines), json.dumps(figures, indent=1)
+    report = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", "", *table(rows), ""]
+    return "\n".join(report), json.dumps(figures, indent=1)
+
+
+def _passes_to_first_hit(model: GlimpseEvidence, windows: Windows) -> dict[str, list[int]]:
+    """Passes until a look at a photograph of a mosaic shows a class, by the evidence of the overview and by its scores.
+
+    One number for each class that a photograph of a mosaic shows; none without mosaics.
+    """
+    first = windows.of_overviews
+    slots = first[windows.slot[first]]
+    values = {"evidence": _presence_log_odds(model, windows, slots), "raw score": windows.scores[slots]}
+    presence = windows.presence[slots]
+    passes: dict[str, list[int]] = defaultdict(list)
+    for mosaic in windows.mosaic[slots].unique():
+        in_mosaic = windows.mosaic[slots] == mosaic
+        for target in presence[in_mosaic].any(0).nonzero()[:, 0].tolist():
+            hits = presence[in_mosaic, target]
+            for name, value in values.items():
+                order = value[in_mosaic, target].argsort(descending=True, stable=True)
+                # The overview is a pass, too.
+                passes[name].append(2 + int(hits[order].int().argmax()))
+    return passes

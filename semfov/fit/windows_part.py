@@ -1,6 +1,6 @@
 """The part of a model folder for large pictures: evidence by magnification, fitted on mosaics of the photographs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any
 
@@ -8,14 +8,13 @@ import numpy as np
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.detector_report import Difference, mean_percent, section
+from semfov.fit.detector_report import Difference, curves_table, mean_percent, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_evidence import judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.io.manifest import Part
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
@@ -39,46 +38,35 @@ _LOOK = 0.04  # estimate of the seconds of a pass of the detector
 class WindowsFit(PartFit):
     """Fit evidence by magnification on mosaics of the photographs, with its decisions."""
 
+    settings: FitMosaicsConfig | dict[str, str]
+
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
-        photographs, held_out = len(self.run.scenes), len(inputs.held_out)
-        why = None
+        why = self._why_left_out()
+        if why is not None:
+            self.settings = {"left out": why}
+            self.tasks = {}
+            return
+        self.settings = self.mosaics(len(self.run.scenes))
+        self.tasks = _tasks(self.settings)
+
+    def _why_left_out(self) -> str | None:
+        """The reason why the part is not fitted; None if it is."""
+        photographs = len(self.run.scenes)
+        held_out = len(self.inputs.held_out)
         if not self.config.windows:
-            why = "not fitted, since the setting `windows` is false"
-        elif held_out < _ENOUGH:
-            why = (
+            return "not fitted, since the setting `windows` is false"
+        if held_out < _ENOUGH:
+            return (
                 f"not fitted, since mosaics need at least {_ENOUGH} held-out photographs, and {held_out} of the "
                 f"{photographs} photographs are held out"
             )
-        self.settings: FitMosaicsConfig | dict[str, str]
-        if why is not None:
-            self.settings, self.tasks = {"left out": why}, {}
-            return
-        self.settings = config = self.mosaics(photographs)
-        sets = {"searched": config.searched, "judged": config.judged}
-        self.tasks = {
-            "looking": 60 * _LOOK * (config.mosaics + config.crowded + config.judged + 4 * config.far),
-            "learning what closer looks show": 0.1 * config.steps,
-            "learning the expected number of objects": 0.2 * config.steps,
-            "learning the survey": 0.4 * config.survey_steps,
-            **{f"searching, {kind}": 4 * count for kind, count in sets.items()},
-            "fitting decisions": 0.01 * config.judging,
-            "looking closely": 4 * config.searched,
-            "looking closely at held-out pictures": 4 * config.judged,
-            "looking at photographs": 25 * _LOOK * config.photographs,
-            **{f"exploring, {kind}": 2 * count for kind, count in (sets | config.some_explored).items()},
-        }
+        return None
 
     def mosaics(self, photographs: int) -> FitMosaicsConfig:
         """Return the settings for so many photographs; each to learn from is in about four mosaics, unless many are."""
-        own, held_out = self.config, -(-photographs // (self.config.holdout or 5))
+        held_out = -(-photographs // (self.config.holdout or 5))
         training = min(photographs - held_out, _FOR_MOSAICS)
-        # The photographs are not enlarged.
-        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
-        width = min(
-            median(max(width, height * 4 / 3) for width, height in sizes),
-            _OF_INPUT * self.run.eye.detector.input_size[0],
-        )
         return self.inputs.settings(
             FitMosaicsConfig,
             sensor=SensorConfig(),
@@ -90,58 +78,93 @@ class WindowsFit(PartFit):
             sought=3,
             passes=16,
             photographs=min(photographs, _ALONE),
-            tile=max(16, round(width)),
-            steps=own.window_steps,
-            survey_steps=own.window_steps,
+            tile=max(16, round(self._tile_width())),
+            steps=self.config.window_steps,
+            survey_steps=self.config.window_steps,
         )
+
+    def _tile_width(self) -> float:
+        """Width of the slot of a photograph in a mosaic, in which photographs are not enlarged."""
+        sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
+        usual = median(max(width, height * 4 / 3) for width, height in sizes)
+        return min(usual, _OF_INPUT * self.run.eye.detector.input_size[0])
 
     def fit(self) -> PartResult:
         """Fit, and compare the objects found with those of slices in the order of the overview's scores."""
-        config = self.settings
-        if isinstance(config, dict):
-            why = config["left out"]
-            return PartResult(Part(None, None, False, why), f"{why.capitalize()}.")
+        if isinstance(self.settings, dict):
+            return self.left_out(self.settings["left out"])
         with one_thread():
-            fit = MosaicFit(config, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
-            model, figures = _fit_mosaics(fit)
-            judged, opened = fit.mosaics["judged"], fit.opened("judged")
-            ways = {"fitted": model, "raw": None}
-            curves = {name: _photograph_recalls(judged, opened, way) for name, way in ways.items()}
-        gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
-        at = _RECALL_PASSES[-1] - 1
-        why = (
-            f"{100 * curves['fitted'][:, at].mean():.1f} % of the objects are found in {_RECALL_PASSES[-1]} passes, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % in slices in the order of raw scores; on average over the "
-            f"passes {gain.in_words('points gained', 100)}"
-        )
-        rows = [["looks", *(f"after {n} passes" for n in _RECALL_PASSES), "mean"]]
-        rows += [
-            [name, *(mean_percent(curve[:, n - 1]) for n in _RECALL_PASSES), mean_percent(curve.mean(1))]
-            for name, curve in curves.items()
-        ]
-        text = section(
-            f"Objects found in {len(judged)} mosaics of {len(judged.tiles(0))} held-out photographs, in % of the "
-            f"objects of each photograph, and the mean over 1 to {_RECALL_PASSES[-1]} passes. `raw` looks at slices in "
-            "the order of the sums of the overview's raw scores, as the agent does without this part.",
-            rows,
-        )
-        return PartResult(self.write("windows", model, gain.better, why), "\n".join([text, figures]))
+            fit = MosaicFit(self.settings, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
+            model, report = _fit_mosaics(fit)
+            mosaics = fit.mosaics["judged"]
+            opened = fit.opened("judged")
+            curves = {
+                "fitted": _photograph_recalls(mosaics, opened, model),
+                "raw": _photograph_recalls(mosaics, opened, None),
+            }
+        gain, why = _compare(curves)
+        part = self.write("windows", model, gain.better, why)
+        return PartResult(part, "\n".join([_report_on_curves(curves, mosaics), report]))
+
+
+def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
+    """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds."""
+    searched = {"searched": config.searched, "judged": config.judged}
+    explored = searched | config.some_explored
+    looked = config.mosaics + config.crowded + config.judged + 4 * config.far
+    return {
+        "looking": 60 * _LOOK * looked,
+        "learning what closer looks show": 0.1 * config.steps,
+        "learning the expected number of objects": 0.2 * config.steps,
+        "learning the survey": 0.4 * config.survey_steps,
+        **{f"searching, {kind}": 4 * count for kind, count in searched.items()},
+        "fitting decisions": 0.01 * config.judging,
+        "looking closely": 4 * config.searched,
+        "looking closely at held-out pictures": 4 * config.judged,
+        "looking at photographs": 25 * _LOOK * config.photographs,
+        **{f"exploring, {kind}": 2 * count for kind, count in explored.items()},
+    }
+
+
+def _compare(curves: Mapping[str, FloatArray]) -> tuple[Difference, str]:
+    """Compare the mean recall over passes with that of slices; the difference, and the sentence about it."""
+    gain = Difference.of(curves["fitted"].mean(1), curves["raw"].mean(1))
+    passes = _RECALL_PASSES[-1]
+    return gain, (
+        f"{100 * curves['fitted'][:, passes - 1].mean():.1f} % of the objects are found in {passes} passes, "
+        f"{100 * curves['raw'][:, passes - 1].mean():.1f} % in slices in the order of raw scores; on average over the "
+        f"passes {gain.in_words('points gained', 100)}"
+    )
+
+
+def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str:
+    head = ["looks", *(f"after {passes} passes" for passes in _RECALL_PASSES)]
+    rows = curves_table(head, curves, [passes - 1 for passes in _RECALL_PASSES])
+    means = ["mean", *(mean_percent(curve.mean(1)) for curve in curves.values())]
+    return section(
+        f"Objects found in {len(mosaics)} mosaics of {len(mosaics.tiles(0))} held-out photographs, in % of the "
+        f"objects of each photograph, and the mean over 1 to {_RECALL_PASSES[-1]} passes. `raw` looks at slices in "
+        "the order of the sums of the overview's raw scores, as the agent does without this part.",
+        [[*row, mean] for row, mean in zip(rows, means, strict=True)],
+    )
 
 
 def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
     """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
     examples = fit.look(("near", "far", "crowded", "judged"))
-    model = fit.closer(examples)
-    fit.survey(model, examples)
-    lines = [judge_windows(model, examples["judged"])[0], *fit.decisions(model)]
+    model = fit.fit_prediction(examples)
+    fit.fit_survey(model, examples)
+    report, _ = judge_windows(model, examples["judged"])
+    lines = [report, *fit.fit_decisions(model)]
     shipped = [
         GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
     ]
-    lines += fit.verification(model, mean_of([each.verification for each in shipped if each.verification is not None]))
-    lines += fit.certainty(model)
-    alone = [each.photograph.verification for each in shipped if each.photograph is not None]
+    of_windows = [other.verification for other in shipped if other.verification is not None]
+    lines += fit.fit_verification(model, mean_of(of_windows))
+    lines += fit.fit_certainty(model)
+    of_photographs = [other.photograph.verification for other in shipped if other.photograph is not None]
     scenes = make_scenes(fit.config.data, fit.eye.detector.classes)
-    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(alone))]
+    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(of_photographs))]
     return model, "\n".join(lines)
 
 
@@ -150,21 +173,30 @@ def _photograph_recalls(
     mosaics: Mosaics, opened: Sequence[StoredWindowLooks], model: GlimpseEvidence | None
 ) -> FloatArray:
     """Recall in each photograph of mosaics after each pass, `(P, 16)`; without a model by slices, as by an agent."""
-    hits, there = np.zeros((len(mosaics.scenes), _RECALL_PASSES[-1])), np.zeros(len(mosaics.scenes))
+    passes = _RECALL_PASSES[-1]
+    hits = np.zeros((len(mosaics.scenes), passes))
+    objects = np.zeros(len(mosaics.scenes))
     for index, source in enumerate(opened):
-        tiles, annotation = mosaics.tiles(index), mosaics.annotation(index)
-        photograph = np.repeat(
-            [tile.scene for tile in tiles], [len(mosaics.scenes.annotation(tile.scene).boxes) for tile in tiles]
-        )
-        np.add.at(there, photograph, 1)
+        annotation = mosaics.annotation(index)
+        # The photograph of each object of the mosaic.
+        photographs = [tile.scene for tile in mosaics.tiles(index)]
+        counts = [len(mosaics.scenes.annotation(photograph).boxes) for photograph in photographs]
+        photograph_of_object = np.repeat(photographs, counts)
+        np.add.at(objects, photograph_of_object, 1)
         history: list[WindowLook] = []
-        steps: Iterator[WindowStep[Any]] = look_by_look(source, ranked(usual_slices(source.lattice)), None)
-        if model is not None:
-            steps = find_everything(source, model)
-        for number in range(_RECALL_PASSES[-1]):
+        steps = _steps(source, model)
+        for number in range(passes):
             step = next(steps, None)
             if step is not None:
                 history.append(step.look)
-            np.add.at(hits[:, number], photograph, found_in(history, annotation).numpy())
+            np.add.at(hits[:, number], photograph_of_object, found_in(history, annotation).numpy())
         source.save()
-    return hits[there > 0] / there[there > 0, None]
+    is_shown = objects > 0
+    return hits[is_shown] / objects[is_shown, None]
+
+
+def _steps(source: StoredWindowLooks, model: GlimpseEvidence | None) -> Iterator[WindowStep[Any]]:
+    """Look for all objects of a mosaic by a model, or without one at slices in the order of raw scores."""
+    if model is None:
+        return look_by_look(source, ranked(usual_slices(source.lattice)), None)
+    return find_everything(source, model)

@@ -1,7 +1,8 @@
 """Looks at scenes from every cell of a grid, kept on disk."""
 
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -12,21 +13,54 @@ from semfov.detection.detections import Detections
 from semfov.episode import EpisodeLook, Looks
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import LookingConfig
+from semfov.runs.config import DataConfig, DetectorConfig, LookingConfig, SensorConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store, look_everywhere
 
 
+class LookingSettings(Protocol):
+    """Settings of looks from every cell, as an `EyeConfig` with `cells` has them."""
+
+    @property
+    def data(self) -> DataConfig:
+        """The scenes."""
+
+    @property
+    def detector(self) -> DetectorConfig:
+        """The detector."""
+
+    @property
+    def sensor(self) -> SensorConfig:
+        """The sensor."""
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+
+    @property
+    def cache(self) -> Path | None:
+        """Folder of the store."""
+
+
 class Looking(SceneRun):
-    """Scenes, and an eye that looks at each from every cell; settings are those of an `EyeConfig` with `cells`."""
+    """Scenes, and an eye that looks at each from every cell.
 
-    cells: tuple[int, int]
+    Attributes:
+        config: the settings.
+        cells: columns and rows of the grid.
+        eye: sensor and detector.
+        scenes: the scenes.
+        store: the looks on disk.
+    """
 
-    def __init__(self, config: Any) -> None:
+    config: LookingSettings
+
+    def __init__(self, config: LookingSettings) -> None:
         self.config = config
-        columns, rows = self.cells = config.cells
+        self.cells = config.cells
+        columns, rows = config.cells
         self.check_sources()
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
@@ -44,16 +78,30 @@ class Looking(SceneRun):
         return make_scenes(self.config.data, self.eye.detector.classes)
 
     def depends_on(self) -> dict[str, Any]:
+        """List the settings of the eye, and the cells."""
         return {"eye": self.eye.settings(), "cells": [*self.cells]}
 
     def grid(self, index: int) -> Grid:
+        """Lay the cells over a scene."""
         return Grid(*self.cells, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:
-        """Detections from every cell of a scene, read from the store, or computed and stored."""
-        store = None if isinstance(self.config, LookingConfig) and not self.config.store else self.store
-        image, digest = (lambda: self.scenes[index].image[None]), (lambda: self.digest(index))
-        return look_everywhere(self.eye, image, self.grid(index), store, digest)
+        """Look at a scene from every cell, or read the looks from the store.
+
+        Args:
+            index: number of the scene.
+
+        Returns:
+            The detections, a batch with a row for each cell.
+        """
+        keeps_none = isinstance(self.config, LookingConfig) and not self.config.store
+        return look_everywhere(
+            self.eye,
+            lambda: self.scenes[index].image[None],
+            self.grid(index),
+            None if keeps_none else self.store,
+            lambda: self.digest(index),
+        )
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Look at a scene; there are no episodes, so there are no records."""
@@ -61,7 +109,7 @@ class Looking(SceneRun):
         return [], {}
 
     def stored(self, index: int) -> bytes | None:
-        """The looks at a scene, which fits read."""
+        """Return the file of the looks at a scene, which fits read."""
         tensors = self.store.read(self.digest(index))
         return None if tensors is None else pack_tensors(tensors)
 
@@ -72,10 +120,20 @@ class Looking(SceneRun):
 
 
 class CellLooks(Looks):
-    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it."""
+    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it.
+
+    Attributes:
+        look: gives the detections from a cell, by number.
+        grid: the cells.
+        like: a tensor of the type and on the device of beliefs.
+        target: class that is searched for, 1..K; None for all.
+    """
 
     def __init__(self, look: Callable[[int], Detections], grid: Grid, like: Tensor, target: int | None = None) -> None:
-        self.look, self.grid, self.like, self.target = look, grid, like, target
+        self.look = look
+        self.grid = grid
+        self.like = like
+        self.target = target
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Look, and weigh; the fixations are the centres of the cells."""

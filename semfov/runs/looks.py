@@ -29,15 +29,25 @@ def one_thread() -> Iterator[None]:
 def photograph_looks(
     eye: Eye, image: Callable[[], Tensor], grid: Grid
 ) -> Callable[[int | tuple[float, ...]], Detections]:
-    """Looks of an eye at a photograph `(1, 3, H, W)`: from a cell, by number, or closely at a box, by its corners."""
-    view: View | None = None
+    """Return what looks at a photograph: from a cell, by number, or closely at a box, by its corners.
+
+    Args:
+        eye: the eye.
+        image: gives the photograph, `(1, 3, H, W)`; it is called once, at the first look.
+        grid: the cells.
+
+    Returns:
+        A function from a look to its detections, a batch of one without padding.
+    """
     image = cache(image)
+    view: View | None = None  # opened at the first look from a cell
 
     def look(action: int | tuple[float, ...]) -> Detections:
         nonlocal view
         if isinstance(action, tuple):
             return tight(eye.close_up(image(), torch.tensor(action)))
-        view = eye.open(image()) if view is None else view
+        if view is None:
+            view = eye.open(image())
         return tight(eye.look(view, grid.centres.to(view.canvas)[[action]]))
 
     return look

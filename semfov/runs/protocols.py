@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Semantic
+from semfov.belief.observers import Observer, Semantic
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks, rollout
@@ -19,7 +19,17 @@ from semfov.strategy import Strategy
 
 
 class Trial(NamedTuple):
-    """One search for a target class in a scene."""
+    """One search for a target class in a scene.
+
+    Attributes:
+        scene: number of the scene.
+        target: class to find, 1..K.
+        cue: class that the policy looks for; another one in the control `wrong-class`.
+        repetition: number of the search for this target.
+        start: cell of the first fixation.
+        goal: cells that an object of the target overlaps.
+        commonest: whether the scene holds the target most often.
+    """
 
     scene: int
     target: int
@@ -37,35 +47,54 @@ _Outcome = tuple[list[int], int]
 def episodes_of(
     scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig, targets: Sequence[int] | None = None
 ) -> list[Trial]:
-    """All episodes of one scene: for every target `starts` searches from cells that no object of it overlaps."""
+    """Draw all searches of one scene: `starts` for every target, from cells that no object of it overlaps.
+
+    Args:
+        scenes: the scenes.
+        index: number of the scene.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        protocol: number of starts, control condition and seed.
+        targets: classes to search for (None: those that the scenes allow).
+
+    Returns:
+        The searches.
+    """
     annotation = scenes.annotation(index)
-    labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
-    counts = torch.bincount(labels, minlength=1)
+    labels = annotation.labels
+    covered = Grid(columns, rows, annotation.size).footprint(annotation.boxes)
     targets = scenes.targets(index) if targets is None else targets
-    commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
+    counts = torch.bincount(labels, minlength=1)
+    commonest = max(targets, key=lambda target: (int(counts[target]), -target)) if targets else None
     episodes = []
     for target in targets:
-        goal, cue = covered[labels == target].any(0), target
+        goal = covered[labels == target].any(0)
         if protocol.control == "permuted":
-            goal = goal[
-                torch.randperm(len(goal), generator=generator_for("goal", protocol.seed, scenes.ids[index], target))
-            ]
-        elif protocol.control == "wrong-class":
-            others = [other for other in range(1, len(scenes.classes) + 1) if other != target]
-            draw = generator_for("cue", protocol.seed, scenes.ids[index], target)
-            cue = others[int(torch.randint(len(others), (1,), generator=draw))]
+            draw = generator_for("goal", protocol.seed, scenes.ids[index], target)
+            goal = goal[torch.randperm(len(goal), generator=draw)]
+        cue = _wrong_class(scenes, index, target, protocol.seed) if protocol.control == "wrong-class" else target
         free = (~goal).nonzero()[:, 0]
         if not len(free) or not goal.any():
             continue
         generator = generator_for("start", protocol.seed, scenes.ids[index], target)
-        rounds = -(-protocol.starts // len(free))
-        order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
         cells = tuple(goal.nonzero()[:, 0].tolist())
-        episodes += [
-            Trial(index, target, cue, repetition, start, cells, target == commonest)
-            for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
-        ]
+        starts = free[_in_rounds(len(free), protocol.starts, generator)].tolist()
+        for repetition, start in enumerate(starts):
+            episodes.append(Trial(index, target, cue, repetition, start, cells, target == commonest))
     return episodes
+
+
+def _wrong_class(scenes: Scenes, index: int, target: int, seed: int) -> int:
+    """Draw another class than the target."""
+    others = [other for other in range(1, len(scenes.classes) + 1) if other != target]
+    draw = generator_for("cue", seed, scenes.ids[index], target)
+    return others[int(torch.randint(len(others), (1,), generator=draw))]
+
+
+def _in_rounds(count: int, drawn: int, generator: torch.Generator) -> Tensor:
+    """Draw so many of `count` numbers, each once before any is drawn again, `(drawn,)`."""
+    rounds = -(-drawn // count)
+    return torch.cat([torch.randperm(count, generator=generator) for _ in range(rounds)])[:drawn]
 
 
 def choose_classes(
@@ -77,24 +106,49 @@ def choose_classes(
     seed: int,
     absent: int | None = None,
 ) -> list[int]:
-    """Draw target classes for a photograph: some that it holds, and some that it does not hold."""
+    """Draw target classes for a photograph: some that it holds, and some that it does not hold.
+
+    Args:
+        scenes: the photographs.
+        index: number of the photograph.
+        annotation: its objects.
+        classes: largest number of classes that it holds.
+        max_area: share of the image from which on a class is too large to be searched for.
+        seed: seed of the draw.
+        absent: largest number of classes that it does not hold (None: as many as it holds). A draw with a larger
+            number begins with the same classes.
+
+    Returns:
+        The classes, 1..K; those that it holds come first.
+    """
     generator = generator_for("classes", seed, scenes.ids[index])
-    held = set(annotation.labels.tolist())
     legal = legal_targets(annotation, max_area)
     present = [legal[place] for place in torch.randperm(len(legal), generator=generator)[:classes].tolist()]
+    held = set(annotation.labels.tolist())
     others = [target for target in range(1, len(scenes.classes) + 1) if target not in held]
     count = len(present) if absent is None else absent
-    return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
+    missing = [others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist()]
+    return [*present, *missing]
 
 
 def numbers_drawn(scenes: Scenes, classes: int, max_area: float, absent: int | None = None) -> tuple[Tensor, Tensor]:
-    """Count the searches for each class that `choose_classes` draws: where it is there, and where it is not, `(K,)`.
+    """Compute the expected numbers of searches for each class that `choose_classes` draws.
 
-    The numbers are expected ones. Present classes are drawn from what a photograph holds, and absent ones evenly from
-    all others, so that a search for a common class is mostly for one that is there.
+    Present classes are drawn from what a photograph holds, and absent ones evenly from all others, so that a search for
+    a common class is mostly for one that is there.
+
+    Args:
+        scenes: the photographs.
+        classes: largest number of classes that a photograph holds.
+        max_area: share of the image from which on a class is too large to be searched for.
+        absent: largest number of classes that it does not hold (None: as many as it holds).
+
+    Returns:
+        The numbers where the class is there, and where it is not, each `(K,)`.
     """
     kinds = len(scenes.classes)
-    there, missing = torch.zeros(kinds, dtype=torch.float64), torch.zeros(kinds, dtype=torch.float64)
+    there = torch.zeros(kinds, dtype=torch.float64)
+    missing = torch.zeros(kinds, dtype=torch.float64)
     for index in range(len(scenes)):
         annotation = scenes.annotation(index)
         legal = torch.tensor(legal_targets(annotation, max_area), dtype=torch.long)
@@ -108,16 +162,25 @@ def numbers_drawn(scenes: Scenes, classes: int, max_area: float, absent: int | N
 
 
 class DrawnSearch(NamedTuple):
-    """A search for a drawn class, which the photograph may hold; `spare` ones serve only some purposes of a fit."""
+    """A search for a drawn class, which the photograph may hold.
+
+    Attributes:
+        target: the class, 1..K.
+        goal: `(X·Y,)` boolean, the cells that an object of it overlaps.
+        start: `(1,)`, cell of the first fixation.
+        noise: `(1, shifts+1, X·Y)`, by which ties are broken.
+        spare: whether the search serves only some purposes of a fit.
+    """
 
     target: int
-    goal: Tensor  # (X·Y,)
-    start: Tensor  # (1,)
-    noise: Tensor  # (1, shifts+1, X·Y)
+    goal: Tensor
+    start: Tensor
+    noise: Tensor
     spare: bool = False
 
     @property
     def present(self) -> bool:
+        """Whether the photograph holds the class."""
         return bool(self.goal.any())
 
 
@@ -130,24 +193,48 @@ def choose_searches(
     max_area: float,
     absent: int | None = None,
 ) -> list[DrawnSearch]:
-    """Draw searches of a photograph: their classes (`choose_classes`), first fixations and ties."""
-    annotation, scene, seed = scenes.annotation(index), scenes.ids[index], protocol.seed
+    """Draw searches of a photograph: their classes (`choose_classes`), first fixations and ties.
+
+    Args:
+        scenes: the photographs.
+        index: number of the photograph.
+        grid: the cells.
+        protocol: number of shifts, and seed.
+        classes: largest number of classes that the photograph holds.
+        max_area: share of the image from which on a class is too large to be searched for.
+        absent: largest number of classes that it does not hold (None: as many as it holds).
+
+    Returns:
+        The searches.
+    """
+    annotation = scenes.annotation(index)
+    scene = scenes.ids[index]
     covered = grid.footprint(annotation.boxes)
-    return [
-        DrawnSearch(
-            target,
-            covered[annotation.labels == target].any(0),
-            torch.randint(len(grid), (1,), generator=generator_for("start", seed, scene, target)),
-            noise_for(protocol, len(grid), scene, target, 0)[None],
-        )
-        for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
-    ]
+    searches = []
+    for target in choose_classes(scenes, index, annotation, classes, max_area, protocol.seed, absent):
+        goal = covered[annotation.labels == target].any(0)
+        generator = generator_for("start", protocol.seed, scene, target)
+        start = torch.randint(len(grid), (1,), generator=generator)
+        searches.append(DrawnSearch(target, goal, start, noise_for(protocol, len(grid), scene, target, 0)[None]))
+    return searches
 
 
 def run_episodes(
     episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, *, shifts: int, batch: int
 ) -> list[_Outcome]:
-    """Run episodes of one scene, each until its target is found or its shifts are spent; noise `(B, shifts+1, X·Y)`."""
+    """Run searches of one scene, each until its target is found or its shifts are spent.
+
+    Args:
+        episodes: B searches.
+        strategy: the observer, and the policy that chooses fixations.
+        looks: the looks from every cell, for each search.
+        noise: `(B, shifts+1, X·Y)`, by which ties are broken.
+        shifts: largest number of gaze shifts.
+        batch: number of searches that run side by side.
+
+    Returns:
+        For each search the fixated cells, and the gaze shift that found the target (-1: none).
+    """
     outcomes: list[_Outcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
@@ -167,13 +254,9 @@ def _run_batch(
     visits = torch.full((len(episodes), shifts + 1), -1)
     visits[:, 0] = starts
     found_at = torch.where(goals.gather(1, starts[:, None])[:, 0], 0, -1)
-    # A search that starts on its target has ended before its first look.
+    # A search that starts on its target has ended before its first look. Steps count the others only.
     seeking = (found_at < 0).nonzero()[:, 0]
-    if strategy.policy.function.by_belief:
-        observer, source = strategy.observer, looks.of(seeking)
-    else:
-        # No look changes what the policy does, and most of the time would go into the belief.
-        observer, source = Semantic(1), StoredLooks(Detections.empty(len(grid), 0, like=looks.like), grid)
+    observer, source = _observation(strategy, looks, seeking)
     steps = rollout(
         source,
         observer,
@@ -185,23 +268,55 @@ def _run_batch(
     )
     for step in steps:
         going = ~step.visited.all(-1)
-        number, cell = seeking[step.episodes[going]], step.next_cell[going]
+        number = seeking[step.episodes[going]]
+        cell = step.next_cell[going]
         visits[number, step.shift + 1] = cell
         found_at[number[goals[number, cell]]] = step.shift + 1
-    return [(row[row >= 0].tolist(), int(at)) for row, at in zip(visits, found_at, strict=True)]
+    return [(row[row >= 0].tolist(), int(shift)) for row, shift in zip(visits, found_at, strict=True)]
+
+
+def _observation(strategy: Strategy, looks: StoredLooks, seeking: Tensor) -> tuple[Observer, StoredLooks]:
+    """Return the observer and the looks of some searches, `(n,)`; both empty for policies that ignore the belief."""
+    if strategy.policy.function.by_belief:
+        return strategy.observer, looks.of(seeking)
+    # No look changes what the policy does, and most of the time would go into the belief.
+    nothing = Detections.empty(len(looks.grid), 0, like=looks.like)
+    return Semantic(1), StoredLooks(nothing, looks.grid)
 
 
 def search_steps(
     looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> list[Step]:
-    """Run one search until it decides or all looks are spent; start `(1,)`, noise `(1, N, X·Y)`, rule `(1,)`."""
-    policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
-    ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
+    """Run one search until it decides or all looks are spent.
+
+    Args:
+        looks: the looks at the picture.
+        strategy: the observer, and the policy that chooses fixations.
+        target: class 1..K.
+        start: `(1,)`, cell of the first fixation.
+        noise: `(1, N, X·Y)`, by which ties are broken; N is the largest number of looks.
+        rule: decides after a step: the number of the outcome `(1,)`, 0 to go on.
+
+    Returns:
+        The steps.
+    """
+
+    def ends(step: Step) -> Tensor:
+        return rule(step) > 0
+
+    policy = strategy.policy(target, looks.grid)
+    choice = Greedy(drawn_from(noise))
     return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))
 
 
 class Exploration(NamedTuple):
-    """One exploration of a scene."""
+    """One exploration of a scene.
+
+    Attributes:
+        scene: number of the scene.
+        repetition: number of the exploration of the scene.
+        start: cell of the first fixation.
+    """
 
     scene: int
     repetition: int
@@ -209,11 +324,24 @@ class Exploration(NamedTuple):
 
 
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
-    """All explorations of a scene; their starts differ as long as there are enough cells."""
+    """Draw all explorations of a scene; their starts differ as long as there are enough cells.
+
+    Args:
+        scenes: the scenes.
+        index: number of the scene.
+        cells: number of cells.
+        protocol: number of starts, and seed.
+
+    Returns:
+        The explorations.
+    """
     generator = generator_for("start", protocol.seed, scenes.ids[index])
-    rounds = -(-protocol.starts // cells)
-    order = torch.cat([torch.randperm(cells, generator=generator) for _ in range(rounds)])
-    return [Exploration(index, number, start) for number, start in enumerate(order[: protocol.starts].tolist())]
+    starts = _in_rounds(cells, protocol.starts, generator).tolist()
+    return [Exploration(index, number, start) for number, start in enumerate(starts)]
+
+
+_Progress = tuple[list[int], dict[str, list[int]]]
+"""Result of an exploration: the fixated cells in order, and numbers of right cells after each shift, by name."""
 
 
 def run_explorations(
@@ -225,17 +353,32 @@ def run_explorations(
     *,
     shifts: int,
     batch: int,
-) -> list[tuple[list[int], dict[str, list[int]]]]:
-    """Run explorations until their gaze shifts are spent or no cell is left; noise `(episodes, shifts+1, X·Y)`."""
-    starts, progress = torch.tensor([episode.start for episode in episodes]), []
-    for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
-        visits, counts = [], []
+) -> list[_Progress]:
+    """Run explorations of one scene until their gaze shifts are spent or no cell is left.
+
+    Args:
+        episodes: B explorations.
+        strategy: the observer, and the policy that chooses fixations.
+        looks: the looks from every cell.
+        answers: `(X·Y, K+1)` boolean, the classes that each cell holds.
+        noise: `(B, shifts+1, X·Y)`, by which ties are broken.
+        shifts: largest number of gaze shifts.
+        batch: number of explorations that run side by side.
+
+    Returns:
+        For each exploration the fixated cells, and the numbers of right cells after each shift (`counts_of`).
+    """
+    starts = torch.tensor([episode.start for episode in episodes])
+    progress: list[_Progress] = []
+    for start, noise_of_batch in zip(starts.split(batch), noise.split(batch), strict=True):
+        visits = []
+        counts = []
         steps = rollout(
             looks,
             strategy.observer,
             lambda _, cell: strategy.acquisition(None, looks.grid, cell),
             start,
-            Greedy(drawn_from(random)),
+            Greedy(drawn_from(noise_of_batch)),
             most=shifts + 1,
         )
         for step in steps:
@@ -243,14 +386,23 @@ def run_explorations(
             counts.append(counts_of(step.belief.class_probabilities(), answers))
         # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
-        tables = {name: torch.stack([each[name] for each in counts], 1).tolist() for name in counts[0]}
-        rows = [dict(zip(tables, row, strict=True)) for row in zip(*tables.values(), strict=True)]
-        progress += list(zip(torch.stack(visits, 1).tolist(), rows, strict=True))
+        by_name = {name: torch.stack([after[name] for after in counts], 1).tolist() for name in counts[0]}
+        for row, cells in enumerate(torch.stack(visits, 1).tolist()):
+            progress.append((cells, {name: numbers[row] for name, numbers in by_name.items()}))
     return progress
 
 
 def counts_of(probabilities: Tensor, answers: Tensor) -> dict[str, Tensor]:
-    """Numbers of right cells of maps `(B, X·Y, K+1)`, each `(B,)`."""
+    """Count the right cells of maps.
+
+    Args:
+        probabilities: `(B, X·Y, K+1)`, of background and classes.
+        answers: `(X·Y, K+1)` boolean, the classes that each cell holds; background never.
+
+    Returns:
+        Numbers `(B,)` of cells with objects that are right (`right`), that would be without background as an answer
+        (`right_without_background`), and of all cells that are right (`right_everywhere`).
+    """
     everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
     return {
         "right": right_cells(probabilities, answers).sum(-1),

@@ -13,7 +13,17 @@ from semfov.observation.matching import match
 
 @dataclass(frozen=True)
 class Samples:
-    """M detections with their true classes, and the R looks that they come from."""
+    """M detections with their true classes, and the R looks that they come from.
+
+    Attributes:
+        boxes: `(M, 4)`.
+        scores: `(M, K+1)`.
+        distance: `(M,)`, from the fixation, in units of the image's longer side (for windows, octaves of reduction).
+        labels: `(M,)`, true class 1..K, or 0 for background.
+        look: `(M,)`, number of the look; ascending.
+        scenes: `(R,)`, number of the scene of each look.
+        fixations: `(R, 2)`, in pixels.
+    """
 
     boxes: Tensor
     scores: Tensor
@@ -37,20 +47,38 @@ class Samples:
         return self.scenes[self.look]
 
     def looks_at(self, index: int) -> tuple[Detections, Tensor]:
-        """All looks at one scene, R of them: their detections, a batch of R, and their fixations `(R, 2)`."""
+        """Return the looks at one scene.
+
+        Args:
+            index: number of the scene.
+
+        Returns:
+            Their detections, a batch of n, and their fixations `(n, 2)`.
+        """
         numbers = (self.scenes == index).nonzero()[:, 0]
         firsts = torch.searchsorted(self.look, numbers).tolist()
         ends = torch.searchsorted(self.look, numbers + 1).tolist()
         looks = []
         for first, end in zip(firsts, ends, strict=True):
-            boxes, scores = self.boxes[None, first:end], self.scores[None, first:end]
-            looks.append(Detections(boxes, scores, torch.ones(1, end - first, dtype=torch.bool)))
+            mask = torch.ones(1, end - first, dtype=torch.bool)
+            looks.append(Detections(self.boxes[None, first:end], self.scores[None, first:end], mask))
         return Detections.stack(looks), self.fixations[numbers]
 
     @classmethod
     @torch.inference_mode()
     def of(cls, detections: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> "Samples":
-        """Label the detections of the looks at one scene; fixations `(R, 2)`."""
+        """Label the detections of the looks at one scene.
+
+        Args:
+            detections: a batch of R looks.
+            fixations: `(R, 2)`, in pixels.
+            annotation: the objects of the scene.
+            index: number of the scene.
+            iou: least overlap at which a detection counts as showing an object.
+
+        Returns:
+            The labelled detections.
+        """
         labels = [
             match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
             for boxes, mask in zip(detections.boxes, detections.mask, strict=True)
@@ -68,10 +96,12 @@ class Samples:
     @classmethod
     def join(cls, sets: "list[Samples]") -> "Samples":
         """Concatenate several sets of samples in order."""
-        joined = {name: torch.cat([getattr(some, name) for some in sets]) for name in _NAMES}
-        counts = torch.tensor([len(some.scenes) for some in sets])
-        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(some) for some in sets]))
-        return cls(**{**joined, "look": joined["look"] + first})
+        joined = {name: torch.cat([getattr(samples, name) for samples in sets]) for name in _NAMES}
+        # Looks are numbered through all sets.
+        looks = torch.tensor([len(samples.scenes) for samples in sets])
+        detections = torch.tensor([len(samples) for samples in sets])
+        looks_before = (looks.cumsum(0) - looks).repeat_interleave(detections)
+        return cls(**{**joined, "look": joined["look"] + looks_before})
 
 
 _DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
@@ -81,6 +111,15 @@ _NAMES = (*_DETECTIONS, "scenes", "fixations")
 def all_cells(
     size: tuple[int, int], fixation: Tensor, cells: tuple[int, int] = (10, 10)
 ) -> tuple[Grid, Tensor, Tensor]:
-    """A grid over a whole photograph: every look shows all cells, at their distances from the fixation."""
+    """Lay a grid over a whole photograph: every look shows all cells.
+
+    Args:
+        size: `(width, height)` of the photograph.
+        fixation: `(2,)`, in pixels.
+        cells: columns and rows.
+
+    Returns:
+        The grid, the distance of each cell from the fixation `(X·Y,)`, and which cells the look shows `(X·Y,)`: all.
+    """
     grid = Grid(*cells, size)
     return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)

@@ -57,7 +57,7 @@ class SceneRun(ABC):
         """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
 
     def stored(self, index: int) -> bytes | None:
-        """Content of the file that a worker stored for a scene, if the run needs it later; None without such a file."""
+        """Return the file that a worker stored for a scene, if the run needs it later; None without such a file."""
         return None
 
     def keep(self, index: int, stored: bytes) -> None:
@@ -66,28 +66,30 @@ class SceneRun(ABC):
 
 
 def store_folder(chosen: Path | None) -> Path:
-    """Folder of the stores: the chosen one, or the user's cache."""
+    """Return the folder of the stores: the chosen one, or the user's cache."""
     return cache_folder() if chosen is None else chosen
 
 
 def finish(run: SceneRun, title: str) -> None:
-    """Run the scenes that are not finished yet, and store their outcomes."""
+    """Run the scenes that are not finished yet, on the processors of the settings, and store their outcomes.
+
+    Args:
+        run: the run.
+        title: title of the progress bar.
+    """
     results = run.results
     finished = results.finished(len(run.scenes))
-    todo = [index for index in range(len(run.scenes)) if index not in finished]
-    others = results.path.parent.glob(f"{results.key.partition('-')[0]}-*.sqlite")
-    older = max(
-        (len(SceneResults(each.parent, each.stem, run.digest)) for each in others if each != results.path), default=0
-    )
-    if todo and older:
-        _log.warning(
-            "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
-            "changed since); they are computed anew",
-            run.config.out,
-            older,
-        )
+    remaining = [index for index in range(len(run.scenes)) if index not in finished]
+    if remaining:
+        _warn_of_older_results(run, results)
     done = run_tasks(
-        _outcomes_of, todo, where=run.config.where, make=type(run), settings=(run.config,), title=title, unit="scene"
+        _outcomes_of,
+        remaining,
+        where=run.config.where,
+        make=type(run),
+        settings=(run.config,),
+        title=title,
+        unit="scene",
     )
     try:
         with closing(done):
@@ -99,8 +101,26 @@ def finish(run: SceneRun, title: str) -> None:
         results.flush()
 
 
+def _warn_of_older_results(run: SceneRun, results: SceneResults) -> None:
+    """Warn where another version of the code finished scenes with the same settings, models and scenes."""
+    settings, _, _ = results.key.partition("-")
+    counts = [
+        len(SceneResults(path.parent, path.stem, run.digest))
+        for path in results.path.parent.glob(f"{settings}-*.sqlite")
+        if path != results.path
+    ]
+    older = max(counts, default=0)
+    if older:
+        _log.warning(
+            "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
+            "changed since); they are computed anew",
+            run.config.out,
+            older,
+        )
+
+
 def digest_of(what: object) -> str:
-    """The sha256 of a JSON value, in which fitted models count by their digests."""
+    """Compute the sha256 of a JSON value, in which fitted models count by their digests."""
     return hashlib.sha256(json.dumps(what, sort_keys=True, default=Pretrained.digest).encode()).hexdigest()
 
 

@@ -27,12 +27,16 @@ from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.fit.detector import _check_photographs, _seconds_of_looks, _thin_classes, _with_classes
+from semfov.fit.detector import _check_photographs, _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import Difference
-from semfov.fit.evidence import FitSearchConfig, choose_thresholds
+from semfov.fit.evidence import FitSearchConfig
+from semfov.fit.folder_report import thin_classes
 from semfov.fit.part import PartInputs, PartResult
+from semfov.fit.searches import SearchEnd
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.verification import VerificationFit, _scores, _VerifiedSearch
+from semfov.fit.thresholds import choose_thresholds
+from semfov.fit.verification import VerifiedSearch
+from semfov.fit.verification_part import VerificationFit, _scores
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
@@ -159,19 +163,19 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 
 FITS = {
-    "observation": "fit_published",
-    "tempering": "hit_rates",
-    "evidence": "fit_evidence",
-    "verification": "fit_in_folds",
-    "map": "fit_map_evidence",
-    "windows_part": "_fit_mosaics",
+    "observation": "observation.fit_published",
+    "tempering": "tempering.hit_rates",
+    "evidence": "evidence_part.fit_evidence",
+    "verification": "verification_part.fit_in_folds",
+    "map": "map_part.fit_map_evidence",
+    "windows": "windows_part._fit_mosaics",
 }
 
 
 def forbid(monkeypatch, *parts):
     """Make the fit of parts fail."""
     for part in parts:
-        monkeypatch.setattr(f"semfov.fit.{part}.{FITS[part]}", None)
+        monkeypatch.setattr(f"semfov.fit.{FITS[part]}", None)
 
 
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
@@ -346,7 +350,7 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
         seen.extend(photographs)
         raise DataError("data: too few")
 
-    monkeypatch.setattr("semfov.fit.verification.fit_in_folds", fail)
+    monkeypatch.setattr("semfov.fit.verification_part.fit_in_folds", fail)
     assert command(arguments(home, "--out", str(folder))) == 0
     assert len(seen) >= 2
     assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
@@ -359,7 +363,9 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
 def test_decisions_are_scored_by_photograph():
     """Present and absent classes have equal weight, whatever their number."""
     kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
-    searches = [_VerifiedSearch(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
+    searches = [
+        VerifiedSearch(number, present, False, (), (), 0.5, 3, SearchEnd(None, 3)) for number, present, _ in kinds
+    ]
     ends = [(right, 2) for _, _, right in kinds]
     np.testing.assert_allclose(_scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 
@@ -453,10 +459,10 @@ def test_the_highest_threshold_can_be_limited():
 
 
 def test_classes_with_few_objects_are_reported():
-    report = "\n".join(_thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
+    report = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
     assert "**No object to learn from** (1 classes): cup." in report
     assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in report
-    assert _thin_classes({"cat": 20}, 20) == []
+    assert thin_classes({"cat": 20}, 20) == []
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -17,11 +17,10 @@ from semfov.fit.evidence import (
     _JUDGED,
     FitSearchConfig,
     _evidence_report,
-    _judge_evidence,
-    _make_examples,
     _train_evidence,
-    choose_thresholds,
     evidence_objective,
+    judge_evidence,
+    make_examples,
 )
 from semfov.fit.examples import _ExampleLooks, example_episodes
 from semfov.fit.map import (
@@ -34,6 +33,7 @@ from semfov.fit.map import (
     _train_map,
     map_objective,
 )
+from semfov.fit.thresholds import choose_thresholds
 from semfov.gaze.acquisition import CloserLook, TargetPosterior
 from semfov.gaze.choice import Given
 from semfov.runs.protocols import choose_classes, numbers_drawn
@@ -52,7 +52,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def examples(run):
-    return _make_examples(run, FitSearchConfig(classes=2, max_target_area=0.5))
+    return make_examples(run, FitSearchConfig(classes=2, max_target_area=0.5))
 
 
 def classes_in(annotation, cell):
@@ -303,7 +303,7 @@ def test_more_training_lowers_the_evaluated_loss(examples):
     for steps in (1, 60):
         config = FitSearchConfig(columns=4, rows=4, steps=steps, batch=8, looks=4)
         model = _train_evidence(config, examples, GRID, {}, len(CLASSES) + 1)
-        judged, thresholds = _judge_evidence(config, model, examples, GRID)
+        judged, thresholds = judge_evidence(config, model, examples, GRID)
         assert [row["looks"] for row in judged] == list(_JUDGED)
         assert 0.49 < thresholds.confirm <= 1
         assert 0 <= thresholds.give_up <= 0.3

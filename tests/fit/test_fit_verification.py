@@ -14,21 +14,21 @@ from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, Foveation, 
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.fit.searches import _PhotographSearch, open_photographs, photograph_searches
+from semfov.fit.searches import SearchEnd, _PhotographSearch, open_photographs, photograph_searches
 from semfov.fit.verification import (
     _LEVELS,
-    _SHIPPED,
     _STRENGTH,
+    CloserLooks,
     VerificationConfig,
-    _CloserLooks,
-    _VerifiedSearch,
+    VerifiedSearch,
     choose_confirm,
     examine,
-    fit,
     fit_in_folds,
+    fit_to_closer_looks,
     mean_of,
     verify,
 )
+from semfov.fit.verification_part import _SHIPPED
 from semfov.gaze.policies import Policy
 from semfov.io.storage import read
 from semfov.runs.store import cell_store, look_everywhere
@@ -41,7 +41,7 @@ def examined(count=200, seed=0):
     generator = torch.Generator().manual_seed(seed)
     features = 2 * torch.randn(count, 7, generator=generator)
     noise = torch.randn(2, count, generator=generator)
-    return _CloserLooks(
+    return CloserLooks(
         features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4
     )
 
@@ -51,7 +51,7 @@ def test_the_fit_minimises_the_penalised_cross_entropy(count):
     """With a prior, the penalty is the distance to it."""
     known = examined(count)
     chosen, prior = known.fold != 1, shipped_mean() if count == 60 else None
-    model = fit(known, chosen, prior)
+    model = fit_to_closer_looks(known, chosen, prior)
     phi = known.features[chosen].double().numpy()
     mean, scale = phi.mean(0), phi.std(0, ddof=1)
     for row, goal in enumerate((known.right, known.present)):
@@ -76,15 +76,18 @@ def test_the_fit_ignores_the_closer_looks_that_are_held_out():
     known = examined()
     other = known.features.clone()
     other[known.fold == 2] = 100.0
-    changed = _CloserLooks(other, known.right, known.present, known.fold)
-    assert torch.equal(fit(known, known.fold != 2).linear.weight, fit(changed, known.fold != 2).linear.weight)
+    changed = CloserLooks(other, known.right, known.present, known.fold)
+    assert torch.equal(
+        fit_to_closer_looks(known, known.fold != 2).linear.weight,
+        fit_to_closer_looks(changed, known.fold != 2).linear.weight,
+    )
 
 
 def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without():
     prior, distances = shipped_mean(), []
     for count in (8, 80, 800, 8000):
         known = examined(count)
-        near, far = fit(known, known.fold >= 0, prior), fit(known, known.fold >= 0)
+        near, far = fit_to_closer_looks(known, known.fold >= 0, prior), fit_to_closer_looks(known, known.fold >= 0)
         logits = [each(known.features) for each in (prior, near, far)]
         distances.append(float((logits[1] - logits[0]).abs().mean() / (logits[2] - logits[0]).abs().mean()))
     assert distances == sorted(distances)
@@ -92,7 +95,7 @@ def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without(
     assert distances[-1] > 0.85
     known = examined(4)
     with pytest.raises(DataError, match=r"expected closer looks in all folds but one, got 1; give more photographs"):
-        fit(known, known.fold == 0, shipped_mean())
+        fit_to_closer_looks(known, known.fold == 0, shipped_mean())
 
 
 def shipped_mean():
@@ -119,7 +122,7 @@ def verified_in(seen, models, evidence, config):
 
 def searched(present, places, ends, presence, looks):
     """A search of a photograph without the search that makes no closer looks."""
-    return _VerifiedSearch(0, present, False, places, ends, presence, looks, (None, looks))
+    return VerifiedSearch(0, present, False, places, ends, presence, looks, SearchEnd(None, looks))
 
 
 PLACES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=3)
@@ -259,7 +262,7 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
     assert set(known.fold.tolist()) == {0, 1}
     # A place can only be right in a photograph that holds the target.
     assert bool((known.present | ~known.right).all())
-    models = [fit(known, known.fold != fold) for fold in (0, 1)]
+    models = [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)]
     searches = list(verified_in(found, models, evidence, config))
     assert len(searches) == sum(len(photograph.targets) for photograph in found)
     for each in searches:
@@ -288,7 +291,9 @@ def all_of(detector, store):
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     found, evidence = opened(detector, store)
     known = examined_in(found, evidence, config)
-    return known, list(verified_in(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
+    return known, list(
+        verified_in(found, [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)], evidence, config)
+    )
 
 
 def test_interrupted_searches_continue_with_the_stored_looks(tmp_path):

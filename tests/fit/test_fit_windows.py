@@ -17,11 +17,11 @@ from semfov.belief.verification import Verification
 from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
-from semfov.fit.detector import _FolderFit, _manifest_of
+from semfov.fit.folder import FolderFit
 from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.verification import _unverified, verify
-from semfov.fit.windows import _fit_closer, _mosaic_searches
+from semfov.fit.verification import verify
+from semfov.fit.windows_decisions import _mosaic_searches, fit_closer_looks
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
@@ -196,14 +196,14 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
         path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
-        found, count = _unverified(sought, model.thresholds)
+        found, count = sought.unverified_end(model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
         assert [look.window for look in sought.window_looks[:count]] == [each.window for each in path.window_looks]
         if found is not None:
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
     kinds = "searched", "judged"
-    text = _fit_closer(model, {kind: [(scenes, opened)] for kind in kinds}, config)
+    text = fit_closer_looks(model, {kind: [(scenes, opened)] for kind in kinds}, config)
     fitted = model.verification.thresholds
     assert (fitted.place, fitted.give_up) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
@@ -226,7 +226,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
 def test_without_right_and_wrong_places_there_is_no_verification():
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
     kinds = "searched", "judged"
-    text = _fit_closer(model, {kind: [(Drawn(), ())] for kind in kinds}, FitZoomConfig(passes=8))
+    text = fit_closer_looks(model, {kind: [(Drawn(), ())] for kind in kinds}, FitZoomConfig(passes=8))
     assert text.startswith("None, since there are no places")
     assert model.verification is None
 
@@ -247,7 +247,7 @@ def folder_of(home, **settings):
         out=home / "models", cache=home / "cache",
     )  # fmt: skip
     config = replace(config, **settings).named()
-    return _FolderFit(config, Looking(replace(config, out=config.out / "progress")))
+    return FolderFit(config, Looking(replace(config, out=config.out / "progress")))
 
 
 @pytest.mark.slow
@@ -284,7 +284,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
     folder.inputs.results["windows"] = fitted._replace(part=part)
-    _manifest_of(folder).write(home / "models")
+    folder.manifest().write(home / "models")
     agent = ActivePerception.from_pretrained(home / "models")
     assert all(torch.equal(tensor, model.state_dict()[name]) for name, tensor in agent.windows.state_dict().items())
     picture = torch.full((3, 192, 256), 0.49)

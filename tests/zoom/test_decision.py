@@ -18,14 +18,9 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES, settle
 from semfov.detection.objects import unlike
-from semfov.fit.windows import _fit_judge, _judge_searches, _Searches
-from semfov.fit.windows_certainty import (
-    _fit_unseen,
-    _Numbers,
-    explorations_of_kinds,
-    fit_spread,
-    logistic_regression,
-)
+from semfov.fit.logistic import logistic_regression
+from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
+from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_searches
 from semfov.metrics.calibration import calibration_error
 from semfov.paths import ZoomPath
 from semfov.runs.window_looking import right_boxes
@@ -131,7 +126,7 @@ def synthetic(count, seed):
     best = torch.rand(count, 1, generator=generator)
     odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 6] - 1
     there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
-    return _Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
+    return WindowSearches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
@@ -161,7 +156,7 @@ def test_a_fitted_probability_is_calibrated():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8)
     known, _ = synthetic(4000, 1)
-    _fit_judge(model, known, steps=250)
+    fit_judge(model, known, steps=250)
     new, odds = synthetic(4000, 2)
     with torch.no_grad():
         log_odds = model.anywhere(new.best, new.case)[:, 0]
@@ -174,9 +169,9 @@ def test_a_fitted_probability_is_calibrated():
     class Bounds:
         false_alarms, surest, lost = 0.05, 1.0, 0.02
 
-    rows = _judge_searches(model, new, Bounds())
+    rows = judge_searches(model, new, Bounds())
     assert "ECE" in rows[0]
-    sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
+    sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.detected[:, 0]
     assert sure[~new.there].double().mean() <= 0.05
 
 
@@ -313,8 +308,8 @@ def test_what_further_looks_show_is_fitted_by_the_number_in_all():
             self.promised = [clear * n / 8 for n in range(9)]
             self.after = [1 + clear / 2 * n / 8 for n in range(9)]
 
-        def sums(self, certainty, number):
-            return self.after[0], self.after[number - 1]
+        def sum_after(self, certainty, number):
+            return self.after[number - 1]
 
     fitted = _fit_unseen(
         Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]

@@ -1,0 +1,220 @@
+"""The part of a model folder that guides searches: target evidence, compared with raw scores."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Semantic
+from semfov.belief.observers.target import Target
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.data.scene import legal_targets
+from semfov.decision import OUTCOMES, confirms, decide
+from semfov.episode import Step, StoredLooks
+from semfov.errors import DataError
+from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
+from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge_evidence, make_examples
+from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
+from semfov.gaze.policies import Policy
+from semfov.metrics.episodes import FloatArray, cumulative_performance
+from semfov.runs.progress import track
+from semfov.runs.protocols import choose_searches, episodes_of, run_episodes, search_steps
+from semfov.runs.seeds import noise_for
+from semfov.runs.tables import mean_or_dash, share
+from semfov.strategy import Strategy
+from semfov.viz.style import save_figure
+
+_ABSENT = 1000  # thresholds are chosen on about this many searches for absent classes
+_MOST_ABSENT = 20  # and at most so many of them in a photograph
+_FEW_ALARMS = 10  # with fewer expected false alarms, one of them would push the threshold up
+_RAW_CONFIRM = 0.5  # score from which on agents without fitted models find the target in the fixated cell
+
+_Rule = Callable[[Step, int, Grid], Tensor]
+"""Decides after a step which searches for a target end: numbers of their outcomes, 0 for those that go on."""
+
+
+class _Decision(NamedTuple):
+    """The decision of a search: whether the class is there, the outcome, and the number of looks until then."""
+
+    present: bool
+    outcome: str
+    looks: int
+
+
+class EvidenceFit(PartFit):
+    """Train the target evidence, and choose its thresholds."""
+
+    settings: FitSearchConfig
+
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(FitSearchConfig, absent=inputs.absent)
+        judged = len(inputs.judged)
+        self.tasks = {
+            "describing looks": 0.05 * len(self.run.scenes),
+            "training": 0.1 * self.settings.steps,
+            "describing others": 0.05 * len(self.inputs.held_out),
+            "searching": judged,
+            "deciding": judged,
+        }
+
+    def fit(self) -> PartResult:
+        """Train, and compare searches and their decisions with those of raw scores."""
+        fitted = fit_evidence(self.settings, self.run)
+        model = fitted.model
+        model.thresholds = self._thresholds(model)
+        strategies = self._strategies(model)
+        curves = self._curves(strategies)
+        if not len(curves["raw"]):
+            raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
+        gain, why = self._compare(curves)
+        rules: dict[str, _Rule] = {
+            "fitted": partial(_decide_by_evidence, thresholds=model.thresholds),
+            "raw": _decide_by_score,
+        }
+        decisions = self._decisions({name: (strategies[name], rule) for name, rule in rules.items()})
+        report = "\n".join(
+            [
+                self._report_on_curves(curves),
+                _report_on_decisions(decisions, model.thresholds),
+                fitted.report,
+            ]
+        )
+        save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
+        return PartResult(self.write("evidence", model, gain.better, why), report, ["search.png"])
+
+    def _thresholds(self, model: TargetEvidence) -> Thresholds:
+        """Choose thresholds on held-out photographs with many absent classes, for a precise share of alarms."""
+        config = self.settings
+        absent = max(config.classes, min(_MOST_ABSENT, _ABSENT // len(self.inputs.held_out)))
+        examples = make_examples(self.run, replace(config, absent=absent), self.inputs.held_out)
+        expected_alarms = config.false_alarms * int((~examples.goal.any(-1)).sum())
+        bounds = replace(config, surest=SUREST_OF_FEW if expected_alarms < _FEW_ALARMS else SUREST)
+        _, thresholds = judge_evidence(bounds, model, examples, Grid(*config.cells, config.cells))
+        return thresholds
+
+    def _strategies(self, model: TargetEvidence) -> dict[str, Strategy]:
+        """Make the strategies that are compared: with the fitted model, with raw scores, and with tempered ones."""
+        strategies = {
+            "fitted": Strategy(Target(model), Policy("non-predictive")),
+            "raw": Strategy(Semantic(self.inputs.components), Policy("non-predictive")),
+            "fused": Strategy(self.inputs.semantic, Policy("non-predictive")),
+        }
+        for strategy in strategies.values():
+            strategy.eval().requires_grad_(False)
+        return strategies
+
+    def _curves(self, strategies: Mapping[str, Strategy]) -> dict[str, FloatArray]:
+        """Cumulative performance of strategies on every photograph with a target, `(P, shifts+1)`."""
+        run = self.run
+        protocol = self.inputs.protocol
+        curves: dict[str, list[FloatArray]] = {name: [] for name in strategies}
+        for index in track(self.inputs.judged, "searching", "scene"):
+            targets = legal_targets(run.scenes.annotation(index), self.settings.max_target_area)
+            episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
+            if not episodes:
+                continue
+            grid = run.grid(index)
+            looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
+            noise = torch.stack(
+                [
+                    noise_for(protocol, len(grid), run.scenes.ids[index], episode.target, episode.repetition)
+                    for episode in episodes
+                ]
+            )
+            for name, strategy in strategies.items():
+                with torch.inference_mode():
+                    ends = run_episodes(episodes, strategy, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
+                found_at = np.array([shift for _, shift in ends])
+                curves[name].append(cumulative_performance(found_at, protocol.shifts))
+        return {name: np.array(rows).reshape(-1, protocol.shifts + 1) for name, rows in curves.items()}
+
+    def _compare(self, curves: Mapping[str, FloatArray]) -> tuple[Difference, str]:
+        """Compare the fitted model with raw scores; the difference, and the sentence about it."""
+        at = self.inputs.compared_at
+        fitted = curves["fitted"][:, at]
+        raw = curves["raw"][:, at]
+        gain = Difference.of(fitted, raw)
+        return gain, (
+            f"{100 * fitted.mean():.1f} % of the targets are found in {at} gaze shifts, "
+            f"{100 * raw.mean():.1f} % with raw scores; {gain.in_words('points gained', 100)}"
+        )
+
+    def _decisions(self, ways: Mapping[str, tuple[Strategy, _Rule]]) -> dict[str, list[_Decision]]:
+        """Search held-out photographs for present and absent classes, each with its strategy and rule."""
+        run = self.run
+        config = self.settings
+        decisions: dict[str, list[_Decision]] = {name: [] for name in ways}
+        for index in track(self.inputs.judged, "deciding", "scene"):
+            grid = run.grid(index)
+            searches = choose_searches(
+                run.scenes, index, grid, self.inputs.protocol, config.classes, config.max_target_area, config.classes
+            )
+            if not searches:
+                continue
+            labels = run.scenes.annotation(index).labels
+            detections = run.detections(index)
+            for search in searches:
+                looks = StoredLooks(detections, grid, torch.tensor([search.target]))
+                present = bool((labels == search.target).any())
+                for name, (strategy, rule) in ways.items():
+                    ends = partial(rule, target=search.target, grid=grid)  # type: ignore[call-arg]
+                    with torch.inference_mode():
+                        steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
+                        outcome = OUTCOMES[int(ends(steps[-1]))]
+                    decisions[name].append(_Decision(present, outcome, len(steps)))
+        return decisions
+
+    def _report_on_curves(self, curves: Mapping[str, FloatArray]) -> str:
+        protocol = self.inputs.protocol
+        shifts = (1, self.inputs.compared_at, protocol.shifts)
+        return section(
+            f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} held-out photographs with "
+            f"{protocol.starts} starting points for each target. `raw` fuses the raw scores; `fused` uses the "
+            "exponent chosen under Tempering.",
+            curves_table(["belief", *(f"CP@{n}" for n in shifts)], curves, shifts),
+        )
+
+
+def _decide_by_evidence(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> Tensor:
+    """Decide by the belief of the fitted model."""
+    return decide(step, target, thresholds)
+
+
+def _decide_by_score(step: Step, target: int, grid: Grid) -> Tensor:
+    """Decide as agents without fitted models do."""
+    return confirms(step.detections, grid, step.cell, target, _RAW_CONFIRM).long()
+
+
+def _report_on_decisions(decisions: Mapping[str, Sequence[_Decision]], thresholds: Thresholds) -> str:
+    rows = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
+    for name, of_belief in decisions.items():
+        rows.append(
+            [
+                name,
+                _share_found(of_belief, present=True),
+                _share_found(of_belief, present=False),
+                share(sum(decision.outcome == "undecided" for decision in of_belief), len(of_belief)),
+                mean_or_dash([decision.looks for decision in of_belief]),
+            ]
+        )
+    return section(
+        f"Decisions of {len(decisions['fitted'])} searches for present and for absent classes. A target "
+        f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
+        f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
+        "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "
+        "search gives up.",
+        rows,
+    )
+
+
+def _share_found(decisions: Sequence[_Decision], *, present: bool) -> str:
+    """Share of the searches for present or for absent classes that find their target, as a cell of a table."""
+    found = [decision.outcome == "found" for decision in decisions if decision.present == present]
+    return share(sum(found), len(found))

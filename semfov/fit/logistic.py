@@ -1,0 +1,45 @@
+"""Logistic regression by maximum likelihood."""
+
+import torch
+from torch import Tensor
+
+_OF_OFFSET = 1e-6  # strength of the prior of the offset, which leaves it free
+_LONGEST_STEP = 2.0
+_CONVERGED = 1e-9
+
+
+def logistic_regression(
+    facts: Tensor, right: Tensor, *, times: Tensor | None = None, ridge: float = 1.0, steps: int = 30
+) -> list[float]:
+    """Fit a logistic regression by penalised maximum likelihood, with Newton's method.
+
+    Args:
+        facts: `(n, m)`, inputs of each case.
+        right: `(n,)`, the answers, 0 or 1.
+        times: `(n,)`, how often each case counts; None: once.
+        ridge: strength with which the weights are held near 0.
+        steps: largest number of steps.
+
+    Returns:
+        The offset, and the m weights.
+    """
+    # Half a case for and against without any facts keeps the result finite where all cases are right or all wrong.
+    inputs = torch.cat([facts.double(), facts.new_zeros(2, facts.shape[1], dtype=torch.float64)])
+    inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
+    answers = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
+    weight = torch.ones(len(inputs), dtype=torch.float64)
+    weight[-2:] = 0.5
+    if times is not None:
+        weight[:-2] = times
+    prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
+    prior[0] = _OF_OFFSET
+    coefficients = torch.zeros_like(prior)
+    for _ in range(steps):
+        chance = (inputs @ coefficients).sigmoid()
+        gradient = inputs.T @ (weight * (answers - chance)) - prior * coefficients
+        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
+        step = torch.linalg.solve(curvature, gradient).clamp(-_LONGEST_STEP, _LONGEST_STEP)
+        coefficients = coefficients + step
+        if float(step.abs().max()) < _CONVERGED:
+            break
+    return coefficients.tolist()

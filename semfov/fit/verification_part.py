@@ -1,0 +1,106 @@
+"""The part of a model folder that verifies targets by closer looks, fitted to held-out photographs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.verification import Verification
+from semfov.errors import DataError
+from semfov.fit.detector_report import Difference
+from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.searches import SearchedPhotograph, SearchEnd, open_photographs
+from semfov.fit.thresholds import SUREST_OF_FEW
+from semfov.fit.training import training_of
+from semfov.fit.verification import VerificationConfig, VerificationInFolds, VerifiedSearch, fit_in_folds, mean_of
+from semfov.fit.verification_report import verification_report
+from semfov.metrics.episodes import FloatArray
+
+_SHIPPED = ("yolox-nano", "yolov3-tiny")  # shipped models whose mean is the centre of the prior for other detectors
+_ABSENT = 200  # the threshold is chosen on about this many searches for absent classes
+_MOST_ABSENT = 20  # and at most so many of them in a photograph
+
+
+class VerificationFit(PartFit):
+    """Fit the verification to held-out photographs: the target evidence is surer on those it learned from."""
+
+    settings: VerificationConfig
+
+    def __init__(self, inputs: PartInputs) -> None:
+        super().__init__(inputs)
+        self.settings = inputs.settings(VerificationConfig, absent=inputs.absent)
+        judged = len(inputs.judged)
+        self.tasks = {"looking": judged, "verifying": 0.5 * judged}
+
+    def fit(self) -> PartResult:
+        """Fit in folds, and compare decisions with those of the same agent without closer looks."""
+        evidence = self.inputs.model("evidence")
+        if not isinstance(evidence, TargetEvidence):
+            return self.left_out("not fitted, since the agent does not use the target evidence")
+        photographs = self._photographs()
+        config = self._settings_for(len(photographs), evidence)
+        prior = mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
+        fitted = fit_in_folds(photographs, evidence, config, prior, SUREST_OF_FEW)
+        model = fitted.model
+        model.metadata = {**self.run.eye.settings(), **training_of(config, self.run.scenes)}
+        gain, why = _compare(fitted)
+        return PartResult(
+            self.write("verification", model, gain.better, why),
+            "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
+            "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
+            "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
+            "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
+            + verification_report(fitted, f"{len(photographs)} photographs").text,
+        )
+
+    def _photographs(self) -> list[SearchedPhotograph]:
+        """Draw searches of the held-out photographs, with spare ones for the choice of the threshold."""
+        run = self.run
+        judged = self.inputs.judged
+        spare = min(_MOST_ABSENT, _ABSENT // len(judged))
+        photographs = open_photographs(run.eye, run.scenes, judged, self.settings, spare=spare, store=run.store)
+        if len(photographs) < 2:
+            raise DataError(
+                "data: expected at least 2 held-out photographs with a class to search for, got "
+                f"{len(photographs)}; give more photographs"
+            )
+        return photographs
+
+    def _settings_for(self, photographs: int, evidence: TargetEvidence) -> VerificationConfig:
+        """Return the settings for so many photographs, and for evidence with its thresholds."""
+        assert evidence.thresholds is not None
+        # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
+        give_up = min(self.settings.give_up, evidence.thresholds.give_up)
+        return replace(self.settings, folds=min(self.settings.folds, photographs), give_up=give_up)
+
+
+def _compare(fitted: VerificationInFolds) -> tuple[Difference, str]:
+    """Compare the scores of decisions with closer looks and without; the difference, and the sentence about it."""
+    assert fitted.model.thresholds is not None
+    confirm = fitted.model.thresholds.confirm
+    searches = fitted.searches
+    after = _scores(searches, [search.found(confirm) for search in searches])
+    before = _scores(searches, [search.unverified for search in searches])
+    gain = Difference.of(after, before)
+    return gain, (
+        f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
+        f"{gain.in_words('points gained', 100)}"
+    )
+
+
+def _scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> FloatArray:
+    """Mean score of the decisions in each photograph, `(P,)`; present and absent classes have equal weight."""
+    by_picture: dict[int, dict[bool, list[int]]] = {}
+    for search, end in zip(searches, ends, strict=True):
+        scores = by_picture.setdefault(search.picture, {}).setdefault(search.present, [])
+        scores.append(_score(end))
+    means = [[np.mean(scores) for scores in kinds.values()] for kinds in by_picture.values()]
+    return np.array([np.mean(of_kinds) for of_kinds in means])
+
+
+def _score(end: SearchEnd) -> int:
+    """Score of a decision: 1 for the right place, -1 for a wrong one, 0 if nothing is found."""
+    if end.right is None:
+        return 0
+    return 1 if end.right else -1

@@ -1,0 +1,122 @@
+"""The report on a fitted verification: probabilities before and after closer looks, and decisions at thresholds."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.fit.searches import SearchEnd
+from semfov.fit.verification import VerificationInFolds
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.episodes import area_under_roc
+from semfov.runs.tables import mean_or_dash, share, table
+
+_THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)  # values of the threshold `confirm` in the table, besides the chosen one
+
+IN_FOLDS = "Each photograph is evaluated with a model fitted to other folds."
+"""How a verification is evaluated that is fitted in folds."""
+
+
+class VerificationReport(NamedTuple):
+    """A report in Markdown, and its measures by name; None where only one kind was searched for."""
+
+    text: str
+    figures: dict[str, float | None]
+
+
+def verification_report(fitted: VerificationInFolds, pictures: str, how: str = IN_FOLDS) -> VerificationReport:
+    """Evaluate the models of folds on their closer looks, and the decisions of the searches.
+
+    Args:
+        fitted: the model with its threshold, the models of folds, closer looks and searches.
+        pictures: number and kind of the pictures, in words.
+        how: sentence about which pictures the models were fitted to.
+
+    Returns:
+        The report.
+    """
+    chances, figures = _chances(fitted)
+    present = torch.tensor([search.present for search in fitted.searches])
+    area = _area(torch.tensor([search.presence for search in fitted.searches]), present)
+    figures["area"] = area
+    text = "\n".join(
+        [
+            f"{len(fitted.searches)} searches of {pictures}, {int(present.sum())} of them for a present class; "
+            f"{len(fitted.closer_looks.fold)} closer looks. {how}",
+            "",
+            "Probability of the target before and after a closer look:",
+            "",
+            *table(chances),
+            "",
+            "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
+            f"the evidence decide. Area under the ROC of the final probability: {_figure(area)}.",
+            "",
+            *table(_decisions(fitted)),
+            "",
+        ]
+    )
+    return VerificationReport(text, figures)
+
+
+def _chances(fitted: VerificationInFolds) -> tuple[list[list[str]], dict[str, float | None]]:
+    """Measure the probabilities before and after closer looks: rows of a table, and the measures by name."""
+    looks = fitted.closer_looks
+    # The log odds after each closer look, by the model that was not fitted to its picture, `(N, 2)`.
+    by_fold = torch.stack([model(looks.features) for model in fitted.folds])
+    after = by_fold[looks.fold, torch.arange(len(looks.fold))]
+    figures: dict[str, float | None] = {}
+    rows = [["", "NLL", "ECE", "area under ROC"]]
+    for words, name, log_odds, answers in (
+        ("at the place, before", "cell", looks.features[:, 1], looks.right),
+        ("at the place, after", "place", after[:, 0], looks.right),
+        ("in the image, before", "image", looks.features[:, 0], looks.present),
+        ("in the image, after", "presence", after[:, 1], looks.present),
+    ):
+        measures = {
+            "nll": float(F.binary_cross_entropy_with_logits(log_odds, answers.to(log_odds))),
+            "ece": float(calibration_error(log_odds.sigmoid(), answers)),
+            "area": _area(log_odds, answers),
+        }
+        figures |= {f"{name}_{measure}": value for measure, value in measures.items()}
+        rows.append([words, *(_figure(value) for value in measures.values())])
+    return rows, figures
+
+
+def _decisions(fitted: VerificationInFolds) -> list[list[str]]:
+    """Rows of a table of the decisions, without closer looks and with them, at several thresholds."""
+    assert fitted.model.thresholds is not None
+    chosen = fitted.model.thresholds.confirm
+    searches = fitted.searches
+    present = [search.present for search in searches]
+    head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
+    rows = [head, ["no closer looks", *_rates(present, [search.unverified for search in searches])]]
+    for confirm in sorted({*_THRESHOLDS, chosen}):
+        mark = " (chosen)" if confirm == chosen else ""
+        ends = [search.found(confirm) for search in searches]
+        rows.append([f"{confirm:.2f}{mark}", *_rates(present, ends)])
+    return rows
+
+
+def _rates(present: Sequence[bool], ends: Sequence[SearchEnd]) -> list[str]:
+    """Hits, false alarms, right places and looks of decisions, as cells of a table."""
+    shares = []
+    verdicts: list[bool] = []
+    looks = []
+    for kind in (True, False):
+        of_kind = [end for end, there in zip(ends, present, strict=True) if there == kind]
+        found = [end.right for end in of_kind if end.right is not None]
+        shares.append(share(len(found), len(of_kind)))
+        looks.append(mean_or_dash([end.looks for end in of_kind]))
+        verdicts += found
+    return [*shares, share(sum(verdicts), len(verdicts)), *looks]
+
+
+def _area(score: Tensor, answers: Tensor) -> float | None:
+    """Area under the ROC; None if all answers are the same."""
+    return area_under_roc(score, answers) if answers.any() and not answers.all() else None
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
