@@ -242,6 +242,7 @@ def _size(file: Path) -> int:
 
 
 def _is_complete(root: Path, split: str, instances: str) -> bool:
+    """Tell whether all images of the annotations are there."""
     try:
         images = json.loads((root / instances).read_bytes())["images"]
         return {image["file_name"] for image in images} <= set(os.listdir(root / split))

@@ -193,7 +193,7 @@ class _Evaluation:
         return rows
 
     def _levels_together(self, level: int) -> str:
-        """The first and the last of the levels that a level is fitted with; empty where it is fitted alone."""
+        """Return the first and the last of the levels that a level is fitted with; empty where it is fitted alone."""
         pooled = self.model.metadata["pooled"]
         if str(level) not in pooled:
             return ""
@@ -201,7 +201,7 @@ class _Evaluation:
         return f"{levels[0]} to {levels[-1]}"
 
     def _figures_at(self, level: int) -> list[str]:
-        """NLL and ECE of raw scores and of the fitted model at a level, as cells of a table."""
+        """Measure NLL and ECE of raw scores and of the fitted model at a level, as cells of a table."""
         is_at_level = self.model.level(self.judged.distance) == level
         if not is_at_level.any():
             return [""] * 4

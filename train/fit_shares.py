@@ -47,8 +47,9 @@ class FitSharesConfig(FitSearchConfig):
 
 @torch.inference_mode()
 def _whole_looks(eye: WindowEye, scenes: Scenes) -> tuple[Tensor, Tensor]:
-    """The highest scores of looks at whole photographs, and the classes that these hold, `(P, K)`."""
-    scores, held = [], torch.zeros(len(scenes), len(scenes.classes), dtype=torch.bool)
+    """Look at whole photographs; returns the highest scores, and the classes that the photographs hold, `(P, K)`."""
+    scores = []
+    held = torch.zeros(len(scenes), len(scenes.classes), dtype=torch.bool)
     for index in track(range(len(scenes)), "looking at photographs", "photograph"):
         source = StoredWindowLooks(eye, scenes, index, None)
         scores.append(source.see([Window.overview(source.lattice)])[0].show)
@@ -61,16 +62,8 @@ def fit_shares(config: FitSharesConfig) -> None:
     detector = make_detector(config.detector)
     scenes = make_scenes(config.data, detector.classes)
     if config.windows is not None:
-        model = GlimpseEvidence.from_pretrained(config.windows)
-        photograph = model.photograph
-        check(photograph is not None, "windows", "evidence with that for photographs", config.windows)
-        assert photograph is not None
-        drawn = shares_by_frequency(photograph.usual, scenes)
         looked = make_scenes(config.looked, detector.classes)
-        scores, held = _whole_looks(WindowEye(detector).eval().requires_grad_(False), looked)
-        photograph.shares = measured_shares(photograph, scores, held, drawn)
-        model.save(config.windows)
-        print(f"{config.windows}: {_span(photograph.shares)}")
+        _write_windows(config.windows, scenes, looked, WindowEye(detector).eval().requires_grad_(False))
     if config.evidence is not None:
         evidence = TargetEvidence.from_pretrained(config.evidence)
         evidence.shares = search_shares(scenes, config)
@@ -78,8 +71,21 @@ def fit_shares(config: FitSharesConfig) -> None:
         print(f"{config.evidence}: {_span(evidence.shares)}")
 
 
+def _write_windows(path: Path, scenes: Scenes, looked: Scenes, eye: WindowEye) -> None:
+    """Write the shares into evidence for windows, corrected by looks at the photographs that it was fitted to."""
+    model = GlimpseEvidence.from_pretrained(path)
+    photograph = model.photograph
+    check(photograph is not None, "windows", "evidence with that for photographs", path)
+    assert photograph is not None
+    drawn = shares_by_frequency(photograph.usual, scenes)
+    scores, held = _whole_looks(eye, looked)
+    photograph.shares = measured_shares(photograph, scores, held, drawn)
+    model.save(path)
+    print(f"{path}: {_span(photograph.shares)}")
+
+
 def _span(shares: Tensor) -> str:
-    """The least and the largest share in words."""
+    """Write the least and the largest share in words."""
     return f"the target was there in {float(shares.min()):.3f} to {float(shares.max()):.3f} of the searches for a class"
 
 

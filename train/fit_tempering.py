@@ -23,7 +23,7 @@ from semfov.belief.observers import Semantic
 from semfov.errors import check
 from semfov.eye import Eye
 from semfov.fit.settings import FitOnCellsConfig
-from semfov.fit.tempering import hit_rates, mean_hits
+from semfov.fit.tempering import EXPONENTS, hit_rates, mean_hits
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.samples import Samples
@@ -58,7 +58,7 @@ class FitTemperingConfig(FitOnCellsConfig):
     unused = ("name",)
     calibrated: bool = False
     footprint: Footprint = "box_centre"
-    exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+    exponents: tuple[Positive, ...] = EXPONENTS
     photographs: Count | None = None
     fixations: Count = 8
     iou: Share = 0.5
@@ -75,9 +75,8 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking")
     samples = sampler.all()
     model = make_observation(None, cast(Eye, sampler.eye)) if config.calibrated else None
-    hits = {tempering: _measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
-    text = _tempering_report(hits)
-    write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
+    hits = {exponent: _measure(config, sampler, samples, model, exponent) for exponent in config.exponents}
+    write_outputs(config, _tempering_report(hits), ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
 def _measure(
@@ -85,25 +84,35 @@ def _measure(
     sampler: Sampler,
     samples: Samples,
     model: FovealObservationModel | None,
-    tempering: float,
+    exponent: float,
 ) -> dict[str, float]:
     """Measure one exponent: the share of next fixations that hit the target, as means over photographs."""
-    observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
-    title, least, most = f"tempering {tempering:g}", config.min_objects, config.photographs
-    rates = hit_rates(config, sampler.scenes, samples, observer, title, least=least, most=most)
+    components = len(sampler.eye.detector.classes) + 1
+    observer = Semantic(components, model, footprint=config.footprint, tempering=exponent)
+    rates = hit_rates(
+        config,
+        sampler.scenes,
+        samples,
+        observer,
+        f"tempering {exponent:g}",
+        least=config.min_objects,
+        most=config.photographs,
+    )
     return mean_hits(config.holdout, rates)
 
 
 def _tempering_report(hits: dict[float, dict[str, float]]) -> str:
     """Report the hit rates of every exponent and the best exponent as Markdown."""
-    best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
-    rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
+    best = max(hits, key=lambda exponent: hits[exponent]["fitted"])
+    rows = [["tempering", "photographs to choose by", "held-out photographs"]]
+    for exponent, means in hits.items():
+        rows.append([f"{exponent:g}", f"{100 * means['fitted']:.2f}", f"{100 * means['held_out']:.2f}"])
     return "\n".join(
         [
             f"Best exponent on the photographs to choose by: {best:g}. The table shows the percentage of next "
             "fixations that hit the target, as a mean over all numbers of looks and over photographs.",
             "",
-            *table([["tempering", "photographs to choose by", "held-out photographs"], *rows]),
+            *table(rows),
             "",
         ]
     )

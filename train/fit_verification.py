@@ -19,6 +19,7 @@ from pathlib import Path
 
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
+from semfov.eye import Eye
 from semfov.fit.searches import open_photographs
 from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, fit_in_folds
@@ -55,16 +56,12 @@ def fit_verification(config: FitVerificationConfig) -> None:
     eye = make_eye(config.detector, config.sensor)
     evidence = make_learned(TargetEvidence, config.target_model, eye)
     scenes = make_scenes(config.data, eye.detector.classes)
-    left_out = set()
-    if config.fitted is not None:
-        data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
-        ids = make_scenes(data, eye.detector.classes).ids
-        holdout = evidence.metadata.get("training", {}).get("holdout", 5)
-        left_out = {name for number, name in enumerate(ids) if number % holdout}
-    chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
+    learned_from = _learned_from(config, eye, evidence)
+    chosen = [index for index, name in enumerate(scenes.ids) if name not in learned_from]
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
-    folder, components = store_folder(config.cache) / "searches", len(eye.detector.classes) + 1
+    components = len(eye.detector.classes) + 1
+    folder = store_folder(config.cache) / "searches"
     store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
     photographs = open_photographs(eye, scenes, chosen, config, store=store)
     fitted = fit_in_folds(photographs, evidence, config)
@@ -73,6 +70,16 @@ def fit_verification(config: FitVerificationConfig) -> None:
     fitted.model.save(path)
     report = verification_report(fitted, f"{len(photographs)} photographs")
     write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)
+
+
+def _learned_from(config: FitVerificationConfig, eye: Eye, evidence: TargetEvidence) -> set[object]:
+    """Find the ids of the photographs that the target evidence learned from."""
+    if config.fitted is None:
+        return set()
+    data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
+    ids = make_scenes(data, eye.detector.classes).ids
+    holdout = evidence.metadata.get("training", {}).get("holdout", 5)
+    return {name for number, name in enumerate(ids) if number % holdout}
 
 
 main = command(fit_verification, FitVerificationConfig, __doc__)

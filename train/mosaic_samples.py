@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import cast
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor
@@ -19,13 +19,25 @@ from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.zoom_store import WindowLookStore
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
-from train.samples import Sampler
+from train.samples import Sampler, SamplerSettings
 
 COLUMNS, ROWS, TILE = 8, 6, (480, 360)
 """Columns and rows of a mosaic, and the size of its slots in pixels.
 
 Such a mosaic is so large that the overview reduces it by more than three octaves.
 """
+
+
+class MosaicSettings(SamplerSettings, Protocol):
+    """Settings of looks at mosaics."""
+
+    @property
+    def mosaics(self) -> int:
+        """Number of mosaics."""
+
+    @property
+    def holdout(self) -> int:
+        """One in every n mosaics is made of held-out photographs."""
 
 
 class MosaicSampler(Sampler):
@@ -39,19 +51,29 @@ class MosaicSampler(Sampler):
     sources = (*WindowLookStore.sources, "semfov.data.mosaics", __name__)
     coordinates = 3
 
+    config: MosaicSettings
+
     def make(self) -> tuple[WindowEye, Scenes]:
         """Make the eye and the mosaics."""
         config = self.config
         eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
-        training, held = split_photographs(config.data, eye.detector.classes, config.holdout)
-        near, far = (
-            Mosaics(some, COLUMNS, ROWS, tile=TILE, count=config.mosaics, seed=config.seed) for some in (training, held)
-        )
-        chosen = [(near if index % config.holdout else far, index) for index in range(len(near))]
-        return eye, ChosenScenes(chosen, near.ids, f"{near.fingerprint} {far.fingerprint} {config.holdout}")
+        training, held_out = split_photographs(config.data, eye.detector.classes, config.holdout)
+        of_training = Mosaics(training, COLUMNS, ROWS, tile=TILE, count=config.mosaics, seed=config.seed)
+        of_held_out = Mosaics(held_out, COLUMNS, ROWS, tile=TILE, count=config.mosaics, seed=config.seed)
+        chosen = [(of_training if index % config.holdout else of_held_out, index) for index in range(len(of_training))]
+        fingerprint = f"{of_training.fingerprint} {of_held_out.fingerprint} {config.holdout}"
+        return eye, ChosenScenes(chosen, of_training.ids, fingerprint)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
+        """Lay out the lattice of a mosaic.
+
+        Args:
+            size: `(width, height)` of the mosaic.
+            fixation: `(3,)`, `(x, y, magnification)`.
+
+        Returns:
+            The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows.
+        """
         lattice = Lattice.over(size, self.eye.detector.input_size)
         grid = Grid(lattice.columns, lattice.rows, size)
         x, y, magnification = fixation.tolist()
@@ -61,22 +83,25 @@ class MosaicSampler(Sampler):
         return grid, torch.full((len(grid),), octaves), in_view
 
     def _look(self, index: int) -> Samples:
+        """Look at a mosaic in random windows; returns the labelled detections."""
         scene = self.scenes[index]
         eye = cast(WindowEye, self.eye)
         view = eye.open(scene.image)
         windows = _choose_windows(view.lattice, self.config.fixations, self.config.seed, scene.id)
-        fixations, octaves = view.lattice.fixations(windows), view.lattice.octaves[windows[:, 0]]
+        fixations = view.lattice.fixations(windows)
+        octaves = view.lattice.octaves[windows[:, 0]]
         annotation = self.scenes.annotation(index)
         samples = []
         with one_thread(), torch.inference_mode():
             for number in range(len(windows)):
-                detections = eye.look(view, fixations[number : number + 1])
+                fixation = fixations[number : number + 1]
+                detections = eye.look(view, fixation)
                 boxes = detections.boxes[0, detections.mask[0]]
+                scores = detections.scores[0, detections.mask[0]]
                 labels = match(boxes, annotation.boxes, annotation.labels, iou=self.config.iou)
-                look = torch.zeros(len(boxes), dtype=torch.long)
                 distance = octaves[number].expand(len(boxes)).clone()
-                at = torch.tensor([index]), fixations[number : number + 1]
-                samples.append(Samples(boxes, detections.scores[0, detections.mask[0]], distance, labels, look, *at))
+                look = torch.zeros(len(boxes), dtype=torch.long)
+                samples.append(Samples(boxes, scores, distance, labels, look, torch.tensor([index]), fixation))
         return Samples.join(samples)
 
 

@@ -4,7 +4,7 @@ import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.training import Fit
@@ -13,8 +13,31 @@ from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 
 
+class OutSettings(Protocol):
+    """Settings of a fit that writes to a folder."""
+
+    @property
+    def out(self) -> Path:
+        """The folder."""
+
+    def yaml(self) -> str:
+        """Write the settings as a file."""
+
+
+class NamedSettings(Protocol):
+    """Settings of a fit that writes a model."""
+
+    @property
+    def out(self) -> Path:
+        """Folder of the model."""
+
+    @property
+    def name(self) -> str | None:
+        """Name of the model; None: that of the detector."""
+
+
 def commit() -> str | None:
-    """Commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
+    """Return the commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
     folder = Path(__file__).parent
 
     def git(*arguments: str) -> str:
@@ -27,23 +50,38 @@ def commit() -> str | None:
         return None
 
 
-def model_path(config: Any, detector: str) -> Path:
+def model_path(config: NamedSettings, detector: str) -> Path:
     """Return the file of a fitted model in `config.out`, named after the settings' `name` or else the detector."""
     return inside(config.out, f"{config.name or detector}.safetensors")
 
 
-def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
-    """Print the report, write it with the settings and the measures to `config.out`, and list the written files."""
-    files = {"report.md": report, "config.yaml": config.yaml(), figures[0]: figures[1]}
+def write_outputs(config: OutSettings, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
+    """Print the report, write it with the settings and the measures to `config.out`, and list the written files.
+
+    Args:
+        config: settings of the fit.
+        report: the report in Markdown.
+        figures: name and text of the file of measures.
+        model: the file of the model, which is written already.
+    """
+    name_of_figures, text_of_figures = figures
+    files = {"report.md": report, "config.yaml": config.yaml(), name_of_figures: text_of_figures}
     print(report)
     for name, text in files.items():
         write_text(inside(config.out, name), text)
-    written = [*([] if model is None else [model]), *(config.out / name for name in files)]
+    written = [config.out / name for name in files]
+    if model is not None:
+        written.insert(0, model)
     print("written:", *(f"  {path}" for path in written), sep="\n")
 
 
 def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
-    """Look from every cell, fit, and write the model, the report, the settings and the measures."""
+    """Look from every cell, fit, and write the model, the report, the settings and the measures.
+
+    Args:
+        config: settings of the fit.
+        fit: fits a model to stored looks.
+    """
     run = Looking(config)
     finish(run, "looking")
     fitted = fit(config, run)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -20,12 +20,13 @@ from semfov.eye import Eye
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
+from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import LOOK_SOURCES, one_thread
 from semfov.runs.samples import Samples, all_cells
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import SceneStore
-from semfov.runs.workers import run_tasks
+from semfov.runs.workers import Where, run_tasks
 from semfov.zoom.eye import WindowEye
 
 _SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")
@@ -33,7 +34,7 @@ _SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.se
 
 
 def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
-    """Look at an image from each of several fixations; image `(3, H, W)`, points `(F, 2)`.
+    """Look at an image from each of several fixations.
 
     The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
     share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`): a
@@ -46,19 +47,73 @@ def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
         return Detections.stack([eye.look(view, point[None]) for point in points])
 
 
+class SamplerSettings(Protocol):
+    """Settings of looks from random fixations, as those of `train.fit_fom` and `train.fit_tempering`."""
+
+    @property
+    def data(self) -> DataConfig:
+        """The photographs."""
+
+    @property
+    def detector(self) -> DetectorConfig:
+        """The detector."""
+
+    @property
+    def sensor(self) -> SensorConfig:
+        """The sensor."""
+
+    @property
+    def fixations(self) -> int:
+        """Number of fixations in each photograph."""
+
+    @property
+    def iou(self) -> float:
+        """Least overlap at which a detection counts as showing an object."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the fixations."""
+
+    @property
+    def shard(self) -> int:
+        """Number of photographs in a unit of work."""
+
+    @property
+    def where(self) -> Where:
+        """The processors that do the work."""
+
+
 class Sampler:
-    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs."""
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
+
+    Attributes:
+        config: the settings.
+        eye: looks at the photographs.
+        scenes: the photographs.
+        shards: numbers of the shards.
+        store: the labelled detections on disk.
+    """
 
     sources: ClassVar[tuple[str, ...]] = _SOURCES
     coordinates: ClassVar[int] = 2
+    """Number of numbers of a fixation."""
 
-    def __init__(self, config: Any, folder: Path) -> None:
+    def __init__(self, config: SamplerSettings, folder: Path) -> None:
         self.config = config
         check_sources(config.data, config.detector)
         self.eye, self.scenes = self.make()
         self.shards = range(-(-len(self.scenes) // config.shard))
+        what = {
+            "settings": self.eye.settings(),
+            "scenes": self.scenes.fingerprint,
+            **{name: getattr(config, name) for name in ("fixations", "iou", "seed", "shard")},
+        }
+        self.store = SceneStore(folder, what, modules_digest(*LOOK_SOURCES, *self.sources), self._schema())
+
+    def _schema(self) -> Schema:
+        """Describe the files of the store: the fields of `Samples`."""
         components = len(self.scenes.classes) + 1
-        schema = Schema(
+        return Schema(
             {
                 "boxes": Field(("M", 4)),
                 "scores": Field(("M", components), low=0, high=1),
@@ -69,12 +124,6 @@ class Sampler:
                 "fixations": Field(("R", self.coordinates)),
             }
         )
-        what = {
-            "settings": self.eye.settings(),
-            "scenes": self.scenes.fingerprint,
-            **{name: getattr(config, name) for name in ("fixations", "iou", "seed", "shard")},
-        }
-        self.store = SceneStore(folder, what, modules_digest(*LOOK_SOURCES, *self.sources), schema)
 
     def make(self) -> tuple[Eye | WindowEye, Scenes]:
         """Make the eye and open the scenes."""
@@ -82,11 +131,11 @@ class Sampler:
         return eye, make_scenes(self.config.data, eye.detector.classes)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """The cells in which misses are counted (`CellsOfLook`)."""
+        """Lay out the cells in which misses are counted (`semfov.runs.samples.all_cells`)."""
         return all_cells(size, fixation)
 
     def load(self, shard: int) -> Samples | None:
-        """The samples of a shard; None if they are missing or damaged."""
+        """Read the samples of a shard; None if they are missing or damaged."""
         tensors = self.store.read(self.digest(shard))
         return None if tensors is None else Samples(**tensors)
 
@@ -95,7 +144,7 @@ class Sampler:
         self.store.write(self.digest(shard), vars(samples))
 
     def by_shard(self) -> Iterator[Samples]:
-        """The samples of one shard after another, so that not all are in memory."""
+        """Read the samples of one shard after another, so that not all are in memory."""
         for shard in self.shards:
             samples = self.load(shard)
             if samples is None:
@@ -104,30 +153,34 @@ class Sampler:
             yield samples
 
     def drawn(self, most: int) -> Samples:
-        """About so many detections, each drawn with the same probability, with all looks; all if they are less."""
+        """Draw about so many detections, each with the same probability.
+
+        Args:
+            most: number of detections.
+
+        Returns:
+            The detections with all looks; all detections if they are less.
+        """
         share = most / max(sum(len(samples) for samples in self.by_shard()), 1)
         if share >= 1:
             return self.all()
-        return Samples.join(
-            [
-                samples[
-                    torch.rand(len(samples), generator=generator_for("detections", self.config.seed, shard)) < share
-                ]
-                for shard, samples in enumerate(self.by_shard())
-            ]
-        )
+        parts = []
+        for shard, samples in enumerate(self.by_shard()):
+            generator = generator_for("detections", self.config.seed, shard)
+            parts.append(samples[torch.rand(len(samples), generator=generator) < share])
+        return Samples.join(parts)
 
     def all(self) -> Samples:
-        """The samples of all photographs in order."""
+        """Read the samples of all photographs in order."""
         return Samples.join(list(self.by_shard()))
 
     def scenes_of(self, shard: int) -> range:
-        """The photographs of a shard."""
+        """Return the numbers of the photographs of a shard."""
         first = shard * self.config.shard
         return range(first, min(first + self.config.shard, len(self.scenes)))
 
     def digest(self, shard: int) -> str:
-        """sha256 of what the pixels of a shard's photographs depend on, and of their numbers."""
+        """Compute a sha256 of what the pixels of a shard's photographs depend on, and of their numbers."""
         digests = [[index, self.scenes.digest(index)] for index in self.scenes_of(shard)]
         return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
 
@@ -136,28 +189,39 @@ class Sampler:
         return Samples.join([self._look(index) for index in self.scenes_of(shard)])
 
     def _look(self, index: int) -> Samples:
-        config, scene = self.config, self.scenes[index]
+        """Look at a photograph from random fixations; returns the labelled detections."""
+        scene = self.scenes[index]
         grid = Grid(1, 1, scene.size)
-        generator = generator_for("fixations", config.seed, scene.id)
-        points = torch.rand(config.fixations, 2, generator=generator) * grid.extent - 0.5
+        generator = generator_for("fixations", self.config.seed, scene.id)
+        points = torch.rand(self.config.fixations, 2, generator=generator) * grid.extent - 0.5
         detections = _look_from(cast(Eye, self.eye), scene.image, points)
-        return Samples.of(detections, points, self.scenes.annotation(index), index, config.iou)
+        return Samples.of(detections, points, self.scenes.annotation(index), index, self.config.iou)
 
 
 def _run_shard(sampler: Sampler, shard: int) -> bytes:
+    """Look at the photographs of a shard; returns the file of the labelled detections."""
     return pack_tensors(vars(sampler.sample(shard)))
 
 
-def collect_samples(config: Any, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:
+def collect_samples(config: SamplerSettings, folder: Path, title: str, kind: type[Sampler] = Sampler) -> Sampler:
     """Collect the labelled detections of all photographs; only those of shards that are not finished are computed.
 
     The result is the same to the last bit wherever the work is done, on processors of one kind.
+
+    Args:
+        config: the settings.
+        folder: folder of the store.
+        title: title of the progress bar.
+        kind: what looks at the photographs.
+
+    Returns:
+        The sampler, with all shards in its store.
     """
     sampler = kind(config, folder)
-    todo = [shard for shard in sampler.shards if sampler.load(shard) is None]
+    remaining = [shard for shard in sampler.shards if sampler.load(shard) is None]
     done = run_tasks(
         _run_shard,
-        todo,
+        remaining,
         where=config.where,
         make=kind,
         settings=(config, folder),

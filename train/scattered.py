@@ -1,6 +1,7 @@
 """Large pictures of one scene, composed by a seed: parts of photographs scattered over one ground."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from torch.nn import functional as F
 from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes, boxes_meet
 from semfov.errors import check
 from semfov.io.files import json_sha256
+from semfov.metrics.episodes import FloatArray
 
 _VERSION = 1  # raise it whenever the same seed would give another picture
 _MARGIN = 0.15
@@ -37,6 +39,13 @@ class _Cutout(NamedTuple):
     place: _Box
 
 
+class _Part(NamedTuple):
+    """A part of a photograph to cut out."""
+
+    scene: int
+    part: _Box
+
+
 class Scattered(ComposedScenes):
     """Pictures with few objects on a ground: single objects of one to three classes, or whole photographs.
 
@@ -60,27 +69,28 @@ class Scattered(ComposedScenes):
         check(most >= 1, "most", "at least 1", most)
         check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
         super().__init__(scenes.classes, count, seed)
-        self.scenes, self.whole, self.size, self.sides, self.most = scenes, whole, size, sides, most
+        self.scenes = scenes
+        self.whole = whole
+        self.size = size
+        self.sides = sides
+        self.most = most
         self._what = [_VERSION, scenes.fingerprint, whole, size, sides, most, seed]
         self.fingerprint = json_sha256([*self._what, count])
 
     @cached_property
-    def alone(self) -> dict[int, list[tuple[int, _Box]]]:
-        """By class, the objects that stand alone: index of the photograph and the part of it to cut out."""
-        by_class: dict[int, list[tuple[int, _Box]]] = defaultdict(list)
+    def alone(self) -> dict[int, list[_Part]]:
+        """By class, the objects that stand alone, as parts of photographs to cut out."""
+        by_class: dict[int, list[_Part]] = defaultdict(list)
         for index in range(len(self.scenes)):
             annotation = self.scenes.annotation(index)
             sides = annotation.boxes[:, 2:] - annotation.boxes[:, :2]
-            wide = torch.cat([annotation.boxes[:, :2] - _MARGIN * sides, annotation.boxes[:, 2:] + _MARGIN * sides], -1)
-            low = torch.maximum(wide[:, None, :2], annotation.boxes[:, :2])
-            high = torch.minimum(wide[:, None, 2:], annotation.boxes[:, 2:])
-            shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)
-            alone = (shared.sum(1) <= _SHARED * (wide[:, 2:] - wide[:, :2]).prod(-1)) & ~annotation.crowd
-            alone &= sides.amax(-1) >= _SMALLEST
-            for n in alone.nonzero()[:, 0].tolist():
-                limits = annotation.size * 2
-                part = [min(max(round(edge), 0), limit) for edge, limit in zip(wide[n].tolist(), limits, strict=True)]
-                by_class[int(annotation.labels[n])].append((index, (part[0], part[1], part[2], part[3])))
+            wider = torch.cat(
+                [annotation.boxes[:, :2] - _MARGIN * sides, annotation.boxes[:, 2:] + _MARGIN * sides], -1
+            )
+            is_large = sides.amax(-1) >= _SMALLEST
+            for number in (_stand_alone(annotation, wider) & is_large).nonzero()[:, 0].tolist():
+                part = _pixels(wider[number], annotation.size)
+                by_class[int(annotation.labels[number])].append(_Part(index, part))
         return dict(by_class)
 
     def cutouts(self, index: int) -> list[_Cutout]:
@@ -89,29 +99,49 @@ class Scattered(ComposedScenes):
         low, high = np.log(self.sides)
         side = np.exp(draw.uniform(low, high))
         count = round(np.exp(draw.uniform(0, np.log(self.most))))
-        if self.whole or not self.alone:
-            order = draw.permutation(len(self.scenes))[:count].tolist()
-            sources = [(n, (0, 0, *self.scenes.annotation(n).size)) for n in order]
-        else:
-            kinds = sorted(self.alone)
-            weights = np.sqrt([len(self.alone[kind]) for kind in kinds])
-            chosen = draw.choice(kinds, size=draw.integers(1, 4), p=weights / weights.sum())
-            rows = [self.alone[int(draw.choice(chosen))] for _ in range(count)]
-            sources = [row[int(draw.integers(len(row)))] for row in rows]
+        parts = self._drawn_parts(draw, count)
         groups = draw.uniform(0, 1, (draw.integers(1, 5), 2)) * self.size
         spread = draw.uniform(0.03, 0.2) * self.size[0]
         placed: list[_Cutout] = []
-        for number, part in sources:
-            scale = min(1.0, side * draw.uniform(0.7, 1.3) / max(part[2] - part[0], part[3] - part[1]))
-            wide, tall = (max(2, round(scale * (part[n + 2] - part[n]))) for n in (0, 1))
-            for _ in range(_TRIES):
-                x, y = draw.normal(groups[draw.integers(len(groups))], spread)
-                place = round(x), round(y), round(x) + wide, round(y) + tall
-                inside = x >= 0 and y >= 0 and place[2] <= self.size[0] and place[3] <= self.size[1]
-                if inside and not any(boxes_meet(place, other.place) for other in placed):
-                    placed.append(_Cutout(number, part, place))
-                    break
+        for scene, part in parts:
+            x1, y1, x2, y2 = part
+            # Objects of a picture are about equally large, and none is enlarged.
+            scale = min(1.0, side * draw.uniform(0.7, 1.3) / max(x2 - x1, y2 - y1))
+            width = max(2, round(scale * (x2 - x1)))
+            height = max(2, round(scale * (y2 - y1)))
+            place = self._free_place(draw, groups, spread, (width, height), placed)
+            if place is not None:
+                placed.append(_Cutout(scene, part, place))
         return placed
+
+    def _drawn_parts(self, draw: np.random.Generator, count: int) -> list[_Part]:
+        """Draw photographs, or objects of one to three classes."""
+        if self.whole or not self.alone:
+            order = draw.permutation(len(self.scenes))[:count].tolist()
+            return [_Part(scene, (0, 0, *self.scenes.annotation(scene).size)) for scene in order]
+        classes = sorted(self.alone)
+        weights = np.sqrt([len(self.alone[number]) for number in classes])
+        chosen = draw.choice(classes, size=draw.integers(1, 4), p=weights / weights.sum())
+        objects = [self.alone[int(draw.choice(chosen))] for _ in range(count)]
+        return [of_class[int(draw.integers(len(of_class)))] for of_class in objects]
+
+    def _free_place(
+        self,
+        draw: np.random.Generator,
+        groups: FloatArray,
+        spread: float,
+        size: tuple[int, int],
+        placed: Sequence[_Cutout],
+    ) -> _Box | None:
+        """Draw a place for a cutout of `(width, height)` near one of the groups `(G, 2)`; None if none is free."""
+        width, height = size
+        for _ in range(_TRIES):
+            x, y = draw.normal(groups[draw.integers(len(groups))], spread)
+            place = round(x), round(y), round(x) + width, round(y) + height
+            is_inside = x >= 0 and y >= 0 and place[2] <= self.size[0] and place[3] <= self.size[1]
+            if is_inside and not any(boxes_meet(place, other.place) for other in placed):
+                return place
+        return None
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a picture."""
@@ -127,10 +157,13 @@ class Scattered(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a picture, without composing its image."""
-        boxes, labels, crowd = [torch.zeros(0, 4)], [torch.zeros(0, dtype=torch.long)], [torch.zeros(0).bool()]
+        boxes = [torch.zeros(0, 4)]
+        labels = [torch.zeros(0, dtype=torch.long)]
+        crowd = [torch.zeros(0).bool()]
         for cutout in self.cutouts(index):
             annotation = self.scenes.annotation(cutout.scene)
-            low, high = (annotation.boxes.new_tensor(cutout.part[n : n + 2]) for n in (0, 2))
+            low = annotation.boxes.new_tensor(cutout.part[:2])
+            high = annotation.boxes.new_tensor(cutout.part[2:])
             centre = (annotation.boxes[:, :2] + annotation.boxes[:, 2:]) / 2
             inside = ((centre >= low) & (centre <= high)).all(-1)
             x1, y1, x2, y2 = cutout.place
@@ -146,7 +179,7 @@ class Scattered(ComposedScenes):
         return json_sha256([*self._what, self.ids[index]])
 
     def _ground(self, index: int) -> Tensor:
-        """The ground of a picture, `(3, height, width)`."""
+        """Compose the ground of a picture, `(3, height, width)`."""
         draw = self._generator(index, 1)
         ground = self._texture(draw)
         for _ in range(_PATCHES - 1):
@@ -158,7 +191,7 @@ class Scattered(ComposedScenes):
         return ground
 
     def _texture(self, draw: np.random.Generator) -> Tensor:
-        """A patch of a photograph without objects, mirrored until it fills a picture."""
+        """Draw a patch of a photograph without objects, mirrored until it fills a picture."""
         patch = torch.full((3, 16, 16), float(draw.random()))
         for _ in range(_TRIES):
             index = int(draw.integers(len(self.scenes)))
@@ -168,18 +201,36 @@ class Scattered(ComposedScenes):
             if not any(boxes_meet((x, y, x + side, y + side), box) for box in annotation.boxes.tolist()):
                 patch = self.scenes[index].image[:, y : y + side, x : x + side]
                 break
-        across, down = (_mirrored(length, side) for length, side in zip(self.size, patch.shape[:0:-1], strict=True))
-        return patch[:, down][:, :, across]
+        width, height = self.size
+        columns = _mirrored(width, patch.shape[2])
+        rows = _mirrored(height, patch.shape[1])
+        return patch[:, rows][:, :, columns]
 
 
 def _mirrored(length: int, side: int) -> Tensor:
-    """Indices `(length,)` that run through a side back and forth."""
+    """Return indices `(length,)` that run through a side back and forth."""
     place = torch.arange(length) % (2 * side)
     return torch.minimum(place, 2 * side - 1 - place)
 
 
 def _fading(length: int) -> Tensor:
-    """Weights `(length,)` along a side of a cutout that rise from its border to the object in it."""
+    """Return weights `(length,)` along a side of a cutout that rise from its border to the object in it."""
     margin = max(1.0, length * _MARGIN / (1 + 2 * _MARGIN))
     place = torch.arange(length) + 0.5
     return (torch.minimum(place, length - place) / margin).clamp(max=1)
+
+
+def _stand_alone(annotation: Annotation, wider: Tensor) -> Tensor:
+    """Tell which objects `(M,)` can be cut out by wider boxes `(M, 4)`: others cover little of these."""
+    low = torch.maximum(wider[:, None, :2], annotation.boxes[:, :2])
+    high = torch.minimum(wider[:, None, 2:], annotation.boxes[:, 2:])
+    shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)
+    area = (wider[:, 2:] - wider[:, :2]).prod(-1)
+    return (shared.sum(1) <= _SHARED * area) & ~annotation.crowd
+
+
+def _pixels(box: Tensor, size: tuple[int, int]) -> _Box:
+    """Round a box `(4,)` to pixels of an image of `(width, height)`."""
+    width, height = size
+    x1, y1, x2, y2 = (round(edge) for edge in box.tolist())
+    return min(max(x1, 0), width), min(max(y1, 0), height), min(max(x2, 0), width), min(max(y2, 0), height)

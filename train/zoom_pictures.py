@@ -66,16 +66,17 @@ class PicturesFit(MosaicFit):
 
 
 def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:
-    """Compose pictures of a kind."""
+    """Compose pictures of a kind; photographs are `tile` pixels wide and three quarters of that high."""
     seed += 10 + PICTURE_KINDS.index(kind)
-    half, ground = (tile // 2, tile * 3 // 8), (8 * tile, 9 * tile // 2)
+    half_tile = tile // 2, tile * 3 // 8
+    ground = 8 * tile, 9 * tile // 2
     match kind:
         case "few":
             return Mosaics(scenes, 3, 3, tile=(tile, tile * 3 // 4), count=count, seed=seed)
         case "many":
-            return Mosaics(scenes, 12, 12, tile=half, count=count, seed=seed)
+            return Mosaics(scenes, 12, 12, tile=half_tile, count=count, seed=seed)
         case "one class":
-            return Mosaics(scenes, 8, 6, tile=half, alike=True, count=count, seed=seed)
+            return Mosaics(scenes, 8, 6, tile=half_tile, alike=True, count=count, seed=seed)
         case "photographs":
             sides = tile // 5, tile
             return Scattered(scenes, whole=True, size=ground, sides=sides, most=8, count=count, seed=seed)

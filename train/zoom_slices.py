@@ -8,6 +8,8 @@ from torch import Tensor
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import WindowStep, look_by_look
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.hints import Gist
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_hit
 
@@ -45,37 +47,49 @@ def look_for_slice(
 
 
 def _best_slice(
-    belief: ZoomBelief, slices: Sequence[Window], done: set[Window], known: dict[Window, float]
+    belief: ZoomBelief, slices: Sequence[Window], done: set[Window], log_odds: dict[Window, float]
 ) -> WindowChoice | None:
-    """As `best_hit`, but only given slices can confirm the target; coarser windows are those of the lattice."""
-    left = [window for window in slices if window not in done]
-    if not left:
+    """Choose as `best_hit`, but only given slices can confirm the target; coarser windows are those of the lattice."""
+    remaining = [window for window in slices if window not in done]
+    if not remaining:
         return None
-    for window in left:
-        if window not in known:
-            known[window] = odds_of(belief, window)
-    chances = {window: float(torch.tensor(known[window]).sigmoid()) for window in left}
-    window = max(chances, key=chances.__getitem__)
-    best: WindowChoice = window, chances[window]
-    lattice = belief.lattice
+    for window in remaining:
+        if window not in log_odds:
+            log_odds[window] = odds_of(belief, window)
+    chances = {window: float(torch.tensor(log_odds[window]).sigmoid()) for window in remaining}
+    likeliest = max(chances, key=chances.__getitem__)
+    best: WindowChoice = likeliest, chances[likeliest]
     finest = min(window.level for window in slices)
     for level in range(1, finest):
-        half, (across, down) = max(1, lattice.span(level) // 4), lattice.places(level)
-        for row in sorted({*range(0, down, half), down - 1}):
-            for column in sorted({*range(0, across, half), across - 1}):
-                coarse = Window.on(lattice, (level, column, row))
-                if coarse in done:
-                    continue
-                inside = [p for w, p in chances.items() if _inside(w, coarse) and _coarser(belief, w, level)]
-                value = sum(inside) / belief.evidence.patience
-                if value > best[1]:
-                    best = coarse, value
+        for coarse in _windows_at(belief.lattice, level):
+            if coarse in done:
+                continue
+            # The chances of the slices that a coarser window shows, and that no look as close has shown.
+            shown = [
+                chance
+                for window, chance in chances.items()
+                if _inside(window, coarse) and _coarser(belief, window, level)
+            ]
+            worth = sum(shown) / belief.evidence.patience
+            if worth > best[1]:
+                best = coarse, worth
     return best
 
 
+def _windows_at(lattice: Lattice, level: int) -> Iterator[Window]:
+    """List the windows of a level at steps of a quarter of a window, and those at the far borders."""
+    step = max(1, lattice.span(level) // 4)
+    columns, rows = lattice.places(level)
+    for row in sorted({*range(0, rows, step), rows - 1}):
+        for column in sorted({*range(0, columns, step), columns - 1}):
+            yield Window.on(lattice, (level, column, row))
+
+
 def _inside(window: Window, other: Window) -> bool:
-    a, b = window.cells, other.cells
-    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
+    """Tell whether a window lies in another one."""
+    x1, y1, x2, y2 = window.cells
+    left, top, right, bottom = other.cells
+    return x1 >= left and y1 >= top and x2 <= right and y2 <= bottom
 
 
 def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
@@ -87,24 +101,41 @@ def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
 
 
 def odds_of(belief: ZoomBelief, window: Window) -> float:
-    """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
-    value: Tensor | None = None
+    """Compute the log odds that a look at a window shows the class; the window need not lie on the lattice.
+
+    Args:
+        belief: what the looks so far have shown.
+        window: the window.
+
+    Returns:
+        The log odds; minus infinity where no look predicts the window.
+    """
+    log_odds: Tensor | None = None
     for look in sorted(belief.gists, key=lambda gist: gist.level):
         steps = window.level - look.level
-        x1, y1, x2, y2 = window.cells
-        left, top = look.first
-        inside = x1 >= left and y1 >= top and x2 <= left + look.scores.shape[1] * look.scale
-        inside = inside and y2 <= top + look.scores.shape[0] * look.scale
-        if not (inside or look.level == 0) or not 1 <= steps <= STEPS:
+        if not 1 <= steps <= STEPS or not (look.level == 0 or _shows(look, window)):
             continue
-        box = (
-            (x1 - left) // look.scale,
-            (y1 - top) // look.scale,
-            max(-(-(x2 - left) // look.scale), (x1 - left) // look.scale + 1),
-            max(-(-(y2 - top) // look.scale), (y1 - top) // look.scale + 1),
-        )
-        pooled, summary = pool(look.scores, box)
+        pooled, summary = pool(look.scores, _cells_in(look, window))
         with torch.no_grad():
-            before = None if value is None or look.level == 0 else value
-            value = belief.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), belief.target, before)
-    return float("-inf") if value is None else float(value)
+            before = None if log_odds is None or look.level == 0 else log_odds
+            log_odds = belief.evidence.presence(
+                pooled[None], summary[None], torch.tensor([steps]), belief.target, before
+            )
+    return float("-inf") if log_odds is None else float(log_odds)
+
+
+def _shows(look: Gist, window: Window) -> bool:
+    """Tell whether a window lies in what a look shows."""
+    x1, y1, x2, y2 = window.cells
+    left, top = look.first
+    rows, columns = look.scores.shape[:2]
+    return x1 >= left and y1 >= top and x2 <= left + columns * look.scale and y2 <= top + rows * look.scale
+
+
+def _cells_in(look: Gist, window: Window) -> tuple[int, int, int, int]:
+    """Find the cells of a look that a window shows, at least one: first column and row, and those after the last."""
+    x1, y1, x2, y2 = window.cells
+    left, top = look.first
+    column = (x1 - left) // look.scale
+    row = (y1 - top) // look.scale
+    return column, row, max(-(-(x2 - left) // look.scale), column + 1), max(-(-(y2 - top) // look.scale), row + 1)

@@ -148,7 +148,17 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
 
 
 def search_shares(scenes: Scenes, config: FitSearchConfig) -> Tensor:
-    """Share of the searches for each class whose target is there, `(K,)`, half a search for and against added."""
+    """Compute the share of the searches for each class whose target is there.
+
+    Half a search for and against is added.
+
+    Args:
+        scenes: the photographs.
+        config: how classes are drawn.
+
+    Returns:
+        The shares, `(K,)`.
+    """
     there, missing = numbers_drawn(scenes, config.classes, config.max_target_area, config.absent)
     return ((there + 0.5) / (there + missing + 1)).float()
 

@@ -111,7 +111,7 @@ class EvidenceFit(PartFit):
         return strategies
 
     def _curves(self, strategies: Mapping[str, Strategy]) -> dict[str, FloatArray]:
-        """Cumulative performance of strategies on every photograph with a target, `(P, shifts+1)`."""
+        """Search every held-out photograph with a target; returns cumulative performances `(P, shifts+1)`."""
         run = self.run
         protocol = self.inputs.protocol
         curves: dict[str, list[FloatArray]] = {name: [] for name in strategies}
@@ -172,6 +172,7 @@ class EvidenceFit(PartFit):
         return decisions
 
     def _report_on_curves(self, curves: Mapping[str, FloatArray]) -> str:
+        """Write the section about the searches."""
         protocol = self.inputs.protocol
         shifts = (1, self.inputs.compared_at, protocol.shifts)
         return section(
@@ -193,6 +194,7 @@ def _decide_by_score(step: Step, target: int, grid: Grid) -> Tensor:
 
 
 def _report_on_decisions(decisions: Mapping[str, Sequence[_Decision]], thresholds: Thresholds) -> str:
+    """Write the section about the decisions."""
     rows = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
     for name, of_belief in decisions.items():
         rows.append(
@@ -215,6 +217,6 @@ def _report_on_decisions(decisions: Mapping[str, Sequence[_Decision]], threshold
 
 
 def _share_found(decisions: Sequence[_Decision], *, present: bool) -> str:
-    """Share of the searches for present or for absent classes that find their target, as a cell of a table."""
+    """Format the share of the searches for present or for absent classes that find their target."""
     found = [decision.outcome == "found" for decision in decisions if decision.present == present]
     return share(sum(found), len(found))

@@ -74,7 +74,7 @@ class FolderFit:
         return result
 
     def _key(self, name: str) -> str:
-        """Digest of all that a part depends on: photographs, looks and code, its settings, and the parts before it."""
+        """Digest all that a part depends on: photographs, looks and code, its settings, and the parts before it."""
         results = self.inputs.results
         before: list[Any] = [fitted.part.sha256 for fitted in results.values()]
         before += [plain(asdict(fitted.part)) for fitted in results.values() if fitted.part.settings]

@@ -70,7 +70,7 @@ def folder_report(inputs: PartInputs, seconds: float) -> str:
 
 
 def _part_rows(inputs: PartInputs) -> list[list[str]]:
-    """Rows of a table of the parts."""
+    """Make rows of a table of the parts."""
     rows = [["part", "used", "result on held-out photographs"]]
     for name, fitted in inputs.results.items():
         used = "yes" if fitted.part.used else _UNUSED.get(name, "no, raw")
@@ -107,7 +107,7 @@ def thin_classes(counts: Mapping[str, int], thin: int) -> list[str]:
 
 
 def _roughness(held_out: int) -> list[str]:
-    """Lines of Markdown that say whether the figures are rough."""
+    """Say, in lines of Markdown, whether the figures are rough."""
     if held_out >= _FEW:
         return []
     number = "only 1 photograph" if held_out == 1 else f"only {held_out} photographs"

@@ -110,12 +110,12 @@ def _fit_map(
 
 
 def _steps(pictures: _Pictures, batch: int) -> int:
-    """Number of batches of pictures in an epoch."""
+    """Count the batches of pictures in an epoch."""
     return sum(-(-len(numbers) // batch) for numbers in pictures)
 
 
 def _batches(pictures: _Pictures, batch: int, generator: torch.Generator) -> Iterator[tuple[int, list[int]]]:
-    """Random batches of pictures of one group, with its number, in random order, epoch after epoch."""
+    """Draw batches of pictures of one group, with its number, in random order, epoch after epoch."""
     while True:
         batches: list[tuple[int, list[int]]] = []
         for group, numbers in enumerate(pictures):
@@ -234,7 +234,7 @@ def _events_on(events: Events, corner: tuple[int, int], size: tuple[int, int], g
 def _saccade_loss(
     model: FixationDensity, maps: Tensor, centre: Tensor, events: Events, size: tuple[int, int], corner: tuple[int, int]
 ) -> Tensor:
-    """Mean negative log likelihood of events by all terms, on every second row and column of cells."""
+    """Average the negative log likelihood of events by all terms, on every second row and column of cells."""
     terms = {"map": _for_events(maps, events), "centre bias": centre[None]}
     conditional = model.given(terms, size, events.before, (*corner, _EVERY))
     log_density = torch.stack([*conditional.values()]).sum(0)
@@ -245,7 +245,7 @@ def _saccade_loss(
 
 
 def _for_events(maps: _MapsOfPicture, events: Events) -> Tensor:
-    """The map of each event."""
+    """Return the map of each event."""
     if not isinstance(maps, Tensor):
         return maps(events)
     return maps if len(maps) == 1 else maps[events.person]
@@ -294,7 +294,7 @@ def score(
 
 
 def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[int, int]) -> Tensor:
-    """Density in the bins of a raster, `(E, N)` or `(1, N)`, by terms `(E or 1, rows, columns)` without some."""
+    """Sum the density of terms `(E or 1, rows, columns)`, without some, in the bins of a raster, `(E or 1, N)`."""
     log_density = torch.zeros_like(terms["map"][:1])
     for name, term in terms.items():
         if name not in left_out:
@@ -305,7 +305,7 @@ def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[in
 
 
 def _scores(density: Tensor, cell: Tensor) -> Tensor:
-    """Means of NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`."""
+    """Average NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`."""
     at_fixation = density.gather(1, cell[:, None])[:, 0]
     z = (at_fixation - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
     lower = (density < at_fixation[:, None]).float().mean(1)

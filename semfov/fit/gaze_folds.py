@@ -65,7 +65,7 @@ class Fold:
         return split
 
     def fitted(self, source: int | None = None) -> list[list[int]]:
-        """The pictures of each group that models are fitted to, of one data set or of all."""
+        """Return the pictures of each group that models are fitted to, of one data set or of all."""
         return [
             others if source in (None, group.source) else []
             for group, (others, _) in zip(self.groups(), self._split, strict=True)
@@ -96,7 +96,7 @@ class Fold:
     def _group_scores(
         self, model: FixationDensity, group: Viewed, judge: Viewed, pictures: list[int]
     ) -> dict[str, Tensor]:
-        """Scores on pictures of one size by row, each `(P, 3)`."""
+        """Score a model on pictures of one size; returns scores `(P, 3)` by row."""
         maps = self.maps(model, group, pictures)
         bias = FixationDensity({"none": 1}, centre=self.centres[group.source])
         flat_maps = [torch.zeros(1, *cells_of(group.size))] * len(pictures)

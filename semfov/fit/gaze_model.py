@@ -73,7 +73,7 @@ def _describe_starts(model: FixationDensity, groups: Sequence[Viewed]) -> None:
 
 
 def _timed(group: Viewed) -> Iterator[Fixations]:
-    """The scanpaths of a group with durations."""
+    """Go through the scanpaths of a group with durations."""
     for people in group.people:
         for scanpath in people:
             if scanpath.durations is not None:
@@ -148,7 +148,7 @@ def summaries(scores: Scores) -> dict[str, dict[str, Mapping[str, float]]]:
 
 
 def _summary(metrics: Tensor, centre: Tensor) -> dict[str, float]:
-    """Means of a row `(P, 3)`, with its gain over the centre bias `(P, 3)`."""
+    """Average a row `(P, 3)`, with its gain over the centre bias `(P, 3)`."""
     return {
         "NSS": float(metrics[:, 0].mean()),
         "AUC": float(metrics[:, 1].mean()),

@@ -232,7 +232,7 @@ def _train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples,
 
 
 def _gain(model: MapEvidence, step: Step, examples: MapExamples, cell: Tensor) -> Tensor:
-    """The gain of looks from cells `(B,)` that the model expects after a look, `(B, X·Y)`."""
+    """Compute the gain of looks from cells `(B,)` that the model expects after a look, `(B, X·Y)`."""
     belief = step.belief
     assert isinstance(belief, MapBelief)
     distance = examples.distance[torch.arange(len(examples)), cell][:, None]

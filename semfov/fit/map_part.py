@@ -69,7 +69,7 @@ class MapFit(PartFit):
         return strategies
 
     def _curves(self, strategies: Mapping[str, Strategy]) -> dict[str, _Curves]:
-        """Share of the cells, with `objects` and of `all`, that strategies classify correctly."""
+        """Explore held-out photographs; returns the shares of right cells, of those with `objects` and of `all`."""
         run = self.run
         protocol = self.inputs.protocol
         rows: dict[str, dict[str, list[FloatArray]]] = {kind: {name: [] for name in strategies} for kind in _MEASURED}
@@ -117,6 +117,7 @@ class MapFit(PartFit):
         )
 
     def _report(self, curves: Mapping[str, _Curves]) -> str:
+        """Write the section about the explorations."""
         shifts = (1, self.inputs.compared_at, self.inputs.protocol.shifts)
         head = ["map", *(f"after {n}" for n in shifts)]
         kinds = {"objects": "cells with objects, the published success rate", "all": "all cells"}

@@ -159,6 +159,6 @@ class ObservationFit(PartFit):
 
 
 def _mean_costs(posterior: Tensor, judged: Samples) -> FloatArray:
-    """Mean surprisal of the true class in each photograph, `(P,)`; posterior `(M, K+1)`."""
+    """Average the surprisal of the true class in each photograph, `(P,)`; posterior `(M, K+1)`."""
     cost = surprisal(posterior.double().gather(1, judged.labels[:, None])[:, 0])
     return torch.stack([cost[judged.scene == scene].mean() for scene in judged.scene.unique().tolist()]).numpy()

@@ -214,7 +214,7 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], h
 
 
 def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
-    r"""Share π of the searches for each class whose target is there, as the frequency alone predicts it.
+    r"""Predict the share π of the searches for each class whose target is there, by its frequency alone.
 
     .. math:: \operatorname{logit} \pi_t = b_0 \operatorname{logit} q_t + c_0
 
@@ -235,7 +235,7 @@ def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
 
 
 def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, shares: Tensor) -> Tensor:
-    r"""Shares with which searches of all photographs for each class have the right probabilities, near others.
+    r"""Fit shares with which searches of all photographs for each class have the right probabilities, near others.
 
     Some classes are hinted at more often than others where they are not, such as chairs: their score tells less than
     that of a class as frequent. The shift δ of the log odds of each class maximises the likelihood of all photographs,
@@ -269,7 +269,7 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
 
 
 def _explored(looks: Sequence[WindowLook], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:
-    """What the whole, and the whole with all slices, show of all classes, and of the most frequent class."""
+    """Judge what the whole, and all slices, show of all classes, and of the most frequent class."""
     targets: list[int | None] = [None]
     if len(annotation.labels):
         targets.append(int(annotation.labels.mode().values))
@@ -292,7 +292,7 @@ def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
 
 
 def _log_odds_held(held: Tensor, count: int) -> Tensor:
-    """Log odds that a photograph holds each class, half a photograph for and against added."""
+    """Compute the log odds that a photograph holds each class, half a photograph for and against added."""
     return ((held + 0.5) / (count + 1)).double().logit()
 
 

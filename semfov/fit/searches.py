@@ -63,7 +63,7 @@ class TargetSearch(ABC, Generic[LookType]):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Number of looks, without closer looks."""
+        """Count the looks, without closer looks."""
 
     @abstractmethod
     def look(self, index: int, number: int) -> LookType:

@@ -106,7 +106,11 @@ class FitDetectorConfig(FitOnCellsConfig):
     out: Path = Path("mymodels")
 
     def named(self) -> "FitDetectorConfig":
-        """These settings with `model` as the detector's name, and with targets of all sizes in the photographs."""
+        """Return the settings with `model` as the detector's name, and with targets of all sizes in the photographs.
+
+        Raises:
+            InputError: the settings name no detector, or another one besides, or options of `gaze` without fixations.
+        """
         default = DetectorConfig().name
         if self.model is None:
             raise InputError("model: expected the name or the file of a detector, got none")

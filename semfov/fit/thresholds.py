@@ -61,7 +61,7 @@ class _Searches:
         return int(self.found(thresholds)[self.there].sum())
 
     def false_alarms(self, thresholds: Thresholds) -> float:
-        """Share of the absent targets that are found."""
+        """Compute the share of the absent targets that are found."""
         return float(self.found(thresholds)[~self.there].double().mean())
 
     def confirming(self, place: float, bounds: Bounds) -> Thresholds:

@@ -44,25 +44,37 @@ class SearchedLooks:
 def searched_looks(
     scenes: Scenes, samples: Samples, cells: tuple[int, int], max_target_area: float
 ) -> dict[int, SearchedLooks]:
-    """Find the searches that stored looks allow, by the number of the photograph; some photographs have none."""
-    found = {}
+    """Find the searches that stored looks allow.
+
+    Args:
+        scenes: the photographs.
+        samples: labelled detections of their looks.
+        cells: columns and rows of the grid.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+
+    Returns:
+        The searches by the number of the photograph; some photographs have none.
+    """
+    searches = {}
     for index in samples.scenes.unique().tolist():
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
         covered = grid.footprint(annotation.boxes)
-        goals = {
-            target: covered[annotation.labels == target].any(0) for target in legal_targets(annotation, max_target_area)
-        }
-        goals = {target: goal for target, goal in goals.items() if goal.any() and not goal.all()}
+        goals: dict[int, Tensor] = {}
+        for target in legal_targets(annotation, max_target_area):
+            goal = covered[annotation.labels == target].any(0)
+            # A target in every cell is found at once.
+            if goal.any() and not goal.all():
+                goals[target] = goal
         if goals:
             looks, fixations = samples.looks_at(index)
-            goal = torch.stack([*goals.values()])
-            found[index] = SearchedLooks(looks, fixations, grid, torch.tensor([*goals]), goal)
-    return found
+            targets = torch.tensor([*goals])
+            searches[index] = SearchedLooks(looks, fixations, grid, targets, torch.stack([*goals.values()]))
+    return searches
 
 
 def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> Tensor | None:
-    r"""Loss of searches that fixate in a given order, the mean over looks and over targets that were not found yet.
+    r"""Compute the loss of searches that fixate in a given order, a mean over looks and targets not found yet.
 
     .. math:: -\ln \frac{\sum_{x \in \text{goal}} P(t \in x)}{\sum_x P(t \in x)}, \quad x \text{ not fixated yet}
 
@@ -95,10 +107,23 @@ def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> 
 
 @torch.no_grad()
 def mean_landing_loss(model: FovealObservationModel, searches: Sequence[SearchedLooks], looks: int = 8) -> float:
-    """Average the loss of searches over photographs, with their first looks in the order in which they are stored."""
+    """Average the loss of searches over photographs, with their first looks in the order in which they are stored.
+
+    Args:
+        model: an observation model that was fitted through the belief.
+        searches: looks at photographs.
+        looks: most looks in a search.
+
+    Returns:
+        The mean over photographs whose first look leaves a target to find.
+    """
     observer = Semantic.searching(model)
-    losses = [landing_loss(observer, each, torch.arange(min(looks, len(each.fixations)))) for each in searches]
-    return float(torch.stack([loss for loss in losses if loss is not None]).mean())
+    losses = []
+    for searched in searches:
+        loss = landing_loss(observer, searched, torch.arange(min(looks, len(searched.fixations))))
+        if loss is not None:
+            losses.append(loss)
+    return float(torch.stack(losses).mean())
 
 
 @torch.no_grad()
@@ -106,9 +131,9 @@ def starting_model(model: FovealObservationModel) -> FovealObservationModel:
     """Copy a model for `fit_through_belief`, with exponents, odds of a miss and refutation to start from."""
     start = deepcopy(model)
     start.log_exponents.fill_(math.log(_EXPONENT))
-    odds = torch.full_like(start.log_prior, math.log(_MISS))
-    odds[0] = 0.0
-    start.log_miss = nn.Parameter(odds)
+    log_miss = torch.full_like(start.log_prior, math.log(_MISS))
+    log_miss[0] = 0.0  # background cannot be missed
+    start.log_miss = nn.Parameter(log_miss)
     start.refutation.fill_(_REFUTATION)
     return start
 
@@ -159,10 +184,12 @@ def fit_through_belief(
 
     def loss_of(_: int) -> Tensor | None:
         losses = []
-        for chosen in torch.randint(len(searches), (batch,), generator=generator).tolist():
-            order = torch.randperm(len(searches[chosen].fixations), generator=generator)[:looks]
-            loss = landing_loss(observer, searches[chosen], order)
-            losses += [] if loss is None else [loss]
+        for number in torch.randint(len(searches), (batch,), generator=generator).tolist():
+            searched = searches[number]
+            order = torch.randperm(len(searched.fixations), generator=generator)[:looks]
+            loss = landing_loss(observer, searched, order)
+            if loss is not None:
+                losses.append(loss)
         return torch.stack(losses).mean() if losses else None
 
     parameters = [trained.log_exponents, trained.log_prior, trained.log_miss, trained.refutation]
@@ -174,6 +201,6 @@ def fit_through_belief(
 
 
 def _same_for_all_classes(gradient: Tensor) -> Tensor:
-    """Gradient `(K+1, N)` of a table whose classes move together; background stays."""
-    same = gradient[1:].sum(0).expand_as(gradient)
-    return torch.cat([torch.zeros_like(same[:1]), same[1:]])
+    """Sum the gradient `(K+1, N)` of a table over its classes, which move together; background stays."""
+    total = gradient[1:].sum(0).expand_as(gradient)
+    return torch.cat([torch.zeros_like(total[:1]), total[1:]])

@@ -223,6 +223,7 @@ def verify(
 def _verify_search(
     search: TargetSearch[Any], model: Verification, limits: Thresholds, thresholds: Thresholds | None
 ) -> VerifiedSearch:
+    """Make all closer looks of a search, and decide it without them."""
     places = search.candidates()
     verifier = Verifier(model, places, search.close_up, limits, search.most)
     looks = 0

@@ -90,7 +90,7 @@ def _compare(fitted: VerificationInFolds) -> tuple[Difference, str]:
 
 
 def _scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> FloatArray:
-    """Mean score of the decisions in each photograph, `(P,)`; present and absent classes have equal weight."""
+    """Average the scores of decisions in each photograph, `(P,)`; present and absent classes have equal weight."""
     by_picture: dict[int, dict[bool, list[int]]] = {}
     for search, end in zip(searches, ends, strict=True):
         scores = by_picture.setdefault(search.picture, {}).setdefault(search.present, [])
@@ -100,7 +100,7 @@ def _scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> Fl
 
 
 def _score(end: SearchEnd) -> int:
-    """Score of a decision: 1 for the right place, -1 for a wrong one, 0 if nothing is found."""
+    """Score a decision: 1 for the right place, -1 for a wrong one, 0 if nothing is found."""
     if end.right is None:
         return 0
     return 1 if end.right else -1

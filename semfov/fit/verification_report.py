@@ -85,7 +85,7 @@ def _chances(fitted: VerificationInFolds) -> tuple[list[list[str]], dict[str, fl
 
 
 def _decisions(fitted: VerificationInFolds) -> list[list[str]]:
-    """Rows of a table of the decisions, without closer looks and with them, at several thresholds."""
+    """Make rows of a table of the decisions, without closer looks and with them, at several thresholds."""
     assert fitted.model.thresholds is not None
     chosen = fitted.model.thresholds.confirm
     searches = fitted.searches
@@ -100,7 +100,7 @@ def _decisions(fitted: VerificationInFolds) -> list[list[str]]:
 
 
 def _rates(present: Sequence[bool], ends: Sequence[SearchEnd]) -> list[str]:
-    """Hits, false alarms, right places and looks of decisions, as cells of a table."""
+    """Count hits, false alarms, right places and looks of decisions, as cells of a table."""
     shares = []
     verdicts: list[bool] = []
     looks = []
@@ -114,7 +114,7 @@ def _rates(present: Sequence[bool], ends: Sequence[SearchEnd]) -> list[str]:
 
 
 def _area(score: Tensor, answers: Tensor) -> float | None:
-    """Area under the ROC; None if all answers are the same."""
+    """Compute the area under the ROC; None if all answers are the same."""
     return area_under_roc(score, answers) if answers.any() and not answers.all() else None
 
 

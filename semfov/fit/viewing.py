@@ -82,7 +82,7 @@ class ViewingData(Settings):
         return dict(islice(pictures.items(), self.limit))
 
     def seconds_of(self, number: int) -> float:
-        """Time for which people viewed a picture of a data set."""
+        """Return the time for which people viewed a picture of a data set."""
         return self.seconds[number] if number < len(self.seconds) else _SECONDS
 
 
@@ -148,7 +148,7 @@ def counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, in
 
 
 def _numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
-    """Numbers of the cells that hold points; those outside the picture belong to the nearest cell."""
+    """Find the cells that hold points, by number; those outside the picture belong to the nearest cell."""
     x = ((points[:, 0] + 0.5) * (cells[1] / size[1])).floor().clamp(0, cells[1] - 1)
     y = ((points[:, 1] + 0.5) * (cells[0] / size[0])).floor().clamp(0, cells[0] - 1)
     return (y * cells[1] + x).long()

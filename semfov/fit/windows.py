@@ -220,6 +220,6 @@ class MosaicFit:
         ]
 
     def _searched(self) -> dict[str, tuple[str, ...]]:
-        """Kinds of pictures to fit decisions on, and to choose thresholds on."""
+        """List the kinds of pictures to fit decisions on, and to choose thresholds on."""
         of_held_out = (f"judged {kind}" for kind in self.kinds)
         return {"searched": ("searched", *self.kinds), "judged": ("judged", *of_held_out)}

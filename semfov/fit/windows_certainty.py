@@ -98,7 +98,7 @@ class Exploration(NamedTuple):
         return float(certainty.probability(facts).double().sum())
 
     def number(self, certainty: Certainty, number: int) -> tuple[float, float] | None:
-        """Mean and variance of the number of objects after some looks, without a spread; None where none is claimed."""
+        """Claim a number of objects after some looks, or none: its mean, and its variance without a spread."""
         facts, right = self.objects[number]
         chances = certainty.probability(facts)
         if not (chances >= 0.5).any() or not reacts(chances):
@@ -151,7 +151,7 @@ def _explore(
 
 
 def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tensor]:
-    """Facts about the objects of explorations after some numbers of looks, and which are right, without crowds."""
+    """Collect facts about the objects of explorations after some looks, and which are right, without crowds."""
     after = []
     for exploration in explored:
         numbers = sorted({min(number, exploration.looks, passes) for number in (*_AFTER, passes)})
@@ -188,7 +188,7 @@ class _Growth(NamedTuple):
 
 
 def _growth_of(exploration: Exploration, certainty: Certainty) -> list[_Growth]:
-    """How the sum of probabilities grows after some numbers of looks of an exploration."""
+    """Follow how the sum of probabilities grows after some numbers of looks of an exploration."""
     numbers = [number for number in _EXPECTING if number < exploration.looks]
     if not numbers:
         return []
@@ -238,7 +238,7 @@ class _Numbers(NamedTuple):
     held: Tensor
 
     def covered(self, spread: float) -> float:
-        """Share of the pictures in which the annotated number is within two errors of the mean."""
+        """Compute the share of the pictures in which the annotated number is within two errors of the mean."""
         error = (self.variance + (spread * self.mean) ** 2).sqrt()
         return float(((self.held - self.mean).abs() <= 2 * error).double().mean())
 

@@ -308,7 +308,7 @@ def _drawn(values: Tensor, most: int) -> Tensor:
 
 
 def _rates_before(first: Gist, log_rates: Tensor, look: Gist) -> Tensor:
-    """Rates of the overview `(T, 3, …)` in the cells of a closer look, for windows an octave closer, `(T, …)`."""
+    """Read the rates of the overview `(T, 3, …)` in the cells of a closer look, for windows an octave closer."""
     # The rate of a cell of the overview spreads over the cells of the lattice in it.
     rates = log_rates.exp() / first.scale**2
     cells = rates.repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
@@ -383,7 +383,7 @@ class _LookCounts(NamedTuple):
         return cls(look.gist, {size: _Counts(*torch.tensor(rows).unbind(-1)) for size, rows in by_size.items()})
 
     def loss(self, survey: Survey, log_rates: Tensor) -> Tensor:
-        """Mean Poisson negative log likelihood of the numbers, up to a constant; log_rates `(3, rows, columns)`."""
+        """Average the Poisson negative log likelihood of the numbers; log_rates `(3, rows, columns)`."""
         rates = log_rates.exp()
         terms = []
         for (steps, span), counts in self.counts.items():
@@ -430,7 +430,7 @@ class SurveyExample(NamedTuple):
         return cls(_LookCounts.of(example, overview, overview.found), tuple(closer))
 
     def losses(self, survey: Survey, closer: Sequence[_LookCounts]) -> list[Tensor]:
-        """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
+        """Compute the losses of the overview and of closer looks, whose predictions build on those of the overview."""
         overview = self.overview.gist
         log_rates = survey.rates(overview)
         losses = [self.overview.loss(survey, log_rates[0])]
@@ -487,7 +487,7 @@ def judge_windows(model: GlimpseEvidence, examples: Sequence[ZoomExample]) -> tu
 
 
 def _passes_to_first_hit(model: GlimpseEvidence, windows: Windows) -> dict[str, list[int]]:
-    """Passes until a look at a photograph of a mosaic shows a class, by the evidence of the overview and by its scores.
+    """Count passes until a look at a photograph of a mosaic shows a class, by evidence and by scores of the overview.
 
     One number for each class that a photograph of a mosaic shows; none without mosaics.
     """

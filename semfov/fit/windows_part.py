@@ -51,7 +51,7 @@ class WindowsFit(PartFit):
         self.tasks = _tasks(self.settings)
 
     def _why_left_out(self) -> str | None:
-        """The reason why the part is not fitted; None if it is."""
+        """Return the reason why the part is not fitted; None if it is."""
         photographs = len(self.run.scenes)
         held_out = len(self.inputs.held_out)
         if not self.config.windows:
@@ -84,7 +84,7 @@ class WindowsFit(PartFit):
         )
 
     def _tile_width(self) -> float:
-        """Width of the slot of a photograph in a mosaic, in which photographs are not enlarged."""
+        """Compute the width of the slot of a photograph in a mosaic, in which photographs are not enlarged."""
         sizes = [self.run.scenes.annotation(index).size for index in range(len(self.run.scenes))]
         usual = median(max(width, height * 4 / 3) for width, height in sizes)
         return min(usual, _OF_INPUT * self.run.eye.detector.input_size[0])
@@ -108,7 +108,7 @@ class WindowsFit(PartFit):
 
 
 def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
-    """The tasks of the fit by the titles of their progress bars, with an estimate of their seconds."""
+    """List the tasks of the fit by the titles of their progress bars, with an estimate of their seconds."""
     searched = {"searched": config.searched, "judged": config.judged}
     explored = searched | config.some_explored
     looked = config.mosaics + config.crowded + config.judged + 4 * config.far
@@ -138,6 +138,7 @@ def _compare(curves: Mapping[str, FloatArray]) -> tuple[Difference, str]:
 
 
 def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str:
+    """Write the section about the objects found."""
     head = ["looks", *(f"after {passes} passes" for passes in _RECALL_PASSES)]
     rows = curves_table(head, curves, [passes - 1 for passes in _RECALL_PASSES])
     means = ["mean", *(mean_percent(curve.mean(1)) for curve in curves.values())]
@@ -172,7 +173,7 @@ def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
 def _photograph_recalls(
     mosaics: Mosaics, opened: Sequence[StoredWindowLooks], model: GlimpseEvidence | None
 ) -> FloatArray:
-    """Recall in each photograph of mosaics after each pass, `(P, 16)`; without a model by slices, as by an agent."""
+    """Compute the recall in each photograph of mosaics after each pass, `(P, 16)`; without a model by slices."""
     passes = _RECALL_PASSES[-1]
     hits = np.zeros((len(mosaics.scenes), passes))
     objects = np.zeros(len(mosaics.scenes))

@@ -41,7 +41,11 @@ class LookingSettings(Protocol):
 
     @property
     def cache(self) -> Path | None:
-        """Folder of the store."""
+        """Folder of the store; None: the user's cache."""
+
+    @property
+    def workers(self) -> int | None:
+        """Number of processes; None: one per CPU core."""
 
 
 class Looking(SceneRun):

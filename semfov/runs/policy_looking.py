@@ -21,35 +21,36 @@ from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.setup import make_fitted, make_learned, make_observation
 from semfov.strategy import Strategy
 
+_OF_SEMANTIC = ("footprint", "tempering", "memory", "misses", "association")
+"""Settings of the belief that a policy may have of its own."""
+
 
 class PolicyLooking(Looking):
-    """Looks at scenes, and policies that choose where to look in them."""
+    """Looks at scenes, and policies that choose where to look in them.
+
+    Attributes:
+        policies: the settings of the policies, by label.
+        strategies: observer and policy of each, by label.
+        models: the fitted models that they need.
+    """
 
     task: Task
     config: RunConfig
 
     def __init__(self, config: RunConfig) -> None:
-        check(len(config.policies) > 0, "policies", "at least one policy", "none")
-        labels = [label(choice, self.task) for choice in config.policies]
-        for name in labels:
-            check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
-        self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
+        self.policies = _labelled(config, self.task)
         super().__init__(config)
-        components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
-        loaded: dict[str, Any] = {}
-
-        def model(name: str) -> Any:
-            loaded[name] = loaded[name] if name in loaded else _load(name, config.belief, self.eye)
-            return loaded[name]
-
+        models = _LoadedModels(config.belief, self.eye)
         self.strategies: dict[str, Strategy] = {}
         observers: dict[PolicyConfig, Observer] = {}
         for name, policy in self.policies.items():
-            made = _make_strategy(policy, self.task, config.belief, components, model, fovea)
+            strategy = _make_strategy(
+                policy, self.task, config.belief, len(self.scenes.classes) + 1, models, config.sensor.fovea
+            )
             # Policies with the same belief share an observer, which then weighs each look only once.
-            observer = observers.setdefault(_belief_settings(policy, self.task), made.observer)
-            self.strategies[name] = Strategy(observer, made.policy)
-        self.models = _Models(**loaded)
+            observer = observers.setdefault(_belief_settings(policy, self.task), strategy.observer)
+            self.strategies[name] = Strategy(observer, strategy.policy)
+        self.models = _Models(**models.loaded)
 
     @cached_property
     def code(self) -> str:
@@ -60,18 +61,29 @@ class PolicyLooking(Looking):
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, the models of all policies, and the settings of belief, protocol and policies."""
-        config, models = self.config, self.models
-        policies = {name: asdict(policy) for name, policy in self.policies.items()}
+        models = self.models
+        belief = asdict(self.config.belief)
+        protocol = asdict(self.config.protocol)
         return {
             **super().depends_on(),
             "task": self.task,
             "models": [models.observation, models.fitted, models.evidence, models.map],
-            "belief": {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")},
-            "protocol": {name: value for name, value in asdict(config.protocol).items() if name != "batch"},
-            "policies": policies,
+            # Models count by their digests, and the size of batches changes nothing.
+            "belief": {name: value for name, value in belief.items() if not name.endswith("model")},
+            "protocol": {name: value for name, value in protocol.items() if name != "batch"},
+            "policies": {name: asdict(policy) for name, policy in self.policies.items()},
         }
 
     stored = SceneRun.stored  # nothing: the records are all that a comparison needs
+
+
+def _labelled(config: RunConfig, task: Task) -> dict[str, PolicyConfig]:
+    """Resolve the policies of a run, by label; raises `InputError` if there is none, or one twice."""
+    check(len(config.policies) > 0, "policies", "at least one policy", "none")
+    labels = [label(choice, task) for choice in config.policies]
+    for name in labels:
+        check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
+    return {name: resolve(choice, task) for name, choice in zip(labels, config.policies, strict=True)}
 
 
 class _Models(NamedTuple):
@@ -81,6 +93,20 @@ class _Models(NamedTuple):
     fitted: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
     map: MapEvidence | None = None
+
+
+class _LoadedModels:
+    """Models by name, each loaded when it is asked for the first time."""
+
+    def __init__(self, belief: BeliefConfig, eye: Eye) -> None:
+        self.belief = belief
+        self.eye = eye
+        self.loaded: dict[str, Any] = {}
+
+    def __call__(self, name: str) -> Any:
+        if name not in self.loaded:
+            self.loaded[name] = _load(name, self.belief, self.eye)
+        return self.loaded[name]
 
 
 def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
@@ -95,12 +121,12 @@ def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
 
 
 def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
-    """Whether a policy uses the learned target evidence."""
+    """Tell whether a policy uses the learned target evidence."""
     return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
 
 
 def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
-    """The settings of a policy without those of its choice: policies for which they are equal have the same belief."""
+    """Return settings that are equal for policies with the same belief: those of the policy without its choice."""
     if _by_evidence(policy, task):
         return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
     return replace(policy, policy=Uniform.name, saliency=None, samples=None)
@@ -109,23 +135,47 @@ def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
 def _make_strategy(
     policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, model: Callable[[str], Any], fovea: float
 ) -> Strategy:
-    """Build the observer and the policy that settings describe; `model` gives what they need by its name."""
+    """Build the observer and the policy that settings describe.
+
+    Args:
+        policy: settings of the policy.
+        task: what it does.
+        belief: settings of the belief, where the policy has none of its own.
+        components: number of scores in all, K + 1.
+        model: gives the models that are needed, by name.
+        fovea: radius of the fovea, in units of the image's longer side.
+
+    Returns:
+        The strategy.
+    """
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(model("evidence")), Policy("non-predictive"))
-    calibrated, function = policy.scores == "calibrated", FUNCTIONS[policy.policy]
-    needed = model("map" if function.needs_map else "observation") if "model" in function.takes else None
-    common = {"fovea": fovea, "prior": belief.prior}
-    own = {name: common[name] for name in common.keys() & function.takes}
-    chosen = Policy(function, needed, samples=policy.samples, calibrated=calibrated, **own)
+    chosen = _make_policy(policy, belief, model, fovea)
     if _by_evidence(policy, task):
         return Strategy(Target(model("evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(model("map")), chosen)
     if policy.scores == "fitted":
         return Strategy(Semantic.searching(model("fitted")), chosen)
-    names = ("footprint", "tempering", "memory", "misses", "association")
-    common_or_own = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in names}
-    common_or_own["misses"] = model("observation") if common_or_own["misses"] else None
-    observation = model("observation") if calibrated else None
-    observer = Semantic(components, observation, prior=belief.prior, fusion=belief.fusion, **common_or_own)
-    return Strategy(observer, chosen)
+    return Strategy(_make_semantic(policy, belief, components, model), chosen)
+
+
+def _make_policy(policy: PolicyConfig, belief: BeliefConfig, model: Callable[[str], Any], fovea: float) -> Policy:
+    """Build the policy, with what its acquisition function takes."""
+    function = FUNCTIONS[policy.policy]
+    needed = None
+    if "model" in function.takes:
+        needed = model("map" if function.needs_map else "observation")
+    available = {"fovea": fovea, "prior": belief.prior}
+    options = {name: available[name] for name in available.keys() & function.takes}
+    return Policy(function, needed, samples=policy.samples, calibrated=policy.scores == "calibrated", **options)
+
+
+def _make_semantic(
+    policy: PolicyConfig, belief: BeliefConfig, components: int, model: Callable[[str], Any]
+) -> Semantic:
+    """Build the observer that fuses scores, with the settings of the policy or else those of the belief."""
+    settings = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in _OF_SEMANTIC}
+    settings["misses"] = model("observation") if settings["misses"] else None
+    observation = model("observation") if policy.scores == "calibrated" else None
+    return Semantic(components, observation, prior=belief.prior, fusion=belief.fusion, **settings)

@@ -245,6 +245,7 @@ def run_episodes(
 def _run_batch(
     episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, shifts: int
 ) -> list[_Outcome]:
+    """Run searches side by side; the arguments are those of `run_episodes`."""
     grid = looks.grid
     goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
     for row, episode in enumerate(episodes):

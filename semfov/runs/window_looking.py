@@ -23,6 +23,8 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
 
+_SAME = 0.5  # overlap (IoU) from which on boxes are of the same object, and share of a box that lies in a crowd
+
 TileSize = Annotated[int, Range(16, 16_384)]  # side of a part of a picture in pixels
 
 
@@ -54,7 +56,15 @@ class WindowLookingConfig(WorkConfig):
 
 
 class WindowLooking:
-    """Large pictures, an eye that looks at their windows, and learned evidence; the detections are stored."""
+    """Large pictures, an eye that looks at their windows, and learned evidence; the detections are stored.
+
+    Attributes:
+        config: the settings.
+        eye: looks at windows.
+        evidence: evidence by magnification for its detector.
+        scenes: the pictures: mosaics of photographs, or photographs as they are.
+        store: the looks on disk.
+    """
 
     config: WindowLookingConfig
     scenes: Scenes
@@ -70,9 +80,9 @@ class WindowLooking:
             raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
         self.scenes = photographs
         if config.mosaics:
-            size = config.tile, config.tile * 3 // 4
+            tile = config.tile, config.tile * 3 // 4
             self.scenes = Mosaics(
-                photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
+                photographs, config.columns, config.rows, tile=tile, count=config.mosaics, seed=config.seed
             )
         folder = store_folder(config.cache) / "glances"
         self.store = WindowLookStore(folder, self.eye.settings(), len(detector.classes))
@@ -82,30 +92,54 @@ class WindowLooking:
         return make_scenes(self.config.data, classes)
 
     def looks_at(self, index: int) -> StoredWindowLooks:
+        """Open the looks at a picture."""
         return StoredWindowLooks(self.eye, self.scenes, index, self.store if self.config.store else None)
 
 
 def found_in(looks: Sequence[WindowLook], annotation: Annotation, target: int | None = None) -> Tensor:
-    """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
+    """Tell which objects looks have found: a merged box has a score of 0.1 or more and an IoU of 0.5 or more.
+
+    Args:
+        looks: looks at a picture.
+        annotation: its M objects.
+        target: class that they looked for, 1..K; None for all.
+
+    Returns:
+        `(M,)` boolean.
+    """
     objects = merge(looks, target, score=DETECTION_SCORE)
-    hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
+    hits = (box_iou(objects.boxes, annotation.boxes) >= _SAME) & (objects.labels[:, None] == annotation.labels)
     return hits.any(0)
 
 
 def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
-    """Compare objects with the annotated ones, class by class; → `(M,)`."""
+    """Compare objects with the annotated ones, class by class.
+
+    Args:
+        objects: N objects, in descending confidence.
+        annotation: the annotated objects; one matches one object, a crowd any number.
+
+    Returns:
+        `(N,)`, 1 for right objects, 0 for wrong ones, and -1 for those in a crowd of their class.
+    """
     verdicts = torch.zeros(len(objects), dtype=torch.long)
     for label in objects.labels.unique().tolist():
-        mine = (objects.labels == label).nonzero()[:, 0]
-        there = annotation.labels == label
-        single, crowd = (annotation.boxes[there & kind] for kind in (~annotation.crowd, annotation.crowd))
-        boxes = objects.boxes[mine]
-        hits = (match(boxes, single.to(boxes), torch.ones(len(single)).long(), iou=0.5) > 0).long()
-        if len(crowd):
-            low = torch.maximum(boxes[:, None, :2], crowd[:, :2])
-            high = torch.minimum(boxes[:, None, 2:], crowd[:, 2:])
-            area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
-            inside = (high - low).clamp(min=0).prod(-1) / area
-            hits[(hits == 0) & (inside >= 0.5).any(-1)] = -1
-        verdicts[mine] = hits
+        numbers = (objects.labels == label).nonzero()[:, 0]
+        boxes = objects.boxes[numbers]
+        is_label = annotation.labels == label
+        single = annotation.boxes[is_label & ~annotation.crowd]
+        crowds = annotation.boxes[is_label & annotation.crowd]
+        of_one_class = torch.ones(len(single)).long()
+        hits = (match(boxes, single.to(boxes), of_one_class, iou=_SAME) > 0).long()
+        if len(crowds):
+            hits[(hits == 0) & (_share_inside(boxes, crowds) >= _SAME).any(-1)] = -1
+        verdicts[numbers] = hits
     return verdicts
+
+
+def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
+    """Compute the share of the area of each box `(N, 4)` that lies in each other box `(M, 4)`, `(N, M)`."""
+    low = torch.maximum(boxes[:, None, :2], others[:, :2])
+    high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
+    return (high - low).clamp(min=0).prod(-1) / area

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,52 +36,74 @@ class WindowLookStore(DetectionStore):
         super().__init__(folder, {"settings": settings}, self.sources, classes + 1)
 
     def encode(self, action: Window) -> Sequence[float]:
-        """The fixation, the part of the picture, the level and the cells of a window."""
+        """Write a window as numbers: the fixation, the part of the picture, the level and the cells."""
         # Four zeros stand for a window without a limit, since no limit ends at 0.
         return (*action.fixation, *(action.within or (0.0, 0.0, 0.0, 0.0)), action.level, *action.cells)
 
     def decode(self, row: Sequence[float]) -> Window:
-        within: Any = tuple(row[3:7]) if row[5] > 0 else None
-        cells: Any = tuple(map(int, row[8:12]))
-        return Window((row[0], row[1], row[2]), int(row[7]), cells, within)
+        """Read a window from the numbers of `encode`."""
+        x, y, magnification, left, top, right, bottom, level, *cells = row
+        first_column, first_row, last_column, last_row = map(int, cells)
+        within = (left, top, right, bottom) if right > 0 else None
+        return Window((x, y, magnification), int(level), (first_column, first_row, last_column, last_row), within)
 
     def pack(self, looks: Sequence[WindowLook]) -> dict[str, Tensor]:
-        """Convert looks to tensors for a file, gists without empty cells; a look without a gist has a scale of 0."""
-        gists, kinds = [window_look.gist for window_look in looks], self.classes
-        some = [look for look in gists if look is not None]
-        frames = [[0, 0, 0] if look is None else [look.scale, *look.scores.shape[:2]] for look in gists]
-        scores = torch.cat([torch.zeros(0, kinds), *(look.scores.flatten(0, 1) for look in some)])
-        sizes = torch.cat([torch.zeros(0), *(look.size.flatten() for look in some)])
-        found = torch.cat([torch.zeros(0, kinds, dtype=torch.bool), *(look.found.flatten(0, 1) for look in some)])
-        full = (scores > 0).any(-1)
+        """Convert looks to tensors for a file.
+
+        The cells of all gists follow one another; those without a score are left out. A look without a gist has a scale
+        of 0.
+        """
+        gists = [look.gist for look in looks if look.gist is not None]
+        frames = [[0, 0, 0] if look.gist is None else [look.gist.scale, *look.gist.scores.shape[:2]] for look in looks]
+        scores = torch.cat([torch.zeros(0, self.classes), *(gist.scores.flatten(0, 1) for gist in gists)])
+        sizes = torch.cat([torch.zeros(0), *(gist.size.flatten() for gist in gists)])
+        no_cells = torch.zeros(0, self.classes, dtype=torch.bool)
+        found = torch.cat([no_cells, *(gist.found.flatten(0, 1) for gist in gists)])
+        has_score = (scores > 0).any(-1)
         return {
-            **super().pack([window_look.detections for window_look in looks]),
-            "cut": torch.cat([window_look.cut for window_look in looks]),
-            "show": torch.stack([window_look.show for window_look in looks]),
+            **super().pack([look.detections for look in looks]),
+            "cut": torch.cat([look.cut for look in looks]),
+            "show": torch.stack([look.show for look in looks]),
             "gist.frames": torch.tensor(frames),
-            "gist.cells": full.nonzero()[:, 0],
-            "gist.scores": scores[full].float(),
-            "gist.sizes": sizes[full].float(),
+            "gist.cells": has_score.nonzero()[:, 0],
+            "gist.scores": scores[has_score].float(),
+            "gist.sizes": sizes[has_score].float(),
             "gist.found": found.flatten().nonzero()[:, 0],
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[WindowLook]:
         """Convert the tensors of a file back to the looks at these windows."""
-        frames, kinds = tensors["gist.frames"].tolist(), tensors["gist.scores"].shape[-1]
-        counts = [rows * columns for _, rows, columns in frames]
-        scores, size = torch.zeros(sum(counts), kinds), torch.zeros(sum(counts))
-        found = torch.zeros(sum(counts) * kinds, dtype=torch.bool)
-        cells = tensors["gist.cells"]
-        scores[cells], size[cells], found[tensors["gist.found"]] = tensors["gist.scores"], tensors["gist.sizes"], True
-        parts = scores.split(counts), size.split(counts), found.view(-1, kinds).split(counts)
-        gists = [
-            Gist(window.level, window.cells[:2], scale, *(part.unflatten(0, (rows, columns)).clone() for part in three))
-            if scale
-            else None
-            for window, (scale, rows, columns), *three in zip(actions, frames, *parts, strict=True)
+        detections = super().unpack(tensors, actions)
+        cut = tensors["cut"].split(tensors["count"].tolist())
+        gists = _unpack_gists(tensors, actions)
+        return [
+            WindowLook(window, detections[number], cut[number], tensors["show"][number], gists[number])
+            for number, window in enumerate(actions)
         ]
-        seen, cut = super().unpack(tensors, actions), tensors["cut"].split(tensors["count"].tolist())
-        return [WindowLook(*each) for each in zip(actions, seen, cut, tensors["show"], gists, strict=True)]
+
+
+def _unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
+    """Convert the tensors of a file back to the gists of looks at windows; None for looks without one."""
+    frames = tensors["gist.frames"].tolist()
+    classes = tensors["gist.scores"].shape[-1]
+    counts = [rows * columns for _, rows, columns in frames]
+    scores = torch.zeros(sum(counts), classes)
+    sizes = torch.zeros(sum(counts))
+    found = torch.zeros(sum(counts) * classes, dtype=torch.bool)
+    scores[tensors["gist.cells"]] = tensors["gist.scores"]
+    sizes[tensors["gist.cells"]] = tensors["gist.sizes"]
+    found[tensors["gist.found"]] = True
+    scores_of = scores.split(counts)
+    sizes_of = sizes.split(counts)
+    found_of = found.view(-1, classes).split(counts)
+    gists: list[Gist | None] = []
+    for number, (window, (scale, rows, columns)) in enumerate(zip(windows, frames, strict=True)):
+        if not scale:
+            gists.append(None)
+            continue
+        cells = (part[number].unflatten(0, (rows, columns)).clone() for part in (scores_of, sizes_of, found_of))
+        gists.append(Gist(window.level, window.cells[:2], scale, *cells))
+    return gists
 
 
 class StoredWindowLooks(WindowLooks):
@@ -96,11 +117,11 @@ class StoredWindowLooks(WindowLooks):
             return lambda window: source.see([window])[0]
 
         # Files of looks have no hints of photographs.
-        kept = store if self.lattice.levels > 1 else None
-        self.looks = RememberedLooks(open_picture, kept, lambda: scenes.digest(index))
+        store = store if self.lattice.levels > 1 else None
+        self.looks = RememberedLooks(open_picture, store, lambda: scenes.digest(index))
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
-        """The looks at windows, read from the store or computed."""
+        """Look at windows, or read the looks from the store."""
         return [self.looks(window) for window in windows]
 
     def save(self) -> None:
