@@ -92,6 +92,7 @@ def make_examples(run: Looking, config: FitSearchConfig, scenes: Sequence[int] |
         DataError: no photograph has a class that may be searched for.
     """
     title = "describing looks" if scenes is None else "describing others"
+    # A row is the fields of one example.
     rows = []
     for index in track(range(len(run.scenes)) if scenes is None else scenes, title, "scene"):
         rows += _examples_of_scene(run, config, index)
@@ -117,6 +118,7 @@ def _examples_of_scene(run: Looking, config: FitSearchConfig, index: int) -> lis
         if goal.all():  # every fixation would find it
             continue
         with torch.inference_mode():
+            # In half precision, since the features of all pairs of cells fill the memory.
             features = look_features(detections, grid.centres, grid, target).half()
         score = highest_score(detections, target)
         rows.append((features, score, grid.cell_distance, torch.tensor(index), torch.tensor(target), goal))
@@ -138,6 +140,7 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """
     examples = make_examples(run, config)
     held_out = split(examples.scene, config.holdout)
+    # Only numbers of cells matter from here on: photographs of all sizes share one grid of one pixel a cell.
     grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
@@ -168,6 +171,7 @@ def _train_evidence(
 ) -> TargetEvidence:
     """Train the model on searches that it makes itself. Some of their fixations are random."""
     generator = torch.Generator().manual_seed(config.seed)
+    # The weights begin the same, and the caller's random numbers stay as they are.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         model = TargetEvidence(components=components, metadata=metadata)
@@ -176,9 +180,10 @@ def _train_evidence(
         batch = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         # At first the model has learned nothing, so its own choice of fixations would be no better than random ones.
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
-        # The first look and two random ones count: nearly as good as all of them, and faster.
+        # The first look and two random ones stand for all.
         counted = (1, *torch.randint(2, config.looks + 1, (2,), generator=generator).tolist())
         observer = Target(model, together=True)
+        # Every example has its own class, so that the policy's class, 1, is only a name.
         loss = batch.score.new_zeros(())
         for step in example_episodes(batch, observer, TargetPosterior(1), grid, config.looks, astray, generator):
             if step.shift + 1 in counted:
@@ -210,6 +215,7 @@ def evidence_objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Ten
     assert isinstance(belief, TargetBelief)
     log_odds = belief.present.logit(eps=_EPSILON)
     present = goal.any(-1).to(belief.anywhere)
+    # 4 times the mean over cells is the sum over 100 cells divided by 25.
     loss = 4 * F.binary_cross_entropy_with_logits(log_odds, goal.to(log_odds))
     loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
     # The next cell, and the most probable fixated one, are selected by their probability, which is biased by that.

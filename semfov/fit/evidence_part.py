@@ -122,6 +122,7 @@ class EvidenceFit(PartFit):
                 continue
             grid = run.grid(index)
             looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
+            # All strategies break ties in the same way, so that their difference is paired.
             noise = torch.stack(
                 [
                     noise_for(protocol, len(grid), run.scenes.ids[index], episode.target, episode.repetition)

@@ -76,10 +76,11 @@ class FolderFit:
     def _key(self, name: str) -> str:
         """Digest all that a part depends on: photographs, looks and code, its settings, and the parts before it."""
         results = self.inputs.results
-        before: list[Any] = [fitted.part.sha256 for fitted in results.values()]
+        before: list[object] = [fitted.part.sha256 for fitted in results.values()]
         before += [plain(asdict(fitted.part)) for fitted in results.values() if fitted.part.settings]
         settings = self.fits[name].settings
         values = plain(settings if isinstance(settings, dict) else asdict(settings))
+        # Where the work is done changes nothing.
         relevant = {setting: value for setting, value in values.items() if setting not in WHERE}
         return digest_of([self.inputs.run.key, [name, relevant, self.inputs.config.judged, before]])
 

@@ -85,6 +85,7 @@ def _fit_map(
     def loss_of(_: int) -> Tensor:
         number, batch = next(batches)
         group = groups[number]
+        # Whole channels are left out, other ones for each readout.
         is_read = torch.rand(readouts, 1, model.read.shape[1], generator=generator) >= fit.dropout
         mask = (is_read / (1 - fit.dropout)).expand(-1, units, -1).flatten(0, 1) / scale
         maps = blurred(model.readouts(group.some(batch), group.size, model.read * mask), model.blur.exp())
@@ -277,7 +278,7 @@ def score(
         For each set of terms NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`.
     """
     size = group.size
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)  # the same fixations for all models
     centre = model.centre_bias(size)[None]
     rows: list[list[Tensor]] = [[] for _ in without]
     for maps_of_picture, picture in zip(maps, pictures, strict=True):

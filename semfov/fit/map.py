@@ -124,6 +124,7 @@ def _choose_targets(
     drawn = torch.randperm(len(remaining), generator=generator)[: config.others]
     chosen = torch.cat([order[:leading], remaining[drawn]])
     stands_for = torch.ones(len(chosen))
+    # Those drawn represent all that were not, so that the loss is that of all classes.
     stands_for[leading:] = len(remaining) / max(len(drawn), 1)
     return classes[chosen], stands_for
 
@@ -143,6 +144,7 @@ def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """
     examples = _make_map_examples(run, config)
     held_out = split(examples.scene, config.holdout)
+    # Only numbers of cells matter from here on: photographs of all sizes share one grid of one pixel a cell.
     grid = Grid(*config.cells, config.cells)
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     with torch.random.fork_rng(devices=[]):
@@ -167,7 +169,7 @@ def _frequencies(run: Looking, holdout: int) -> Tensor:
             grid = run.grid(index)
             count += answers_of(run.scenes.annotation(index), grid, components).sum(0)
             cells += len(grid)
-    # In the units of the model's prior, which scales and shifts it back.
+    # Log odds of -4, those of a class in one of about fifty cells, become an input of 0.
     return ((count + 1) / (cells + 2)).logit() / 4 + 1
 
 
@@ -177,7 +179,7 @@ def _train_map(config: FitMapConfig, model: MapEvidence, examples: MapExamples, 
 
     def loss_of(_: int) -> Tensor:
         batch = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
-        # The first look and two random ones count: nearly as good as all of them, and faster.
+        # The first look and two random ones stand for all.
         counted = (1, *torch.randint(2, config.looks + 1, (2,), generator=generator).tolist())
         observer = LearnedMap(model, together=True)
         loss = batch.score.new_zeros(())

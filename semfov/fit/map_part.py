@@ -76,10 +76,11 @@ class MapFit(PartFit):
         for index in track(self.inputs.judged, "exploring", "scene"):
             grid = run.grid(index)
             answers = answers_of(run.scenes.annotation(index), grid, self.inputs.components)
-            if not answers.any():
+            if not answers.any():  # no share of cells with objects
                 continue
             looks = StoredLooks(run.detections(index), grid)
             episodes = explorations_of(run.scenes, index, len(grid), protocol)
+            # All strategies break ties in the same way, so that their difference is paired.
             noise = torch.stack(
                 [
                     noise_for(protocol, len(grid), run.scenes.ids[index], None, episode.repetition)

@@ -42,7 +42,7 @@ def fit_published(
         The model, in `eval` mode.
     """
     model = FovealObservationModel.identity(eye.detector.classes, edges)
-    samples = int(statistics.count.sum())
+    samples = int(statistics.count.sum())  # saved with the model
     with warnings.catch_warnings():
         # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
@@ -102,7 +102,7 @@ def count_misses(
 class ObservationFit(PartFit):
     """Fit the observation model with its miss rates."""
 
-    settings: dict[str, Any]
+    settings: dict[str, int]
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)

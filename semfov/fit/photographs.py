@@ -208,6 +208,7 @@ def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], h
     present = torch.tensor([search.present for search in counted])
     holding = torch.tensor([int(totals[search.target - 1]) for search in counted])
     in_others = _log_odds_held(holding - present.long(), len(held) - 1)
+    # A photograph must not tell its own answer by the frequency, which is therefore that in the others.
     offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), in_others], -1), present)
     evidence.whole.weight.copy_(torch.tensor([weights]))
     evidence.whole.bias.fill_(offset)

@@ -12,11 +12,12 @@ from semfov.errors import DataError
 from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
 from semfov.runs.progress import task_bar
+from semfov.runs.settings import Settings
 
 _Model = TypeVar("_Model", bound=Pretrained)
 
 
-def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
+def training_of(config: Settings, scenes: Scenes, *besides: str) -> dict[str, Any]:
     """Build the metadata of a model about its training.
 
     Args:
@@ -73,7 +74,7 @@ def split(scene: Tensor, holdout: int) -> Tensor:
 
 
 def descend(
-    parameters: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
+    parameters: Iterable[nn.Parameter] | Iterable[dict[str, object]],
     loss_of: Callable[[int], Tensor | None],
     steps: int,
     rate: float,

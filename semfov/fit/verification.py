@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import OUTCOMES, Verifier, verified
+from semfov.decision.candidates import LookType
 from semfov.errors import DataError
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
 from semfov.fit.settings import FitOnCellsConfig
@@ -148,6 +149,7 @@ def fit_in_folds(
     folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(config.folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
     again = photograph_searches(photographs, evidence, config.looks, "verifying")
+    # No place is sure, so that a search makes all its closer looks, and any threshold can be applied to it afterwards.
     limits = Thresholds(1.0, config.give_up, config.place)
     searches = list(verify(again, folds, limits, evidence.thresholds))
     confirm = choose_confirm(searches, config.false_alarms, surest)
@@ -156,7 +158,7 @@ def fit_in_folds(
 
 
 @torch.inference_mode()
-def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLooks | None:
+def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLooks | None:
     """Look closely at the most evident places of every search.
 
     Args:
@@ -183,7 +185,7 @@ def examine(searches: Iterable[TargetSearch[Any]], folds: int = 1) -> CloserLook
     return CloserLooks(torch.stack(features), torch.tensor(right), torch.tensor(present), torch.tensor(fold))
 
 
-def _examined_places(search: TargetSearch[Any]) -> Iterator[tuple[Tensor, Tensor]]:
+def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
     """Look closely at the most evident places after some numbers of looks; yields features `(7,)` and box `(4,)`."""
     for looks in search.after:
         if looks > len(search):
@@ -200,7 +202,7 @@ def _examined_places(search: TargetSearch[Any]) -> Iterator[tuple[Tensor, Tensor
 
 @torch.inference_mode()
 def verify(
-    searches: Iterable[TargetSearch[Any]],
+    searches: Iterable[TargetSearch[LookType]],
     folds: Sequence[Verification],
     limits: Thresholds,
     thresholds: Thresholds | None,
@@ -221,7 +223,7 @@ def verify(
 
 
 def _verify_search(
-    search: TargetSearch[Any], model: Verification, limits: Thresholds, thresholds: Thresholds | None
+    search: TargetSearch[LookType], model: Verification, limits: Thresholds, thresholds: Thresholds | None
 ) -> VerifiedSearch:
     """Make all closer looks of a search, and decide it without them."""
     places = search.candidates()
@@ -327,7 +329,7 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
         raise DataError(f"data: expected closer looks in all folds but one, got {len(features)}; give more photographs")
     answers = torch.stack([closer_looks.right, closer_looks.present], -1)[chosen].double()
     mean = features.mean(0)
-    scale = features.std(0).clamp(min=1e-6)
+    scale = features.std(0).clamp(min=1e-6)  # of a feature that is always the same
     standardised = (features - mean) / scale
     penalty = _Penalty.of(prior, mean, scale, len(features))
     weight = penalty.weight.clone().requires_grad_(True)

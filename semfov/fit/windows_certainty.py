@@ -163,6 +163,7 @@ def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tenso
 
 def _fit_certainty(explored: Sequence[Exploration], passes: int) -> Certainty:
     """Fit the probability of objects, and then the number of objects that further looks show."""
+    # After several numbers of looks, so that the probability holds whenever an exploration stops.
     offset, *weights = logistic_regression(*_judged(explored, passes))
     return _fit_unseen(Certainty(offset, tuple(weights)), explored)
 

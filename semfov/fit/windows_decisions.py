@@ -157,6 +157,7 @@ def fit_judge(model: GlimpseEvidence, searches: WindowSearches, steps: int, batc
     """
     best = searches.best.flatten()
     case = searches.case.flatten(0, 1)
+    # Every look of a search has the answer of its picture.
     there = searches.there[:, None].expand_as(searches.best).flatten().float()
 
     def loss_of(_: int) -> Tensor:
@@ -290,6 +291,7 @@ def fit_closer_looks(
     training = examine(searched)
     held_out = examine(judged)
     _save_looks(pictures)
+    # From here on the model decides as without closer looks, until it has the new verification.
     model.verification = None
     if training is None or held_out is None:
         return "None, since there are no places that hold the target, or none that do not.\n"

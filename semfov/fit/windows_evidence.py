@@ -230,6 +230,7 @@ def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: in
             loss = loss + presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
         return loss
 
+    # The rates of objects have parameters of their own.
     parameters = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
     model.train()
     descend(parameters, loss_of, steps, rate, clip=None, decay=1.0, title="learning what closer looks show")
@@ -244,6 +245,7 @@ def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Ten
 
 def _presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
     """Compute the log odds that closer looks show each class, `(n, K)`; those of closer looks build on the overview."""
+    # Pairs of overviews and of closer looks are not mixed in a call.
     before = None
     if bool((windows.before[rows] >= 0).all()):
         is_training = model.training
