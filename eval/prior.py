@@ -24,17 +24,17 @@ from semfov.agents.episode import EpisodeLimits
 from semfov.agents.windows import WindowEpisode
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
+from semfov.fit.protocols import choose_classes
+from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
-from semfov.runs.protocols import choose_classes
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, finish
 from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Seed, Share, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.runs.tables import table
-from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import WindowLooks

@@ -32,6 +32,7 @@ from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
 from semfov.errors import check, lookup
 from semfov.eye import Eye
+from semfov.fit.protocols import choose_classes
 from semfov.io.files import plain_name, write_text
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation import FovealObservationModel
@@ -39,7 +40,6 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
-from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table

@@ -21,11 +21,14 @@ ROOT = PACKAGE.parent
 SUBPACKAGES = [
     "version", "words", "errors", "threads", "io", "data", "settings", "motion", "sensor", "detection", "observation",
     "belief", "gaze", "eye", "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live",
-    "model_folder", "presets", "agent", "metrics", "human", "viz", "report", "runs", "envs", "fit", "cli", "__main__",
+    "model_folder", "presets", "agent", "metrics", "human", "viz", "report", "runs", "fit", "envs", "cli", "__main__",
 ]  # fmt: skip
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are
 # the packages that draw. Its methods import them when they are called, and nothing of them when the record is made.
 LATE = {("paths", "viz"), ("paths", "report"), ("paths", "metrics")}
+# The fits with their stored looks and protocols, and the environments, stand on all other rooms, which run without them.
+# A command imports them when it is run.
+ABOVE = {"fit", "envs"}
 OUTSIDE = ("eval", "train", "tests", "benchmarks", "examples", "docs", "hubconf")
 
 
@@ -212,6 +215,26 @@ def test_imports_go_in_one_direction(subpackage):
             if first == "semfov":
                 assert asked != "semfov", f"{module} imports from the package as a whole: {taken}"
                 assert more[0] in allowed, f"{module} imports {taken}"
+
+
+def imports_when_imported(source: str) -> set[str]:
+    """The rooms that the import of a module runs; those in functions are left out."""
+    late = Counter(imports(late_part(source)))
+    return {room_of(asked) for asked, _ in Counter(imports(source)) - late}
+
+
+@pytest.mark.parametrize("room", sorted({*SUBPACKAGES} - ABOVE))
+def test_fits_and_environments_stand_on_rooms_that_do_not_import_them(room):
+    for module, file in MODULES.items():
+        if room_of(module) == room:
+            assert ABOVE.isdisjoint(imports_when_imported(file.read_text(encoding="utf-8"))), module
+
+
+def test_an_import_of_a_fit_is_found_unless_it_is_in_a_function():
+    late = "def run():\n    from semfov.fit.detector import fit_folder"
+    assert imports_when_imported(late) == set()
+    assert imports_when_imported(f"import semfov.envs\n{late}") == {"envs"}
+    assert imports_when_imported(f"from semfov.fit.detector import fit_folder\n{late}") == {"fit"}
 
 
 def test_imports_have_no_cycles():

@@ -26,6 +26,7 @@ import torch
 
 from semfov.errors import check
 from semfov.fit.observation import count_misses, fit_published, statistics_of
+from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig
 from semfov.fit.through_belief import (
     SearchedLooks,
@@ -42,7 +43,6 @@ from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.runs.command import command
-from semfov.runs.samples import Samples
 from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import table
 from semfov.version import __version__

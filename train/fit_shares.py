@@ -19,11 +19,11 @@ from semfov.data.scene import Scenes
 from semfov.errors import check
 from semfov.fit.evidence import FitSearchConfig, search_shares
 from semfov.fit.photographs import measured_shares, shares_by_frequency
+from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import track
 from semfov.runs.setup import make_detector, make_scenes
-from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window

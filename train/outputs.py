@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+from semfov.fit.looking import Looking
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.training import Fit
 from semfov.io.files import inside, write_text
-from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 
 

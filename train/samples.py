@@ -17,12 +17,12 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.eye import Eye
+from semfov.fit.samples import Samples, all_cells
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import LOOK_SOURCES, one_thread
-from semfov.runs.samples import Samples, all_cells
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import SceneStore
@@ -131,7 +131,7 @@ class Sampler:
         return eye, make_scenes(self.config.data, eye.detector.classes)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """Lay out the cells in which misses are counted (`semfov.runs.samples.all_cells`)."""
+        """Lay out the cells in which misses are counted (`semfov.fit.samples.all_cells`)."""
         return all_cells(size, fixation)
 
     def load(self, shard: int) -> Samples | None:

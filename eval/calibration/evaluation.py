@@ -14,10 +14,10 @@ from eval.calibration.beliefs_report import write_belief_report
 from eval.comparison.summary import announce
 from eval.search.run import SearchConfig
 from semfov.eye import Eye
+from semfov.fit.samples import Samples
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, DataConfig, EyeConfig, ProtocolConfig
-from semfov.runs.samples import Samples
 from semfov.runs.scene_run import finish
 from semfov.runs.settings import Count, Seed, Share, Side
 from semfov.runs.setup import make_observation

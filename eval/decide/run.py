@@ -30,19 +30,19 @@ from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
+from semfov.fit.looking import CellLooks
+from semfov.fit.protocols import DrawnSearch, choose_searches, search_steps
+from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.policies import Policy
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig
-from semfov.runs.looking import CellLooks
 from semfov.runs.looks import photograph_looks
-from semfov.runs.protocols import DrawnSearch, choose_searches, search_steps
 from semfov.runs.results import ResultRecord
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks
-from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye

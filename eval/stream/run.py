@@ -19,12 +19,12 @@ from semfov.data.classes import class_index
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.errors import check
+from semfov.fit.window_looking import right_boxes
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.progress import track
 from semfov.runs.results import ResultRecord
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
-from semfov.runs.window_looking import right_boxes
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 

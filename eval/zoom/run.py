@@ -24,18 +24,18 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.objects import LEAST
 from semfov.episode.stopwatch import Stopwatch
-from semfov.paths import ZoomPath
-from semfov.runs.protocols import choose_classes
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import SceneRun
-from semfov.runs.settings import Count, Range
-from semfov.runs.window_looking import (
+from semfov.fit.protocols import choose_classes
+from semfov.fit.window_looking import (
     TileSize,
     WindowLooking,
     WindowLookingConfig,
     found_in,
     right_boxes,
 )
+from semfov.paths import ZoomPath
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun
+from semfov.runs.settings import Count, Range
 from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.hints import DETECTION_SCORE

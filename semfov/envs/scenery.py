@@ -21,6 +21,9 @@ from semfov.data.sources import PHOTOGRAPHS
 from semfov.detection.objects import LEAST
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_whole
+from semfov.fit.policy_looking import PolicyLooking
+from semfov.fit.protocols import Trial, episodes_of, explorations_of
+from semfov.fit.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import (
@@ -32,9 +35,6 @@ from semfov.runs.config import (
     RunConfig,
     SensorConfig,
 )
-from semfov.runs.policy_looking import PolicyLooking
-from semfov.runs.protocols import Trial, episodes_of, explorations_of
-from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook

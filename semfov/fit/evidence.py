@@ -17,15 +17,15 @@ from semfov.decision import place_known
 from semfov.episode import Step
 from semfov.errors import DataError
 from semfov.fit.examples import Examples, example_episodes
+from semfov.fit.looking import Looking
+from semfov.fit.protocols import choose_classes, numbers_drawn
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.thresholds import choose_thresholds
 from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import area_under_roc
-from semfov.runs.looking import Looking
 from semfov.runs.progress import track
-from semfov.runs.protocols import choose_classes, numbers_drawn
 from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import table
 

@@ -20,11 +20,11 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
 from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge_evidence, make_examples
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.protocols import choose_searches, episodes_of, run_episodes, search_steps
 from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
 from semfov.gaze.policies import Policy
 from semfov.metrics.episodes import FloatArray, cumulative_performance
 from semfov.runs.progress import track
-from semfov.runs.protocols import choose_searches, episodes_of, run_episodes, search_steps
 from semfov.runs.seeds import noise_for
 from semfov.runs.tables import mean_or_dash, share
 from semfov.strategy import Strategy

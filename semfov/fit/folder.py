@@ -10,6 +10,7 @@ from typing import Any
 
 from semfov.errors import DataError, InputError
 from semfov.fit.evidence_part import EvidenceFit
+from semfov.fit.looking import Looking
 from semfov.fit.map_part import MapFit
 from semfov.fit.observation import ObservationFit
 from semfov.fit.part import PartFit, PartInputs, PartResult
@@ -20,7 +21,6 @@ from semfov.fit.windows_part import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Manifest, Part
 from semfov.runs.config import WHERE
-from semfov.runs.looking import Looking
 from semfov.runs.scene_run import digest_of
 from semfov.runs.settings import plain
 from semfov.runs.setup import detector_options

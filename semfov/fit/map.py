@@ -16,12 +16,12 @@ from semfov.belief.observers.learned_map import MapBelief, MapLook
 from semfov.episode import Step
 from semfov.errors import DataError
 from semfov.fit.examples import Examples, example_episodes
+from semfov.fit.looking import Looking
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import CloserLook
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import answers_of
-from semfov.runs.looking import Looking
 from semfov.runs.progress import track
 from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Range

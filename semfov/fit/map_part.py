@@ -12,10 +12,10 @@ from semfov.errors import DataError, InputError
 from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
 from semfov.fit.map import FitMapConfig, fit_map_evidence
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.protocols import explorations_of, run_explorations
 from semfov.gaze.policies import Policy
 from semfov.metrics.episodes import FloatArray, answers_of
 from semfov.runs.progress import track
-from semfov.runs.protocols import explorations_of, run_explorations
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure

@@ -13,11 +13,11 @@ from semfov.data.scene import Scenes
 from semfov.eye import Eye
 from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.samples import Samples, all_cells
 from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.metrics.episodes import FloatArray
 from semfov.observation import DirichletStatistics, FovealObservationModel, MissCounts, fit_discriminative
-from semfov.runs.samples import Samples, all_cells
 from semfov.viz import plot_reliability, save_figure
 from semfov.zoom.eye import WindowEye
 

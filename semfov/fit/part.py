@@ -17,6 +17,8 @@ import torch
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Semantic
+from semfov.fit.looking import Looking
+from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig, FitDetectorConfig
 from semfov.io.files import sha256
 from semfov.io.manifest import Part
@@ -24,8 +26,6 @@ from semfov.io.pretrained import Pretrained
 from semfov.model_folder import KINDS
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.looking import Looking
-from semfov.runs.samples import Samples
 from semfov.runs.seeds import generator_for
 
 _Config = TypeVar("_Config", bound=FitConfig)

@@ -18,13 +18,13 @@ from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
 from semfov.eye import Eye
+from semfov.fit.looking import CellLooks
+from semfov.fit.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.looking import CellLooks
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import DetectionStore, RememberedLooks
 
 

@@ -13,9 +13,9 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import FOOTPRINT, PartFit, PartInputs, PartResult
+from semfov.fit.samples import Samples
 from semfov.io.manifest import Part
 from semfov.runs.progress import track
-from semfov.runs.samples import Samples
 
 EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
 """Values of the exponent to compare."""

@@ -14,9 +14,9 @@ from semfov.belief.observers import Semantic
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
+from semfov.fit.samples import Samples
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
-from semfov.runs.samples import Samples
 
 _EXPONENT, _MISS, _REFUTATION = 0.75, 1e-4, 0.9
 """Values from which the exponents, the odds of a miss and the refutation are learned."""

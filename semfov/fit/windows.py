@@ -16,12 +16,12 @@ from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_decisions import WindowSearches, fit_closer_looks, fit_judge, judge_searches
 from semfov.fit.windows_evidence import SurveyExample, ZoomExample, fit_presence, fit_rates, fit_survey, pair_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
+from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.workers import prepare_worker, run_tasks
-from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.evidence import GlimpseEvidence, Survey
 from semfov.zoom.eye import WindowEye
 

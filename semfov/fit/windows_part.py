@@ -12,15 +12,15 @@ from semfov.fit.detector_report import Difference, curves_table, mean_percent, s
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
+from semfov.fit.window_looking import found_in
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_evidence import judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
+from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.setup import make_scenes
-from semfov.runs.window_looking import found_in
-from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.looks import WindowLook

@@ -33,10 +33,10 @@ from semfov.fit.map import (
     _train_map,
     map_objective,
 )
+from semfov.fit.protocols import choose_classes, numbers_drawn
 from semfov.fit.thresholds import choose_thresholds
 from semfov.gaze.acquisition import CloserLook, TargetPosterior
 from semfov.gaze.choice import Given
-from semfov.runs.protocols import choose_classes, numbers_drawn
 from tests.small import cells_of, looking
 
 GRID = Grid(4, 4, (640, 480))

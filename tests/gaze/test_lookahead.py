@@ -22,6 +22,7 @@ from semfov import (
     policies,
 )
 from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.fit.policy_looking import _make_strategy
 from semfov.gaze.acquisition import (
     BayesianSurprise,
     CloserLook,
@@ -36,7 +37,6 @@ from semfov.gaze.acquisition import (
 from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
 from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, PolicyConfig
-from semfov.runs.policy_looking import _make_strategy
 from semfov.runs.presets import label, presets, resolve
 from semfov.strategy import Strategy
 from tests.refusals import refused

@@ -14,11 +14,11 @@ from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
+from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
-from semfov.runs.protocols import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_eye
 

@@ -6,7 +6,7 @@ import torch
 
 from eval.explore.run import FUSED, PAINTED, _sharp_maps
 from semfov import Detections, Grid
-from semfov.runs.protocols import counts_of
+from semfov.fit.protocols import counts_of
 from tests.small import kaplan
 
 GRID = Grid(5, 4, (100, 60))

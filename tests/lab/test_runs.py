@@ -18,7 +18,7 @@ from eval.search import report as search_report
 from eval.search.run import SearchConfig, SearchRun
 from semfov import ActivePerception, MapEvidence, rollout
 from semfov.belief.observers import LearnedMap
-from semfov.runs import protocols
+from semfov.fit import protocols
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from tests.refusals import refused
 from tests.small import run_settings

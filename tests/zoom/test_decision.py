@@ -19,12 +19,12 @@ from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES, settle
 from semfov.detection.objects import unlike
 from semfov.fit.logistic import logistic_regression
+from semfov.fit.window_looking import right_boxes
 from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
 from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_searches
+from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import calibration_error
 from semfov.paths import ZoomPath
-from semfov.runs.window_looking import right_boxes
-from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.decision import SearchFacts

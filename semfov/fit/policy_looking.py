@@ -9,13 +9,13 @@ from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.errors import check
 from semfov.eye import Eye
+from semfov.fit.looking import Looking
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Uniform
 from semfov.gaze.policies import Policy
 from semfov.io.code import class_digest
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
-from semfov.runs.looking import Looking
 from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
 from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.setup import make_fitted, make_learned, make_observation
