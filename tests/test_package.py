@@ -26,8 +26,8 @@ SUBPACKAGES = [
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are
 # the packages that draw. Its methods import them when they are called, and nothing of them when the record is made.
 LATE = {("paths", "viz"), ("paths", "report"), ("paths", "metrics")}
-# The fits with their stored looks and protocols, and the environments, stand on all other rooms, which run without them.
-# A command imports them when it is run.
+# The fits with their stored looks and protocols, and the environments, stand on all other rooms, which work without
+# them. A command imports them when it is run.
 ABOVE = {"fit", "envs"}
 OUTSIDE = ("eval", "train", "tests", "benchmarks", "examples", "docs", "hubconf")
 

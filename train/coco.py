@@ -92,7 +92,8 @@ def _fetch_split(
 
 def _fetch_archive(archive: _Archive, folder: Path, *, address: str = _ADDRESS, pause: float = 1.0) -> Path:
     """Fetch an archive and verify it; what an earlier run transferred is not fetched again."""
-    file, part = folder / archive.name, folder / f"{archive.name}.part"
+    file = folder / archive.name
+    part = folder / f"{archive.name}.part"
     if file.exists():
         return file
     folder.mkdir(parents=True, exist_ok=True)
@@ -131,18 +132,14 @@ def _unpack_members(file: Path, root: Path, members: str) -> None:
 
     try:
         with zipfile.ZipFile(file) as archive:
-            entries = [m for m in archive.infolist() if m.filename.startswith(members) and not m.is_dir()]
+            entries = [
+                entry for entry in archive.infolist() if entry.filename.startswith(members) and not entry.is_dir()
+            ]
             if not entries:
                 raise DataError(f"{file}: expected members {members}*, got none; delete the file and run again")
             for member in tqdm(entries, desc=f"unpacking {file.name}", unit="file", disable=None):
-                path = PurePosixPath(member.filename)
-                if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
-                    raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
-                if stat.S_ISLNK(member.external_attr >> 16):
-                    raise DataError(f"{file}: holds the link {member.filename!r}; delete it")
-                target = root.joinpath(*path.parts)
-                right_size = target.is_file() and target.stat().st_size == member.file_size
-                if right_size and zlib.crc32(target.read_bytes()) == member.CRC:
+                target = root.joinpath(*_safe_parts(file, member))
+                if _is_unpacked(target, member):
                     continue
                 target.parent.mkdir(parents=True, exist_ok=True)
                 part = target.with_name(f"{target.name}.part")
@@ -151,6 +148,22 @@ def _unpack_members(file: Path, root: Path, members: str) -> None:
                 part.replace(target)
     except zipfile.BadZipFile as error:
         raise DataError(f"{file}: damaged zip file ({error}); delete it and run again") from None
+
+
+def _safe_parts(file: Path, member: zipfile.ZipInfo) -> tuple[str, ...]:
+    """Return the parts of a member's path; raises `DataError` for names and links that lead out of the folder."""
+    path = PurePosixPath(member.filename)
+    if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
+        raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
+    if stat.S_ISLNK(member.external_attr >> 16):
+        raise DataError(f"{file}: holds the link {member.filename!r}; delete it")
+    return path.parts
+
+
+def _is_unpacked(target: Path, member: zipfile.ZipInfo) -> bool:
+    """Tell whether a file has the size and the checksum of a member."""
+    is_of_size = target.is_file() and target.stat().st_size == member.file_size
+    return is_of_size and zlib.crc32(target.read_bytes()) == member.CRC
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

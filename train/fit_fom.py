@@ -296,6 +296,7 @@ def fit_fom(config: FitFomConfig) -> None:
     check(not (config.mosaics and config.method == "search"), "method", "another one with mosaics", config.method)
     kind = MosaicSampler if config.mosaics else Sampler
     sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking", kind)
+    # Only these are in memory at once; the published fits and the misses are sums over all shards.
     samples = sampler.drawn(config.most)
     held_out = split(samples.scene, config.holdout)
     published = _published_fit(config, sampler)

@@ -79,6 +79,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
         scenes = make_scenes(config.data, fit.eye.detector.classes)
         report.lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, config)]
     settings = training_of(config, fit.mosaics["near"])["training"]
+    # The evidence for photographs notes its own metadata.
     model.metadata |= {part: settings for part in parts if part != "photograph"}
     path = inside(config.out, f"{fit.eye.detector.name}.safetensors")
     model.save(path)

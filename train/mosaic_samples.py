@@ -110,7 +110,7 @@ def _choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> T
     generator = generator_for("windows", seed, scene)
     rows = [torch.zeros(1, 3, dtype=torch.long)]
     for level in range(1, lattice.levels):
-        across, down = lattice.places(level)
-        place = torch.randint(across * down, (count,), generator=generator)
-        rows.append(torch.stack([torch.full_like(place, level), place % across, place // across], -1))
+        columns, lines = lattice.places(level)
+        place = torch.randint(columns * lines, (count,), generator=generator)
+        rows.append(torch.stack([torch.full_like(place, level), place % columns, place // columns], -1))
     return torch.cat(rows)

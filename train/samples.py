@@ -229,6 +229,7 @@ def collect_samples(config: SamplerSettings, folder: Path, title: str, kind: typ
         unit="picture",
         count=lambda shard: len(sampler.scenes_of(shard)),
     )
+    # Closing stops the workers when this process is interrupted.
     with closing(done):
         for shard, tensors in done:
             sampler.save(shard, Samples(**unpack_tensors(tensors)))

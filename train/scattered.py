@@ -97,7 +97,7 @@ class Scattered(ComposedScenes):
         """List the parts of photographs in a picture."""
         draw = self._generator(index, 0)
         low, high = np.log(self.sides)
-        side = np.exp(draw.uniform(low, high))
+        side = np.exp(draw.uniform(low, high))  # small ones as often as large ones
         count = round(np.exp(draw.uniform(0, np.log(self.most))))
         parts = self._drawn_parts(draw, count)
         groups = draw.uniform(0, 1, (draw.integers(1, 5), 2)) * self.size
@@ -120,6 +120,7 @@ class Scattered(ComposedScenes):
             order = draw.permutation(len(self.scenes))[:count].tolist()
             return [_Part(scene, (0, 0, *self.scenes.annotation(scene).size)) for scene in order]
         classes = sorted(self.alone)
+        # Rare classes more often than by their numbers of objects.
         weights = np.sqrt([len(self.alone[number]) for number in classes])
         chosen = draw.choice(classes, size=draw.integers(1, 4), p=weights / weights.sum())
         objects = [self.alone[int(draw.choice(chosen))] for _ in range(count)]
@@ -164,6 +165,7 @@ class Scattered(ComposedScenes):
             annotation = self.scenes.annotation(cutout.scene)
             low = annotation.boxes.new_tensor(cutout.part[:2])
             high = annotation.boxes.new_tensor(cutout.part[2:])
+            # Of a photograph's other objects those count whose centre is in the part.
             centre = (annotation.boxes[:, :2] + annotation.boxes[:, 2:]) / 2
             inside = ((centre >= low) & (centre <= high)).all(-1)
             x1, y1, x2, y2 = cutout.place
@@ -184,6 +186,7 @@ class Scattered(ComposedScenes):
         ground = self._texture(draw)
         for _ in range(_PATCHES - 1):
             noise = torch.from_numpy(draw.normal(size=(1, 1, *draw.integers(4, 16, 2)))).float()
+            # Most pixels are of one texture alone, with soft borders between them.
             share = (6 * F.interpolate(noise, self.size[::-1], mode="bilinear")[0]).sigmoid()
             ground = torch.lerp(ground, self._texture(draw), share)
         if draw.random() < _PLAIN:
@@ -224,7 +227,7 @@ def _stand_alone(annotation: Annotation, wider: Tensor) -> Tensor:
     """Tell which objects `(M,)` can be cut out by wider boxes `(M, 4)`: others cover little of these."""
     low = torch.maximum(wider[:, None, :2], annotation.boxes[:, :2])
     high = torch.minimum(wider[:, None, 2:], annotation.boxes[:, 2:])
-    shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)
+    shared = (high - low).clamp(min=0).prod(-1).fill_diagonal_(0)  # without that of an object with itself
     area = (wider[:, 2:] - wider[:, :2]).prod(-1)
     return (shared.sum(1) <= _SHARED * area) & ~annotation.crowd
 

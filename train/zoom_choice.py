@@ -42,6 +42,7 @@ def choose_foresight(model: GlimpseEvidence, fit: MosaicFit, kinds: Sequence[str
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
         for looks in chain.from_iterable(opened.values()):
             looks.save()
+    # Kinds differ in difficulty, so that each counts by its highest recall.
     highest = [max(*of_kind, 1e-9) for of_kind in zip(*recalls.values(), strict=True)]
     shares = {
         value: sum(recall / high for recall, high in zip(by_kind, highest, strict=True))

@@ -64,7 +64,8 @@ def _best_slice(
         for coarse in _windows_at(belief.lattice, level):
             if coarse in done:
                 continue
-            # The chances of the slices that a coarser window shows, and that no look as close has shown.
+            # The chances of the slices that a coarser window shows, and that no look as close has shown. What it finds
+            # takes further passes to confirm, for which its worth is divided.
             shown = [
                 chance
                 for window, chance in chances.items()

@@ -146,8 +146,9 @@ def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     model = _train_evidence(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     model.shares = search_shares(run.scenes, config)
     judged, model.thresholds = judge_evidence(config, model, examples[held_out], grid)
-    counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, _evidence_report(judged, model.thresholds, *counts))
+    trained = int((~held_out).sum())
+    report = _evidence_report(judged, model.thresholds, trained, int(held_out.sum()))
+    return Fit(model, judged, trained, int(held_out.sum()), report)
 
 
 def search_shares(scenes: Scenes, config: FitSearchConfig) -> Tensor:

@@ -64,7 +64,8 @@ class MapExamples(Examples):
         stands_for: `(E, T)`, number of classes that each class represents: 1, or more for those drawn at random.
     """
 
-    looks, more = MapLook, ("stands_for",)
+    looks = MapLook
+    more = ("stands_for",)
 
     answers: Tensor
     stands_for: Tensor
@@ -155,8 +156,9 @@ def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     _train_map(config, model, examples[~held_out], grid)
     _train_gain(config, model, examples[~held_out], grid)
     judged = _judge_map(config, model.eval(), examples[held_out], grid)
-    counts = int((~held_out).sum()), int(held_out.sum())
-    return Fit(model, judged, *counts, _map_report(judged, *counts))
+    trained = int((~held_out).sum())
+    report = _map_report(judged, trained, int(held_out.sum()))
+    return Fit(model, judged, trained, int(held_out.sum()), report)
 
 
 def _frequencies(run: Looking, holdout: int) -> Tensor:

@@ -175,15 +175,15 @@ def _look_at(
         source = StoredWindowLooks(eye, pictures, index, None)
         with torch.inference_mode():
             looks = source.see([Window.overview(source.lattice), *usual_slices(source.lattice)])
-        whole = looks[0]
-        scores.append(whole.show)
+        overview = looks[0]
+        scores.append(overview.show)
         counted = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
         targets = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
         for place, target in enumerate(targets):
             objects = annotation.boxes[annotation.labels == target]
             spare = place >= len(counted)
-            searches.append(_WholeSearch(number, target, source, whole, objects, evidence, spare=spare))
+            searches.append(_WholeSearch(number, target, source, overview, objects, evidence, spare=spare))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, source.lattice, annotation)
     return _PhotographLooks(torch.stack(scores), searches, explored)
 

@@ -8,8 +8,10 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
 
-SUREST, SUREST_OF_FEW = 0.99, 0.9
-"""Upper limit of the threshold for found targets, and that for few searches, in which one false alarm pushes it up."""
+SUREST = 0.99
+"""Upper limit of the threshold for found targets."""
+SUREST_OF_FEW = 0.9
+"""That for few searches, in which one false alarm pushes the threshold up."""
 
 _FOUND = OUTCOMES.index("found")
 _CONFIRMS = torch.arange(0.99, 0.49, -0.01).tolist()  # the highest first

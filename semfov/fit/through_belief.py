@@ -18,8 +18,9 @@ from semfov.fit.samples import Samples
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
 
-_EXPONENT, _MISS, _REFUTATION = 0.75, 1e-4, 0.9
-"""Values from which the exponents, the odds of a miss and the refutation are learned."""
+_EXPONENT = 0.75  # value from which the exponents are learned
+_MISS = 1e-4  # value from which the odds of a miss are learned
+_REFUTATION = 0.9  # value from which the refutation is learned
 
 
 @dataclass(frozen=True)

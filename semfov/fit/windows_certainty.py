@@ -138,16 +138,16 @@ def _explore(
     model: GlimpseEvidence, looks: StoredWindowLooks, annotation: Annotation, target: int | None, passes: int
 ) -> Exploration:
     """Explore a picture for all classes, or for a target."""
-    seen: list[WindowLook] = []
+    window_looks: list[WindowLook] = []
     remaining: list[tuple[float, float]] = []
     promised: list[float] = []
     for step in islice(find_everything(looks, model, target), _FURTHER * passes):
-        seen.append(step.look)
+        window_looks.append(step.look)
         remaining.append(step.belief.remaining())
         # Nothing was promised before the look at the whole.
         promised.append(promised[-1] + step.worth if promised else 0.0)
-    numbers = {min(number, len(seen)) for number in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
-    return Exploration.of(target, seen, numbers, looks.lattice, annotation, remaining, promised)
+    numbers = {min(number, len(window_looks)) for number in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
+    return Exploration.of(target, window_looks, numbers, looks.lattice, annotation, remaining, promised)
 
 
 def _judged(explored: Sequence[Exploration], passes: int) -> tuple[Tensor, Tensor]:

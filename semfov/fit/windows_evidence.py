@@ -31,8 +31,8 @@ from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLooks, half_steps
 
-_SHOWN_CLASSES, _HINTED_CLASSES = 8, 4
-"""Largest numbers of classes of a mosaic, shown clearly and only hinted at, whose rates are fitted in one step."""
+_SHOWN_CLASSES = 8  # largest number of classes of a mosaic, shown clearly, whose rates are fitted in one step
+_HINTED_CLASSES = 4  # and that of classes that are only hinted at
 _HINT = 0.02  # score from which on a class is hinted at
 _CLOSER_LOOKS = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
@@ -126,12 +126,16 @@ def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[_CloserWindow]
         steps = result.window.level - look.level
         # In cells of the lattice, from the corner of the look.
         x1, y1, x2, y2 = result.window.cells
-        x1, x2 = x1 - left, x2 - left
-        y1, y2 = y1 - top, y2 - top
-        is_inside = x1 >= 0 and y1 >= 0 and x2 <= width and y2 <= height
+        from_left = x1 - left
+        from_top = y1 - top
+        to_right = x2 - left
+        to_bottom = y2 - top
+        is_inside = from_left >= 0 and from_top >= 0 and to_right <= width and to_bottom <= height
         if 1 <= steps <= STEPS and (is_inside or look.level == 0):
-            cells = (x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale))
-            yield _CloserWindow(number, result, steps, cells)
+            # Cells that a window shows in part count.
+            first = (from_left // look.scale, from_top // look.scale)
+            last = (-(-to_right // look.scale), -(-to_bottom // look.scale))
+            yield _CloserWindow(number, result, steps, (*first, *last))
 
 
 class Windows(NamedTuple):
