@@ -366,7 +366,7 @@ def test_decisions_are_scored_by_photograph():
     searches = [
         VerifiedSearch(number, present, False, (), (), 0.5, 3, SearchEnd(None, 3)) for number, present, _ in kinds
     ]
-    ends = [(right, 2) for _, _, right in kinds]
+    ends = [SearchEnd(right, 2) for _, _, right in kinds]
     np.testing.assert_allclose(_scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 
 
