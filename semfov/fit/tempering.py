@@ -1,7 +1,6 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
-from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -139,6 +138,13 @@ def hit_rate(
     return float(shares.mean()) if len(shares) else None
 
 
+class _Fusion(NamedTuple):
+    """How scores are fused: `raw` or `calibrated`, with an exponent."""
+
+    scores: str
+    exponent: float
+
+
 class TemperingFit(PartFit):
     """Choose whether scores are calibrated before they are fused, and with which exponent."""
 
@@ -147,43 +153,55 @@ class TemperingFit(PartFit):
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
         self.settings = {name: getattr(self.config, name) for name in _SETTINGS}
-        tried = [f"{scores} {exponent:g}" for scores in ("raw", "calibrated") for exponent in EXPONENTS]
+        tried = [_title(_Fusion(scores, exponent)) for scores in ("raw", "calibrated") for exponent in EXPONENTS]
         self.tasks = dict.fromkeys(["raw", *tried], 0.005 * len(self.run.scenes))
 
     def fit(self) -> PartResult:
         """Choose, and compare the share of next fixations that hit the target with that of raw scores."""
-        inputs = self.inputs
         holdout = self.settings["holdout"]
-        rates_of = partial(hit_rates, self.config, self.run.scenes, inputs.samples, least=1)
-        kinds = ["raw"] if inputs.model("observation") is None else ["raw", "calibrated"]
-        raw = rates_of(Semantic(inputs.components), "raw")
-        rates = {
-            (scores, exponent): rates_of(inputs.fusing(scores, exponent), f"{scores} {exponent:g}")
-            for scores in kinds
-            for exponent in EXPONENTS
-        }
-        means = {pair: mean_hits(holdout, by_photograph) for pair, by_photograph in rates.items()}
-        best = max(means, key=lambda pair: means[pair]["fitted"])
-        scores, exponent = best
+        raw = self._rates(Semantic(self.inputs.components), "raw")
+        rates = {fusion: self._rates(self.inputs.fusing(*fusion), _title(fusion)) for fusion in self._fusions()}
+        means = {fusion: mean_hits(holdout, of_fusion) for fusion, of_fusion in rates.items()}
+        best = max(means, key=lambda fusion: means[fusion]["fitted"])
         held_out = [index for index in raw if index % holdout == 0]
         fused_rates = torch.tensor([rates[best][index] for index in held_out]).numpy()
         raw_rates = torch.tensor([raw[index] for index in held_out]).numpy()
         gain = Difference.of(fused_rates, raw_rates)
         before = mean_hits(holdout, raw)["held_out"]
         why = (
-            f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
-            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {gain.in_words('points gained', 100)}"
+            f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {best.scores} scores to "
+            f"the power of {best.exponent:g}, {100 * before:.1f} % with raw scores; "
+            f"{gain.in_words('points gained', 100)}"
         )
-        rows = [
-            ["scores", "exponent", "next fixations that hit, %"],
-            ["raw, every cell of a box", "1", f"{100 * before:.1f}"],
-        ]
-        for (kind, value), mean in means.items():
-            rows.append([kind, f"{value:g}", f"{100 * mean['held_out']:.1f}"])
-        report = section(
-            f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
-            f"photographs; the table shows results on {len(held_out)} held-out photographs.",
-            rows,
-        )
-        settings = {"scores": scores, "exponent": exponent, "footprint": FOOTPRINT}
-        return PartResult(Part(None, None, gain.better, why, settings), report)
+        settings = {"scores": best.scores, "exponent": best.exponent, "footprint": FOOTPRINT}
+        part = Part(None, None, gain.better, why, settings)
+        return PartResult(part, _report(best, means, before, len(held_out)))
+
+    def _fusions(self) -> list[_Fusion]:
+        """List what is tried; scores are calibrated only by an observation model that the agent uses."""
+        scores = ["raw"] if self.inputs.model("observation") is None else ["raw", "calibrated"]
+        return [_Fusion(kind, exponent) for kind in scores for exponent in EXPONENTS]
+
+    def _rates(self, observer: Semantic, title: str) -> dict[int, float]:
+        """Measure the hit rates of all photographs with an object."""
+        return hit_rates(self.config, self.run.scenes, self.inputs.samples, observer, title, least=1)
+
+
+def _title(fusion: _Fusion) -> str:
+    """Return the title of the progress bar."""
+    return f"{fusion.scores} {fusion.exponent:g}"
+
+
+def _report(best: _Fusion, means: dict[_Fusion, dict[str, float]], before: float, held_out: int) -> str:
+    """Write the report: the choice, and the hit rates on held-out photographs."""
+    rows = [
+        ["scores", "exponent", "next fixations that hit, %"],
+        ["raw, every cell of a box", "1", f"{100 * before:.1f}"],
+    ]
+    for fusion, mean in means.items():
+        rows.append([fusion.scores, f"{fusion.exponent:g}", f"{100 * mean['held_out']:.1f}"])
+    return section(
+        f"The exponent with which scores are fused ({best.scores}, {best.exponent:g}) was chosen on the training "
+        f"photographs; the table shows results on {held_out} held-out photographs.",
+        rows,
+    )

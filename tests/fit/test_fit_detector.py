@@ -30,6 +30,7 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.detector import _check_photographs, _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import Difference
 from semfov.fit.evidence import FitSearchConfig
+from semfov.fit.folder import FITS as PART_FITS
 from semfov.fit.folder_report import thin_classes
 from semfov.fit.looking import Looking
 from semfov.fit.part import PartInputs, PartResult
@@ -40,7 +41,7 @@ from semfov.fit.thresholds import choose_thresholds
 from semfov.fit.verification import VerifiedSearch
 from semfov.fit.verification_part import VerificationFit, _scores
 from semfov.io.files import sha256
-from semfov.io.manifest import Manifest, Part
+from semfov.io.manifest import PARTS, Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.progress import WholeBar, task_bar, track
@@ -170,6 +171,10 @@ FITS = {
     "map": "map_part.fit_map_evidence",
     "windows": "windows_part._fit_mosaics",
 }
+
+
+def test_every_part_of_a_folder_has_a_fit_in_the_order_of_the_manifest():
+    assert tuple(PART_FITS) == PARTS
 
 
 def forbid(monkeypatch, *parts):
