@@ -204,7 +204,8 @@ def fit_oculomotor(
         for picture in batch:
             # A quarter of the computation: the likelihood of a fixation given that it is on these cells has the same
             # parameters.
-            corner = _drawn_corner(generator)
+            row, column = torch.randint(_EVERY, (2,), generator=generator).tolist()
+            corner = row, column
             events = _events_on(events_of[number][picture], corner, size, generator)
             if len(events.cell):
                 losses.append(_saccade_loss(model, map_of[number][picture], centre, events, size, corner))
@@ -214,14 +215,8 @@ def fit_oculomotor(
     descend(model.oculomotor.parameters(), loss_of, steps, rate, clip=None, decay=1e-3, rise=0.2, title=title)
 
 
-def _drawn_corner(generator: torch.Generator) -> tuple[int, int]:
-    """Draw the first row and column of every second one."""
-    row, column = torch.randint(_EVERY, (2,), generator=generator).tolist()
-    return row, column
-
-
 def _events_on(events: Events, corner: tuple[int, int], size: tuple[int, int], generator: torch.Generator) -> Events:
-    """Draw events on every second row and column of cells, without fixations that none of them has before it."""
+    """Draw events on every second row and column of cells; padding before all their fixations is cut off."""
     columns = cells_of(size)[1]
     is_on = (events.cell // columns % _EVERY == corner[0]) & (events.cell % columns % _EVERY == corner[1])
     numbers = is_on.nonzero()[:, 0]

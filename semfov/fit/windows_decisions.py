@@ -80,14 +80,7 @@ def _with_facts(
 
 
 class _Known(NamedTuple):
-    """What is known after a look of a search.
-
-    Attributes:
-        best: highest score of the target.
-        case: `(10,)`, what the probability of presence is computed from, beside `best`.
-        detected: whether a detection shows the target.
-        worth: value of the best look that is left.
-    """
+    """What is known after a look of a search; the fields are those of `WindowSearches`."""
 
     best: float
     case: Tensor

@@ -179,13 +179,7 @@ def pair_windows(examples: Sequence[ZoomExample]) -> Windows:
     Returns:
         The pairs.
     """
-    scores: list[Tensor] = []
-    summaries: list[Tensor] = []
-    steps: list[int] = []
-    presence: list[Tensor] = []
-    before: list[int] = []
-    slots: list[bool] = []
-    mosaics: list[int] = []
+    pairs: list[Windows] = []
     for number, example in enumerate(examples):
         by_overview: dict[int, int] = {}  # number of the overview's pair by that of the closer look
         for look in example.predicting:
@@ -193,26 +187,22 @@ def pair_windows(examples: Sequence[ZoomExample]) -> Windows:
             is_overview = look.gist.level == 0
             for closer in _closer_windows(example, look.gist):
                 if is_overview:
-                    by_overview[closer.number] = len(scores)
+                    by_overview[closer.number] = len(pairs)
                 elif closer.number not in by_overview:
                     continue
-                pooled, summary = pool(look.gist.scores, closer.cells)
-                scores.append(pooled)
-                summaries.append(summary)
-                steps.append(closer.steps)
-                presence.append(closer.result.show >= example.least)
-                before.append(-1 if is_overview else by_overview[closer.number])
-                slots.append(closer.result.window.within is not None)
-                mosaics.append(number)
-    return Windows(
-        torch.stack(scores),
-        torch.stack(summaries),
-        torch.tensor(steps),
-        torch.stack(presence),
-        torch.tensor(before),
-        torch.tensor(slots),
-        torch.tensor(mosaics),
-    )
+                scores, summary = pool(look.gist.scores, closer.cells)
+                pairs.append(
+                    Windows(
+                        scores,
+                        summary,
+                        steps=torch.tensor(closer.steps),
+                        presence=closer.result.show >= example.least,
+                        before=torch.tensor(-1 if is_overview else by_overview[closer.number]),
+                        slot=torch.tensor(closer.result.window.within is not None),
+                        mosaic=torch.tensor(number),
+                    )
+                )
+    return Windows(*(torch.stack(column) for column in zip(*pairs, strict=True)))
 
 
 def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
