@@ -14,9 +14,6 @@ fits the agent to a detector of your own. Each part is also a function or a diff
 `semfov.fusion`, `semfov.acquisition`, `semfov.rollout`.
 """
 
-import sys
-from types import ModuleType
-
 import lazy_loader
 
 import semfov.cli.start  # noqa: F401 (before what takes long to import)
@@ -27,20 +24,8 @@ _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
+    """Import a public name when it is first asked for; suggest ours where others have another word for it."""
     try:
         return _named(name)
     except AttributeError:
         raise missing("semfov", name, PACKAGE_WORDS) from None
-
-
-class _Room(ModuleType):
-    """A room that is deeper than its name: `from semfov.acquisition import …` finds `semfov.gaze.acquisition`."""
-
-    def __getattr__(self, name: str) -> object:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(_named(self.__name__.removeprefix("semfov.")), name)
-
-
-for _room in ("acquisition", "dirichlet", "observers", "policies", "saliency"):
-    sys.modules[f"semfov.{_room}"] = _Room(f"semfov.{_room}")

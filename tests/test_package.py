@@ -20,8 +20,9 @@ ROOT = PACKAGE.parent
 # A subpackage imports only from itself and from the subpackages before it.
 SUBPACKAGES = [
     "version", "words", "errors", "threads", "io", "data", "settings", "motion", "sensor", "detection", "observation",
-    "belief", "gaze", "eye", "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live",
-    "model_folder", "presets", "agent", "metrics", "human", "viz", "report", "runs", "fit", "envs", "cli", "__main__",
+    "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye", "episode", "decision",
+    "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets", "agent", "metrics", "human", "viz",
+    "report", "runs", "fit", "envs", "cli", "__main__",
 ]  # fmt: skip
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are
 # the packages that draw. Its methods import them when they are called, and nothing of them when the record is made.
