@@ -39,7 +39,7 @@ from semfov.paths import GazePrediction, Record
 from semfov.paths.gaze import ScanpathLike
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.strategy import Strategy
-from semfov.words import AGENT_WORDS, missing
+from semfov.words import AGENT, missing
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
@@ -216,8 +216,8 @@ class ActivePerception(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         """The parts of the module; other libraries' words for what an agent does are refused with its own."""
-        if name in AGENT_WORDS:
-            raise missing("an agent", name, AGENT_WORDS)
+        if name in AGENT:
+            raise missing("an agent", name, AGENT)
         return super().__getattr__(name)
 
     def __call__(self, *given: Any, **options: Any) -> Any:

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.words import OF_OTHER_METHODS, OTHER_WORDS
+from semfov.words import meant_options, other_method
 
 __all__ = ["DataError", "InputError", "SemfovError"]
 
@@ -26,17 +26,19 @@ _Result = TypeVar("_Result")
 
 def printable(text: str) -> str:
     """Escape control characters, and bytes of names that are not UTF-8; lines stay."""
-    steering = ("Cc", "Cf", "Cs")  # controls, marks of direction and lone surrogates
-    return "".join(
-        ascii(each)[1:-1] if unicodedata.category(each) in steering and each not in "\n\t" else each for each in text
-    )
+    return "".join(ascii(character)[1:-1] if _steers(character) else character for character in text)
+
+
+def _steers(character: str) -> bool:
+    """Tell whether a character can steer a terminal: a control, a mark of direction or a lone surrogate."""
+    return unicodedata.category(character) in ("Cc", "Cf", "Cs") and character not in "\n\t"
 
 
 class SemfovError(Exception):
     """Base of every error that semfov raises on purpose; the message names what is wrong and how to correct it."""
 
     def __str__(self) -> str:
-        """The message, in which names of files cannot steer a terminal."""
+        """Return the message, in which names of files cannot steer a terminal."""
         return printable(super().__str__())
 
 
@@ -49,13 +51,27 @@ class DataError(SemfovError):
 
 
 def check(condition: bool, argument: str, expected: str, got: object) -> None:
-    """Raise `InputError` with a message in the house's form, unless a condition holds."""
+    """Raise `InputError` unless a condition holds.
+
+    Args:
+        condition: what must hold.
+        argument: name of the argument that is checked.
+        expected: the values that are allowed, in words.
+        got: the value, or what is wrong with it and how to correct it.
+    """
     if not condition:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
 def check_data(condition: bool, where: object, expected: str, got: object) -> None:
-    """Raise `DataError` with a message in the house's form, for what is wrong in a file, unless a condition holds."""
+    """Raise `DataError`, for what is wrong in a file, unless a condition holds.
+
+    Args:
+        condition: what must hold.
+        where: the file, or the place in it.
+        expected: what it should hold, in words.
+        got: what it holds instead.
+    """
     if not condition:
         raise DataError(f"{where}: expected {expected}, got {got}")
 
@@ -64,12 +80,19 @@ def check_data(condition: bool, where: object, expected: str, got: object) -> No
 def needing(
     package: str, what: object, install: str | None = None, error: type[SemfovError] = InputError
 ) -> Iterator[None]:
-    """A block that imports a package which need not be there; the error tells how it is installed."""
+    """Open a block that imports a package which need not be there.
+
+    Args:
+        package: name of the package.
+        what: what needs it: an argument, a method or a file.
+        install: what pip installs; None for the package itself.
+        error: class of the error that says how the package is installed.
+    """
     try:
         yield
     except ImportError:
-        way = f"pip install {install or package}"
-        raise error(f"{what}: expected the package {package}, which is not installed; {way}") from None
+        remedy = f"pip install {install or package}"
+        raise error(f"{what}: expected the package {package}, which is not installed; {remedy}") from None
 
 
 def values_known(*tensors: Tensor) -> bool:
@@ -114,8 +137,8 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
 
 def check_tensor(value: object, argument: str) -> None:
     """Raise `InputError` unless a value is a tensor; the message has the call that converts it."""
-    got = f"a {type(value).__name__}; give torch.as_tensor({argument})"
-    check(isinstance(value, Tensor), argument, "a tensor", got.replace("a ndarray", "a NumPy array"))
+    kind = "NumPy array" if type(value).__name__ == "ndarray" else type(value).__name__
+    check(isinstance(value, Tensor), argument, "a tensor", f"a {kind}; give torch.as_tensor({argument})")
 
 
 def check_whole(value: object, argument: str, low: int, high: int) -> None:
@@ -136,68 +159,96 @@ def check_pixels(image: Tensor, argument: str) -> None:
         return
     # In the order of memory, which is several times faster than across it.
     in_memory = image.detach().permute(sorted(range(image.ndim), key=image.stride, reverse=True))
-    least, most = torch.stack(in_memory.aminmax()).tolist()
-    inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
-    got = "NaN" if math.isnan(least) else f"numbers from {least:g} to {most:g}"
-    check(inside, argument, "RGB in [0, 1]", f"{got}; {_to_unit(least, most)}")
+    low, high = torch.stack(in_memory.aminmax()).tolist()
+    inside = low >= -_ROUNDING and high <= 1 + _ROUNDING
+    got = "NaN" if math.isnan(low) else f"numbers from {low:g} to {high:g}"
+    check(inside, argument, "RGB in [0, 1]", f"{got}; {_to_unit(low, high)}")
 
 
-def _to_unit(least: float, most: float) -> str:
-    """How to bring pixels from `least` to `most` into [0, 1], in words."""
-    if not math.isfinite(least + most):
+def _to_unit(low: float, high: float) -> str:
+    """Say how to bring pixels from `low` to `high` into [0, 1]."""
+    if not math.isfinite(low + high):
         return "replace NaN and infinite values (torch.nan_to_num)"
-    if least >= -0.25 and most <= 1.25:
+    if low >= -0.25 and high <= 1.25:
         return "clamp to [0, 1] the values that resampling has moved outside"
-    if least < 0:
+    if low < 0:
         return (
             "undo the normalisation: image * std + mean, for ImageNet with mean (0.485, 0.456, 0.406) and std "
             "(0.229, 0.224, 0.225), or (image + 1) / 2 for an image normalised to [-1, 1]"
         )
-    return "divide by 255" if most <= 255.5 else "divide by the value of white"
+    return "divide by 255" if high <= 255.5 else "divide by the value of white"
 
 
 def check_finite(tensor: Tensor, argument: str) -> None:
     """Raise `InputError` where a tensor holds a NaN or an infinite value."""
-    if values_known(tensor) and not bool((finite := torch.isfinite(tensor)).all()):
+    if not values_known(tensor):
+        return
+    finite = torch.isfinite(tensor)
+    if not bool(finite.all()):
         bad = tensor.numel() - int(finite.sum())
         check(False, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
-    """Return a name if it is known; otherwise suggest the nearest known names."""
+    """Return a name if it is known.
+
+    Args:
+        name: the name.
+        known: the names that there are.
+        what: what the names are of, for the message.
+
+    Returns:
+        The known name that is equal to it.
+
+    Raises:
+        InputError: there is no such name; the message has the nearest ones.
+    """
     names = list(known)
     if name in names:
         return names[names.index(name)]
-    near = get_close_matches(str(name), names, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names) or 'none'}"
+    similar = get_close_matches(str(name), names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(map(repr, similar))}?" if similar else f"known: {', '.join(names) or 'none'}"
     raise InputError(f"unknown {what} {name!r}; {hint}")
 
 
 def check_options(options: Iterable[str], known: Iterable[str], what: str) -> None:
-    """Raise `InputError` for the first unknown option of a call that passes its options on, with the nearest names."""
+    """Raise `InputError` for the first unknown option of a call that passes its options on.
+
+    Args:
+        options: names of the options of the call.
+        known: names of the options that there are.
+        what: what takes them, for the message.
+    """
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
-            near = [each for each in OTHER_WORDS.get(name, ()) if each in names] or get_close_matches(name, names)
-            meant = " or ".join(f"{each}=" for each in near)
-            hint = f"did you mean {meant}?" if near else f"known: {', '.join(names) or 'none'}"
-            hint = OF_OTHER_METHODS.get((what, name), hint)
+            hint = other_method(what, name) or _nearest_options(name, names)
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 
 
+def _nearest_options(name: str, known: list[str]) -> str:
+    """Suggest the options that others call by this name, or those with a similar name, or list all."""
+    options = meant_options(name, known) or get_close_matches(name, known)
+    if not options:
+        return f"known: {', '.join(known) or 'none'}"
+    return f"did you mean {' or '.join(f'{option}=' for option in options)}?"
+
+
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """A method that refuses what it does not take with the nearest name, or with its form; Python says neither."""
-    form, name = signature(function), function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
-    _, *known = form.parameters
-    words = [each.name if each.default is each.empty else f"{each.name}=" for each in form.parameters.values()][1:]
+    """Decorate a method so that unknown or missing arguments raise `InputError` with a suggestion."""
+    form = signature(function)
+    name = function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
+    _, *parameters = form.parameters.values()  # without `self`
+    known = [parameter.name for parameter in parameters]
+    words = [p.name if p.default is p.empty else f"{p.name}=" for p in parameters]
 
     @wraps(function)
-    def call(*given: _Given.args, **options: _Given.kwargs) -> _Result:
+    def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
         check_options(options, known, name)
         try:
-            form.bind(*given, **options)
+            form.bind(*arguments, **options)
         except TypeError as error:
             raise InputError(f"{name}: {error}; expected {', '.join(words)}") from None
-        return function(*given, **options)
+        return function(*arguments, **options)
 
     return call

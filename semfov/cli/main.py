@@ -16,7 +16,7 @@ from typing import Any
 
 from semfov.cli.help import HELP
 from semfov.version import __version__
-from semfov.words import OTHER_WORDS
+from semfov.words import OPTIONS, meant_options
 
 _PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: one that comes with semfov)")
 _DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
@@ -168,12 +168,12 @@ def _of_others(own: str, rest: Sequence[str]) -> str | None:
     for word in rest:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
         whole = (own, option) == ("fit", "detector")  # its parts are options, detector.name and others
-        asked = {option, option.removesuffix("s"), *OTHER_WORDS.get(option, ())}
+        asked = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
         if whole or (option and option not in names[own] and asked & {first, singular}):
             return f"unknown option --{option}; the {singular} has no option before it: semfov {own} {singular.upper()}"
         if own not in (*_LOOKING, "gaze"):
             continue
-        meant = next((each for each in OTHER_WORDS.get(option, ()) if each in names[own]), None)
+        meant = next(iter(meant_options(option, names[own])), None)
         if meant is not None and option not in names[own]:
             return f"unknown option --{option.replace('_', '-')}; did you mean --{meant.replace('_', '-')}?"
         having = [each for each in _LOOKING if option in names[each] - names[own]]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.io.schema import is_number
-from semfov.words import not_there
+from semfov.words import DECISION, OtherWords
 
 Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
@@ -23,17 +23,9 @@ OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
 _ABSENT = 0.5  # probability of the picture below which the target of a search without a find is absent
 
-_WORDS = {
-    **dict.fromkeys(("found", "present", "result", "success"), "decision.outcome == 'found'"),
-    **dict.fromkeys(("conf", "confidence", "p", "score"), "decision.probability"),
-    **dict.fromkeys(("bbox", "boxes", "xyxy"), "decision.box"),
-    **dict.fromkeys(("at", "location", "point", "x", "y"), "record.found_at"),
-}
-"""What others call the attributes of a decision, and ours."""
-
 
 @dataclass(frozen=True)
-class Decision:
+class Decision(OtherWords):
     """Decision of a search; box `(4,)`."""
 
     outcome: Outcome
@@ -42,10 +34,7 @@ class Decision:
     box: Tensor | None = None
     place: float | None = None
 
-    if not TYPE_CHECKING:  # to which any name would be one of a decision
-
-        def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, _WORDS)
+    _other_words = DECISION
 
 
 @dataclass(frozen=True)

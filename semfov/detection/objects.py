@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from semfov.data.classes import class_index
 from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
-from semfov.words import not_there
+from semfov.words import OBJECTS, OtherWords
 
 _Column = NDArray[np.float32]
 _Index = NDArray[np.intp]
@@ -25,24 +24,9 @@ _FAR = 1e9  # pixels of an edge, beyond which areas of single precision overflow
 _PRINTED = 20  # largest number of objects in the text form
 _BORDER = 2 / 416  # boxes that come this near to a border of their window, in longer sides of the window, are cut by it
 
-_WORDS = {
-    **dict.fromkeys(("save", "to_csv", "write"), "record.to_csv(path, 'objects')"),
-    **dict.fromkeys(
-        ("dataframe", "df", "to_dataframe", "to_df", "to_frame", "to_pandas"), "record.to_frame('objects')"
-    ),
-    **dict.fromkeys(("to_dict", "to_json", "tolist"), "record.object_rows()"),
-    **dict.fromkeys(("to_coco", "to_geojson", "to_supervision", "to_yolo"), "the method of the record"),
-    **dict.fromkeys(("draw", "plot", "show"), "record.plot()"),
-    **dict.fromkeys(("bbox", "box", "xyxy"), "objects.boxes"),
-    **dict.fromkeys(("conf", "confidence", "probability", "score"), "objects.scores"),
-    **dict.fromkeys(("class_id", "cls", "label"), "objects.labels"),
-    "names": "objects.classes",
-}
-"""What others call the attributes of objects, and ours."""
-
 
 @dataclass(frozen=True, repr=False)
-class Objects:
+class Objects(OtherWords):
     """Objects of a picture, most confident first.
 
     Attributes:
@@ -63,10 +47,7 @@ class Objects:
     passes: Tensor
     classes: tuple[str, ...] = field(default=(), compare=False)
 
-    if not TYPE_CHECKING:  # to which any name would be one of objects
-
-        def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, _WORDS)
+    _other_words = OBJECTS
 
     def __len__(self) -> int:
         return len(self.boxes)

@@ -24,7 +24,7 @@ from semfov.io.tables import csv_text, digits, pixels
 from semfov.paths.georeference import box_on_earth, georeference
 from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
-from semfov.words import not_there
+from semfov.words import RECORD, OtherWords
 
 if TYPE_CHECKING:
     import pandas
@@ -36,31 +36,14 @@ _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
 COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
-_WORDS = {
-    **dict.fromkeys(("boxes", "labels", "scores", "xyxy"), "its objects, such as record.objects.boxes"),
-    "box": "record.decision.box, or its objects, record.objects.boxes",
-    **dict.fromkeys(("confidence", "probability", "score"), "record.decision.probability"),
-    **dict.fromkeys(("outcome", "result"), "record.decision.outcome"),
-    **dict.fromkeys(("count", "counts", "number"), "len(record.objects), or record.expected with what was not seen"),
-    **dict.fromkeys(("dataframe", "df", "to_dataframe", "to_df", "to_pandas"), "record.to_frame()"),
-    **dict.fromkeys(("draw", "show", "visualize"), "record.plot()"),
-    **dict.fromkeys(("names",), "record.classes"),
-    **dict.fromkeys(("detections", "results"), "record.objects, or the detections of a look, record[0].detections"),
-    **dict.fromkeys(("to_html", "save_html"), "record.report(path)"),
-}
-"""What others call the attributes of a record, and ours."""
 
-
-class Conversion(Outcome):
+class Conversion(Outcome, OtherWords):
     """Conversion of looks and objects to tables, and of objects to the formats of other libraries and of maps."""
 
     _columns: ClassVar[tuple[str, ...]] = COLUMNS
     """Columns of the table of objects."""
 
-    if not TYPE_CHECKING:  # to which any name would be one of a record
-
-        def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, _WORDS)
+    _other_words = RECORD
 
     def rows(self) -> list[dict[str, Any]]:
         """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.

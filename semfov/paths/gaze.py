@@ -28,7 +28,7 @@ from semfov.io.files import MADE_HERE, write_bytes
 from semfov.io.tables import digits, pixels
 from semfov.paths.base import Record
 from semfov.paths.stimulus import reduced_copy
-from semfov.words import not_there
+from semfov.words import GAZE_PREDICTION, OtherWords
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,17 +39,9 @@ _REACH = 0.05  # distance, in longer sides of the picture, within which probabil
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
 
-_WORDS = {
-    **dict.fromkeys(("draw", "show", "visualize"), "gaze.plot()"),
-    **dict.fromkeys(("save", "to_png"), "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)"),
-    **dict.fromkeys(("heatmap", "map", "saliency"), "gaze.density"),
-    **dict.fromkeys(("fixations", "sample", "scanpath"), "gaze.scanpaths(people)"),
-}
-"""What others call the attributes of a prediction, and ours."""
-
 
 @dataclass(frozen=True, repr=False, eq=False)
-class GazePrediction:
+class GazePrediction(OtherWords):
     """Where people look in a picture that they view freely, without a task.
 
     Attributes:
@@ -75,10 +67,7 @@ class GazePrediction:
     source: str | None = None
     seen: int | None = None
 
-    if not TYPE_CHECKING:  # to which any name would be one of a prediction
-
-        def __getattr__(self, name: str) -> Any:
-            return not_there(self, name, _WORDS)
+    _other_words = GAZE_PREDICTION
 
     @classmethod
     def of(
