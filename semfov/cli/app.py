@@ -184,7 +184,7 @@ class _Calls:
                     record = agent.find_all(picture, None if target == _EVERY else target, **limits)
                 else:
                     record = agent.explore(picture, **limits)
-                data = record.page_data(picture if record.how == "windows" else None)
+                data = record.page_data(picture if record.kind.fine else None)
                 words, page = record.summary(), page_html(record.describe(), [data])
             # A frame that shares nothing with the page around it.
             source = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'

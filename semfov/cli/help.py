@@ -1,5 +1,7 @@
 """Texts of the command: its help, one screen for each subcommand."""
 
+from semfov.cli.formats import suffixes_in_words
+
 _OVERVIEW = """\
 semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
 
@@ -39,8 +41,8 @@ _LOOKS = """\
   --passes N           most passes of the detector; --shifts N: most gaze shifts of a fovea
   --seconds S          longest time for a picture; --white auto: thermal or 12 bits; --bands 4,3,2: bands of a TIFF"""
 
-_OUTPUT = """\
-  --out FILE           .json, .jsonl, .csv, .geojson, .coco.json (--annotations FILE: with its ids, and AP); - is stdout
+_OUTPUT = f"""\
+  --out FILE           {suffixes_in_words()}; - is stdout
   --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
                        also views,belief, and in a search belief_bars
   --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: errors alone

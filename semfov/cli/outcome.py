@@ -11,16 +11,15 @@ from typing import Any
 from torch import Tensor
 
 from semfov.agents.picture import PictureLike
+from semfov.cli.formats import ResultsFormat
 from semfov.cli.options import ALL_DRAWINGS, Drawing, PictureOptions
-from semfov.cli.results import kind_of
+from semfov.cli.results import kind_of, results_format
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
-from semfov.data.classes import canonical_name
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
 from semfov.paths import Record, Scanpath
-from semfov.paths.conversion import coco_categories
 from semfov.paths.look import CONFIDENT, detections_in_words
 from semfov.report.episode import jpeg
 from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip, save_figure
@@ -34,10 +33,10 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     width, height = record.size
     limit = " (the limit)" if record.ending == "passes" else ""
     looks = f"{record.passes} look{'s' if record.passes != 1 else ''}{limit} in {seconds:.1f} s"
-    if record.how == "head":  # whose seconds are those of its movements and looks
+    if record.kind.turns:  # whose seconds are those of its movements and looks
         looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
-    headline = record.objects_in_words() if decision is None else _decision_text(record, decision)
+    headline = record.words.objects if decision is None else _decision_text(record, decision)
     why = "" if limit else record.why_it_ended()
     lines = [f"{name}, {width} × {height} px: {headline}", f"  {why} {looks}.".replace("   ", "  ")]
     if record.decision is None:
@@ -48,12 +47,14 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
 
 def _decision_text(record: Record, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    what = "probability that the picture holds it:" if record.decided_by == "probability" else record.decided_by
-    name, probability = record.target_name, f"{what} {decision.probability:.2f}"
+    name = record.target_name
+    measure = record.words.decided_by
+    number = "probability that the picture holds it:" if measure == "probability" else measure
+    probability = f"{number} {decision.probability:.2f}"
     if decision.outcome == "absent":
         return f"{name} is not there, {probability}"
     if decision.outcome == "undecided":
-        return "; ".join(filter(None, (f"{name} undecided, {probability}", record.best_place_in_words())))
+        return "; ".join(filter(None, (f"{name} undecided, {probability}", record.words.best_place)))
     point, box = record.found_at, decision.box
     edges = f", box {box_text(box.tolist())}" if box is not None else ""
     where = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
@@ -71,7 +72,7 @@ def _objects_lines(record: Record) -> list[str]:
     more = len(rows) - _OBJECTS_LISTED
     lines += [f"  and {more} more (--out FILE.json writes all)"] if more > 0 else []
     several = record.target is None and not record.targets and len(rows) > 1
-    return [*lines, f"  in all: {record.classes_in_words()}"] if several else lines
+    return [*lines, f"  in all: {record.words.classes}"] if several else lines
 
 
 def _regions_lines(scanpath: Scanpath) -> list[str]:
@@ -105,7 +106,7 @@ def _looks_text(record: Record) -> str:
     head = ["look", "at (x, y)", "shows", f"detections from score {CONFIDENT:g} on", "value", "s"]
     lines = [f"  {line}" for line in table_lines([head, *rows])]
     if any(look.value is not None for look in record):
-        lines.append(f"  value: {record.value_in_words}")
+        lines.append(f"  value: {record.words.value}")
     for number, close_up in enumerate(record.closer, 1):
         taken = record.decision is not None and close_up.presence == record.decision.probability
         chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} in the picture{', as decided' * taken}"
@@ -149,12 +150,12 @@ class PictureOutcome:
         text = _outcome_text(record, source.name, seconds)
         boxes = None if source.scene is None else source.scene.boxes
         episode = None
-        kind = None if options.out is None else kind_of(options.out)
-        row = _result_row(record, source.name, seconds, kind, source.file, truth)
+        form = None if options.out is None else results_format(options.out, truth=truth)
+        row = _result_row(record, source, seconds, form)
         if options.report is not None:
             name = Path(source.name).name
             # Others have no more pixels than the record keeps.
-            shown = opened if record.how == "windows" else None
+            shown = opened if record.kind.fine else None
             episode = record.page_data(shown, name=name, boxes=boxes)
         figures = _draw_episode(record, boxes, drawings)
         files = {}
@@ -177,38 +178,21 @@ class PictureOutcome:
         )
 
 
-def _result_row(
-    record: Record, name: str, seconds: float, kind: str | None, file: Path | None = None, truth: Truth | None = None
-) -> dict[str, Any]:
-    """Make the entry of a picture in a file of results."""
-    picture = {**record.to_dict(), "picture": name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
-    row: dict[str, Any] = {"picture": {key: value for key, value in picture.items() if key not in ("looks", "summary")}}
-    if kind == ".geojson":
-        collection = record.to_geojson(source=file)
-        row["coordinates"] = collection["coordinates"]
-        row["parts"] = [
-            {**each, "properties": {"picture": name, **each["properties"]}} for each in collection["features"]
-        ]
-    elif truth is not None:
-        sought = picture["targets"] or record.classes[1:]
-        row["image_id"] = truth.image_id(name, (picture["width"], picture["height"]))
-        categories = truth.categories(sought)
-        row["classes"] = list(categories)
-        # Objects of other classes cannot be judged.
-        names = [canonical_name(each) for each in record.classes]
-        numbered = record.to_coco(row["image_id"], range(1, len(names)))
-        results = ((each, names[each["category_id"]]) for each in numbered)
-        row["parts"] = [{**each, "category_id": categories[name]} for each, name in results if name in categories]
-    elif kind == ".coco.json":
-        row["categories"] = coco_categories()
-        known = {canonical_name(each["name"]) for each in row["categories"]}
-        if not {canonical_name(each) for each in record.classes[1:]} <= known:
-            row["categories"] = [{"id": number, "name": each} for number, each in enumerate(record.classes[1:], 1)]
-        row["parts"] = [
-            {**each, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
-            for each in record.to_coco(0, row["categories"])
-        ]
-    return row
+def _result_row(record: Record, source: PictureSource, seconds: float, form: ResultsFormat | None) -> dict[str, Any]:
+    """Make the entry of a picture in a file of results.
+
+    Args:
+        record: the record of the picture.
+        source: the picture.
+        seconds: time that it took.
+        form: format of the file; None without a file.
+
+    Returns:
+        JSON values: the `picture`, and what the format adds.
+    """
+    values = {**record.to_dict(), "picture": source.name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+    picture = {name: value for name, value in values.items() if name not in ("looks", "summary")}
+    return {"picture": picture, **({} if form is None else form.added(record, source.name, source.file))}
 
 
 def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

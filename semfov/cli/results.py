@@ -1,4 +1,4 @@
-"""Files of results: JSON, JSON lines, CSV, GeoJSON and COCO, written while pictures are looked at, and their list."""
+"""Files of results, written while pictures are looked at, and the list of the files of a command."""
 
 import json
 import shutil
@@ -9,130 +9,119 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TextIO
 
+from semfov.cli.formats import FORMATS, CocoResults, JsonLines, ResultsFormat, Row, suffix_of, suffixes
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
 from semfov.errors import DataError, check
 from semfov.io.code import package_digest
 from semfov.io.files import write_text, written_alone
-from semfov.io.tables import csv_text
-from semfov.paths.conversion import COLUMNS
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import digest_of
 
-_RESULT_KINDS = (".coco.json", ".json", ".jsonl", ".csv", ".geojson")  # ends of the names of files of results
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
 STDOUT = Path("-")  # standard output in place of a file of results, which takes JSON lines
 
-_BOX = ("x1", "y1", "x2", "y2")
-_DECISIONS = ("picture", "target", "outcome", "probability", "x", "y", *_BOX, "passes", "seconds", "error")
-
-_EXPECTED = ("expected", "expected_error")
-_OBJECTS = ("picture", "width", "height", *COLUMNS, *_EXPECTED, "error")
-
 
 def kind_of(path: Path) -> str | None:
-    """The kind of a file of results by its name; None for a folder."""
+    """Tell the format of a file of results by its name.
+
+    Args:
+        path: the file, `STDOUT`, or a folder.
+
+    Returns:
+        Suffix of the format; None for a folder.
+
+    Raises:
+        InputError: the name is that of another file.
+    """
     if path == STDOUT:
-        return ".jsonl"
-    name = path.name.lower()
-    kind = next((kind for kind in _RESULT_KINDS if name.endswith(kind)), None)
-    fits = kind is not None or not path.suffix or path.is_dir()
-    check(fits, "out", f"a folder, or a file that ends in {', '.join(_RESULT_KINDS)}", path)
-    return kind
+        return JsonLines.suffix
+    suffix = suffix_of(path.name)
+    is_folder = not path.suffix or path.is_dir()
+    check(suffix is not None or is_folder, "out", f"a folder, or a file that ends in {', '.join(suffixes())}", path)
+    return suffix
+
+
+def results_format(path: Path, *, searched: bool = False, truth: Truth | None = None) -> ResultsFormat:
+    """Make the format of a file of results; that in a folder is JSON.
+
+    Args:
+        path: the file, `STDOUT`, or a folder.
+        searched: whether the pictures are searched for a class.
+        truth: annotations whose ids the results have; None for none.
+
+    Returns:
+        The format.
+    """
+    if truth is not None:
+        return CocoResults(truth)  # the options take annotations with a file of COCO alone
+    if path == STDOUT:
+        return JsonLines(searched=searched, ascii_only=True)
+    return FORMATS[kind_of(path) or ".json"](searched=searched)
 
 
 class ResultsFile:
-    """A file of results that is complete for the pictures so far, whenever the command ends."""
+    """A file of results that is complete for the pictures so far, whenever the command ends.
 
-    def __init__(self, path: Path, kind: str, *, searched: bool, stream: TextIO, truth: Truth | None = None) -> None:
-        self.path, self.kind, self.searched, self.truth = path, kind, searched, truth
-        self._rows: dict[int, dict[str, Any]] = {}
-        self._due = 0.0
+    `_rows` has the rows by the numbers of the pictures, which may come in any order. The file is not written again
+    before the time `_due`, so that writing takes a small share of the time. A file that grows has each row at once.
+
+    Args:
+        path: the file, or `STDOUT`.
+        form: its format.
+        stream: standard output.
+    """
+
+    def __init__(self, path: Path, form: ResultsFormat, stream: TextIO) -> None:
+        self.path = path
+        self.form = form
         self._stream = stream if path == STDOUT else None
-        if kind == ".jsonl" and self._stream is None:
+        self._rows: dict[int, Row] = {}
+        self._due = 0.0
+        if form.grows and self._stream is None:
             write_text(path, "")
 
-    def add(self, number: int, row: dict[str, Any]) -> None:
+    def add(self, number: int, row: Row) -> None:
         """Add a picture, or one that could not be read, with its `error`."""
         self._rows[number] = row
-        if self.kind != ".jsonl":
-            if time.monotonic() >= self._due:
-                self.write()
-            return
-        line = json.dumps(row["picture"], ensure_ascii=self._stream is not None) + "\n"
-        if self._stream is not None:  # which may have another encoding
-            self._stream.write(line)
+        if self.form.grows:
+            self._append(self.form.text([row]))
+        elif time.monotonic() >= self._due:
+            self.write()
+
+    def _append(self, text: str) -> None:
+        """Add text at the end of the stream or of the file."""
+        if self._stream is not None:
+            self._stream.write(text)
             self._stream.flush()
             return
         try:
             with self.path.open("a", encoding="utf-8") as file:
-                file.write(line)
+                file.write(text)
         except OSError as error:
             raise DataError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def write(self) -> None:
         """Write the file, atomically."""
-        if self.kind == ".jsonl":
+        if self.form.grows:
             return
         began = time.monotonic()
-        write_text(self.path, self._text())
+        write_text(self.path, self.form.text(self._in_order()))
         took = time.monotonic() - began
         self._due = began + took / _SHARE
 
-    def precision(self) -> str:
-        """AP and AP50 of the objects against the annotations, in words."""
-        assert self.truth is not None
-        rows = [row for row in self._rows.values() if "error" not in row["picture"]]
-        classes = {name for row in rows for name in row["classes"]}
-        results = [part for row in rows for part in row["parts"]]
-        return self.truth.judge(results, [row["image_id"] for row in rows], classes)
+    def print_judgement(self) -> None:
+        """Print how the objects agree with the annotations, where there are any."""
+        judgement = self.form.judgement(self._in_order())
+        if judgement is not None:
+            print(judgement)
 
-    def _text(self) -> str:
-        every = [self._rows[number] for number in sorted(self._rows)]
-        rows = [row for row in every if "error" not in row["picture"]]
-        pictures = [row["picture"] for row in rows]
-        skipped = [row["picture"] for row in every if "error" in row["picture"]]
-        whole: dict[str, Any] = {"pictures": pictures, "skipped": skipped}
-        if self.kind == ".csv":
-            listed = [row["picture"] for row in every]
-            table = listed if self.searched else [row for each in listed for row in _object_rows(each)]
-            turned = ("pan", "tilt") if any("pan" in row for row in table) else ()
-            columns = _DECISIONS if self.searched else (*_OBJECTS, *turned)
-            return csv_text([columns, *([row.get(name) for name in columns] for row in table)])
-        if self.kind == ".geojson":
-            unit = rows[0]["coordinates"] if rows else ""
-            features = [each for row in rows for each in row["parts"]]
-            whole = {"type": "FeatureCollection", "coordinates": unit, "features": features, "skipped": skipped}
-        elif self.truth is not None:
-            return json.dumps([each for row in rows for each in row["parts"]], indent=1) + "\n"
-        elif self.kind == ".coco.json":
-            images = [
-                {"id": number, "file_name": each["picture"], "width": each["width"], "height": each["height"]}
-                for number, each in enumerate(pictures, 1)
-            ]
-            objects = [{**each, "image_id": number} for number, row in enumerate(rows, 1) for each in row["parts"]]
-            annotations = [{"id": number, **each} for number, each in enumerate(objects, 1)]
-            categories = rows[0]["categories"] if rows else []
-            whole = {"images": images, "annotations": annotations, "categories": categories, "skipped": skipped}
-        return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
+    def _in_order(self) -> list[Row]:
+        """Return the rows in the order of the pictures."""
+        return [self._rows[number] for number in sorted(self._rows)]
 
 
-def _object_rows(picture: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each object, and one without an object for each class that has none, or for a picture without any."""
-    if "error" in picture:
-        return [picture]
-    rows = picture["objects"]
-    seen = {row["class"] for row in rows}
-    missing = [name for name in picture["targets"] if name not in seen] or ([] if rows else [None])
-    whole = {name: picture[name] for name in ("picture", "width", "height")}
-    numbers = picture["expected"], picture["expected_error"]
-    return [
-        {**whole, **row, **{name: of.get(row["class"]) for name, of in zip(_EXPECTED, numbers, strict=True)}}
-        for row in [*rows, *({"class": name} for name in missing)]
-    ]
-
-
-def held_outputs(options: Any) -> AbstractContextManager[None]:
+def held_outputs(options: object) -> AbstractContextManager[None]:
     """Hold all that the options name to write, in a block that is refused while another command writes any of it."""
     named = [getattr(options, name, None) for name in ("out", "report", "crops", "labels")]
     outputs = [path for path in named if path is not None and path != STDOUT]
@@ -141,14 +130,29 @@ def held_outputs(options: Any) -> AbstractContextManager[None]:
 
 
 def unfinished(file: Path, depends_on: Mapping[str, Any], sources: Sequence[PictureSource]) -> SceneResults:
-    """What a command has finished, beside its file: of pictures that are the same, with all that it depends on."""
+    """Open what a command has finished of pictures that are the same, with all that it depends on.
+
+    Args:
+        file: file of results, beside which it is kept.
+        depends_on: what the outcomes depend on beside pictures and code.
+        sources: the pictures.
+
+    Returns:
+        The outcomes that were kept.
+    """
     key = digest_of([depends_on, package_digest()])[:32]
     versions = [json.dumps(source.version()) for source in sources]
     return SceneResults(file.with_name(f"{file.name}.unfinished"), key, versions.__getitem__)
 
 
 def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:
-    """List the files of a command; what it has finished is kept until it is done, else it says which part that is."""
+    """List the files of a command, and say how it continues.
+
+    Args:
+        files: what was written.
+        finished: what is kept of it; removed where all is done.
+        part: which part of the pictures is done, such as `2 of 3`; None for all.
+    """
     if files:
         print("written:", *(f"  {path}" for path in files), sep="\n")
     if finished is None:

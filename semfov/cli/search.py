@@ -32,7 +32,7 @@ from semfov.cli.options import (
     start_of,
 )
 from semfov.cli.outcome import PictureOutcome
-from semfov.cli.results import STDOUT, ResultsFile, held_outputs, kind_of, tell_written, unfinished
+from semfov.cli.results import STDOUT, ResultsFile, held_outputs, kind_of, results_format, tell_written, unfinished
 from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data import WordVectors, class_index, spread
@@ -44,7 +44,6 @@ from semfov.io.files import check_writable, plain_name, sha256, write_bytes
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.paths import Record
-from semfov.paths.georeference import georeference
 from semfov.report import write_page
 from semfov.report.page import page_path
 from semfov.runs.config import WHERE
@@ -144,16 +143,6 @@ def _make_again(kind: type[_PictureJob], options: PictureOptions) -> _PictureJob
         return kind(options)
 
 
-def _check_places(files: Sequence[Path | None]) -> None:
-    """Raise `InputError` where only some of the pictures have a place on earth, as one collection has one unit."""
-    kinds: dict[bool, Path | None] = {}
-    for file in files:
-        with suppress(Exception):  # it is skipped when it is opened
-            kinds.setdefault(file is not None and georeference(str(file)) is not None, file)
-    got = f"{kinds.get(True)} with one and {kinds.get(False)} without; look at them apart, or write .json"
-    check(len(kinds) < 2, "out", "pictures that all have a georeference, or none, for .geojson", got)
-
-
 class _PictureFiles:
     """Files that a command writes about its pictures: results, figures and a page."""
 
@@ -168,11 +157,10 @@ class _PictureFiles:
         if out is None:
             return
         kind = kind_of(out)
-        if kind == ".geojson":
-            _check_places([source.file for source in self.job.sources])
+        form = results_format(out, searched=self.job.title.startswith("search"), truth=self.job.truth)
+        form.check_files([source.file for source in self.job.sources])
         file = out if kind is not None else out / "results.json"
-        searched = self.job.title.startswith("search")
-        self.results = ResultsFile(file, kind or ".json", searched=searched, stream=stream, truth=self.job.truth)
+        self.results = ResultsFile(file, form, stream)
         self.folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         if self.job.several and out != STDOUT:
             self.finished = unfinished(file, self.job.depends_on(), self.job.sources)
@@ -221,8 +209,8 @@ class _PictureFiles:
         written = self.written
         if self.results is not None:
             self.results.write()
-            if complete and self.job.truth is not None and any("error" not in row for row in self.rows.values()):
-                print(self.results.precision())
+            if complete and any("error" not in row for row in self.rows.values()):
+                self.results.print_judgement()
             written = [*([] if self.results.path == STDOUT else [self.results.path]), *written]
         if self.episodes:
             episodes = [self.episodes[number] for number in sorted(self.episodes)]

@@ -59,7 +59,7 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
         f"{photo.name}: the bare detector shows {len(bare.scores)} from {LEAST:g} on, and semfov lists {both} of them"
     )
     if rows:
-        print("\n".join(table_lines([["class", "bare", record.measure, "box"], *rows])))
+        print("\n".join(table_lines([["class", "bare", record.words.measure, "box"], *rows])))
     for word in (*_about_scores(bare, detector), *_about_colours(bare, agent, photo)):
         print(f"note: {word}")
 

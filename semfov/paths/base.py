@@ -52,7 +52,7 @@ class Record(Conversion):
         seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count, in windows their probability (`threshold_in_words`).
+        least: score from which on objects count, in windows their probability (`words.threshold`).
         unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
             no probabilities.
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
@@ -71,22 +71,19 @@ class Record(Conversion):
     _format: ClassVar[Format]
 
     def __repr__(self) -> str:
-        """The summary, the looks, and the most confident objects."""
+        """Return the summary, the looks, and the most confident objects."""
         rows = self.object_rows()
-        named = [
+        objects = [
             f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){' (confirmed)' * row['confirmed']}"
             for row in rows[:_NAMED]
         ]
-        more = [f"and {len(rows) - _NAMED} more"] if len(rows) > _NAMED else []
-        found = f"objects from {self.threshold_in_words}: {', '.join([*named, *more]) or 'none'}"
-        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self._lines(), found])
-
-    def _lines(self) -> list[str]:
-        """Lines of the text form on the looks."""
-        return []
+        if len(rows) > _NAMED:
+            objects.append(f"and {len(rows) - _NAMED} more")
+        found = f"objects from {self.words.threshold}: {', '.join(objects) or 'none'}"
+        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self.words.lines, found])
 
     def outline(self, look: RecordedLook) -> Tensor | None:
-        """The border of what a look shows.
+        """Return the border of what a look shows.
 
         Args:
             look: the look.
@@ -94,9 +91,10 @@ class Record(Conversion):
         Returns:
             `(P, 2)`, points in picture pixels, the first one again at the end; None for the whole picture.
         """
+        if self.is_whole(look.region):
+            return None
         x1, y1, x2, y2 = look.region
-        corners = [(x1, y1), (x2, y1), (x2, y2), (x1, y2), (x1, y1)]
-        return None if self.is_whole(look.region) else torch.tensor(corners)
+        return torch.tensor([(x1, y1), (x2, y1), (x2, y2), (x1, y2), (x1, y1)])
 
     @property
     def around(self) -> float | None:
@@ -104,7 +102,7 @@ class Record(Conversion):
         return None
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor] | None:
-        """The belief after a look.
+        """Return the belief after a look.
 
         Args:
             number: number of the look.
@@ -116,7 +114,7 @@ class Record(Conversion):
         return None
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """What the looks showed, as sharp as the detector saw it.
+        """Go through what the looks showed, as sharp as the detector saw it.
 
         Args:
             source: the opened picture, in any size.
@@ -127,25 +125,13 @@ class Record(Conversion):
         for look in self:
             x1, y1, x2, y2 = whole_pixels(look.region, self.size)
             across = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
+            pixels = read_region(source, (x1, y1, x2, y2), self.size, across)
             boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
-            (x, y), pixels = look.fixation, read_region(source, (x1, y1, x2, y2), self.size, across)
+            x, y = look.fixation
             yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
 
-    @property
-    def value_in_words(self) -> str:
-        """What the value of a look is, for which it was chosen."""
-        return "the value of the acquisition function at its cell"
-
-    def sensor_in_words(self) -> str | None:
-        """Describe through what was looked.
-
-        Returns:
-            The description; None if it is not known.
-        """
-        return None
-
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
-        """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.
+        """Convert the fixations to the format of human data (`semfov.data.fixations`), to write or to compare them.
 
         Args:
             picture: name of the picture.
@@ -253,6 +239,7 @@ class Record(Conversion):
         return Path(self.source).name if self.source else f"{width} × {height} px"
 
     def _repr_html_(self) -> str:
+        """Show the record in a notebook."""
         from semfov.report.notebook import record_html
 
         return record_html(self)
@@ -288,8 +275,8 @@ class Record(Conversion):
         except InputError as error:
             got = " ".join(str(error).split())
             raise DataError(f"{path}: expected a complete {cls._format.kind}, got: {got}") from None
-        made = {each.name for each in fields_of(cls) if each.init}
-        return cls(**{name: value for name, value in fields.items() if name in made})
+        arguments = {field.name for field in fields_of(cls) if field.init}
+        return cls(**{name: value for name, value in fields.items() if name in arguments})
 
     @abstractmethod
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -326,7 +313,7 @@ class Moment(Record):
     @property
     def examined(self) -> CloseUp | None:
         """The closer look, if this frame was spent on one; otherwise None."""
-        return next((each for each in self.closer if each.number == len(self) - 1), None)
+        return next((look for look in self.closer if look.number == len(self) - 1), None)
 
     @property
     @abstractmethod
@@ -363,14 +350,9 @@ class Moment(Record):
         from semfov.viz.live import draw_moment, reduced
 
         image = as_image(frame, argument="frame", color=color)
+        width, height = self.size
         size = tuple(image.shape[:0:-1])
-        check(size == self.size, "frame", "{} × {} px".format(*self.size), size)
-        drawn = draw_moment(image, self, self.describe(), self.size if longest is None else reduced(self.size, longest))
-        return np.ascontiguousarray(drawn[..., ::-1]) if color == "bgr" else drawn
-
-    def _decided(self) -> str | None:
-        """The decision in words; None without one."""
-        if self.decision is None:
-            return None
-        there = "" if self.decision.place is None else f" (there {self.decision.place:.2f})"
-        return f"{self.target_name}: {self.decision.outcome}, p {self.decision.probability:.2f}{there}"
+        check(size == self.size, "frame", f"{width} × {height} px", size)
+        drawing_size = self.size if longest is None else reduced(self.size, longest)
+        drawing = draw_moment(image, self, self.describe(), drawing_size)
+        return np.ascontiguousarray(drawing[..., ::-1]) if color == "bgr" else drawing

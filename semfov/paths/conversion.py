@@ -1,4 +1,4 @@
-"""Conversion of a record to tables, and of its objects to the formats of other libraries and of maps."""
+"""Conversion of a record to words and tables, and of its objects to the formats of other libraries and of maps."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from semfov.detection.exchange import category_ids, coco_results, named_detectio
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text, digits, pixels
-from semfov.paths.georeference import box_on_earth, georeference
+from semfov.paths.georeference import PlaceOnEarth, box_on_earth, georeference
 from semfov.paths.look import confident_detections
 from semfov.paths.outcome import Outcome
+from semfov.paths.words import Words
 from semfov.words import RECORD, OtherWords
 
 if TYPE_CHECKING:
@@ -36,17 +37,52 @@ _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
 COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
+DECISION_COLUMNS = ("target", "outcome", "probability", *_PLACE, "passes")
+"""Values of `to_dict` that stand in a table of searches, a line for each picture."""
+
 
 class Conversion(Outcome, OtherWords):
-    """Conversion of looks and objects to tables, and of objects to the formats of other libraries and of maps."""
+    """Conversion of a record to words, of its looks and objects to tables, and of objects to other formats."""
+
+    _other_words = RECORD
+
+    _words: ClassVar[type[Words]]
+    """Class of the words for the record."""
 
     _columns: ClassVar[tuple[str, ...]] = COLUMNS
     """Columns of the table of objects."""
 
-    _other_words = RECORD
+    @property
+    def words(self) -> Words:
+        """The words for the record (`semfov.paths.words.Words`)."""
+        return self._words(self)
+
+    def describe(self) -> str:
+        """Describe the outcome in one line.
+
+        Returns:
+            The line.
+        """
+        return self.words.describe()
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why the search or the exploration ended.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
+        return self.words.why_it_ended()
+
+    def summary(self) -> str:
+        """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt.
+
+        Returns:
+            The sentences.
+        """
+        return self.words.summary()
 
     def rows(self) -> list[dict[str, Any]]:
-        """The looks as a table of plain values, one row for each look, whose first columns all kinds of records have.
+        """Make a table of the looks, of plain values, whose first columns all kinds of records have.
 
         `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
         the picture that it shows, in picture pixels. `detections` counts those from score 0.1 on, `seen` is the class
@@ -58,75 +94,93 @@ class Conversion(Outcome, OtherWords):
         Returns:
             One dictionary for each look.
         """
-        closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda each: each.place)}
+        closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda look: look.place)}
         brought = Counter(self.objects.passes.tolist())
         rows: list[dict[str, Any]] = []
         for look in self:
-            seen = confident_detections(look.detections)
-            count = int(seen.count)
-            rows.append(
-                {
-                    "look": look.number,
-                    **dict(zip(_PLACE, map(pixels, (*look.fixation, *look.region)), strict=True)),
-                    "detections": count,
-                    "seen": self.classes[int(seen.labels[0, 0])] if count else None,
-                    "score": digits(float(seen.confidence[0, 0])) if count else None,
-                    "seconds": None if look.seconds is None else round(look.seconds, 3),
-                    "value": digits(look.value),
-                    "closer": digits(closer.get(look.number)),
-                    "brought": brought[look.number],
-                    **{name: digits(each) if isinstance(each, float) else each for name, each in look.more.items()},
-                }
-            )
+            detections = confident_detections(look.detections)
+            count = int(detections.count)
+            row: dict[str, Any] = {
+                "look": look.number,
+                **_rounded_place(*look.fixation, *look.region),
+                "detections": count,
+                "seen": self.classes[int(detections.labels[0, 0])] if count else None,
+                "score": digits(float(detections.confidence[0, 0])) if count else None,
+                "seconds": None if look.seconds is None else round(look.seconds, 3),
+                "value": digits(look.value),
+                "closer": digits(closer.get(look.number)),
+                "brought": brought[look.number],
+            }
+            for name, value in look.more.items():
+                row[name] = digits(value) if isinstance(value, float) else value
+            rows.append(row)
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome, the objects (`object_rows`) and the looks (`rows`) as JSON values, without unclaimed numbers.
+        """Convert the outcome, the objects (`object_rows`) and the looks (`rows`) to JSON values.
 
         Returns:
             Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
         """
-        (width, height), decision = self.size, self.decision
-        values: dict[str, Any] = {"picture": self.source, "width": width, "height": height, "target": self.target_name}
-        values["targets"] = [self.classes[label] for label in self._sought]
-        if decision is not None:
-            box = decision.box.tolist() if decision.outcome == "found" and decision.box is not None else [None] * 4
-            values |= {"outcome": decision.outcome, "probability": digits(decision.probability)}
-            edges = (*(self.found_at or (None, None)), *box)
-            values |= {name: None if edge is None else pixels(edge) for name, edge in zip(_PLACE, edges, strict=True)}
-        values["least"] = self.least
-        for key, numbers in (("expected", self.expected), ("expected_error", self.expected_error)):
-            values[key] = {name: None if math.isnan(number) else digits(number) for name, number in numbers.items()}
-        values["passes"] = self.passes
-        return {**values, "summary": self.summary(), "objects": self.object_rows(), "looks": self.rows()}
+        width, height = self.size
+        return {
+            "picture": self.source,
+            "width": width,
+            "height": height,
+            "target": self.target_name,
+            "targets": [self.classes[label] for label in self.sought],
+            **self._decision_values(),
+            "least": self.least,
+            "expected": _without_nan(self.expected),
+            "expected_error": _without_nan(self.expected_error),
+            "passes": self.passes,
+            "summary": self.summary(),
+            "objects": self.object_rows(),
+            "looks": self.rows(),
+        }
+
+    def _decision_values(self) -> dict[str, Any]:
+        """Make JSON values of the decision, with the point and the box of a found target; empty without one."""
+        decision = self.decision
+        if decision is None:
+            return {}
+        point = (None, None) if self.found_at is None else self.found_at
+        found_box = decision.box if decision.outcome == "found" else None
+        box = [None] * 4 if found_box is None else found_box.tolist()
+        return {
+            "outcome": decision.outcome,
+            "probability": digits(decision.probability),
+            **_rounded_place(*point, *box),
+        }
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """The objects as a table of plain values, one row for each object, most confident first.
+        """Make a table of the objects, of plain values, most confident first.
 
-        `x1`, `y1`, `x2` and `y2` are its box and `x` and `y` the middle of the box, in picture pixels. `look` is the
-        number of the look that shows it most sharply.
+        `x1`, `y1`, `x2` and `y2` are the box of the object and `x` and `y` the middle of the box, in picture pixels.
+        `look` is the number of the look that shows it most sharply.
 
         Returns:
             One dictionary for each object.
         """
         objects = self.objects
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
-        return [
-            {
-                "object": number,
-                "class": self.classes[label],
-                "score": digits(score),
-                "confirmed": sure,
-                **dict(zip(_PLACE, map(pixels, ((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)), strict=True)),
-                "look": look,
-            }
-            for number, (label, score, sure, look, (x1, y1, x2, y2)) in enumerate(
-                zip(*(column.tolist() for column in columns), strict=True)
+        rows = []
+        for label, score, confirmed, look, box in zip(*(column.tolist() for column in columns), strict=True):
+            x1, y1, x2, y2 = box
+            rows.append(
+                {
+                    "object": len(rows),
+                    "class": self.classes[label],
+                    "score": digits(score),
+                    "confirmed": confirmed,
+                    **_rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2),
+                    "look": look,
+                }
             )
-        ]
+        return rows
 
     def to_frame(self, table: _Table = "looks") -> pandas.DataFrame:
-        """A table of the record as a pandas data frame.
+        """Convert a table of the record to a pandas data frame.
 
         Args:
             table: `looks`, the table of `rows`, or `objects`, that of `object_rows`.
@@ -143,7 +197,7 @@ class Conversion(Outcome, OtherWords):
         return pandas.DataFrame(rows, columns=columns)
 
     def to_csv(self, path: str | PathLike[str] | None = None, table: _Table = "looks") -> str:
-        """A table of the record as CSV, with a header.
+        """Convert a table of the record to CSV, with a header.
 
         Args:
             path: the file to write; None writes none.
@@ -164,7 +218,7 @@ class Conversion(Outcome, OtherWords):
         return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> str:
-        """The record as JSON: the values of `to_dict`.
+        """Convert the record to JSON, the values of `to_dict`.
 
         Args:
             path: the file to write; None writes none.
@@ -178,9 +232,12 @@ class Conversion(Outcome, OtherWords):
         return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
 
     def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:
+        """Make the rows and the names of the columns of a table."""
         check(table in get_args(_Table), "table", "looks or objects", table)
-        rows = self.rows() if table == "looks" else self.object_rows()
-        return rows, list(self._columns if table == "objects" else dict.fromkeys(name for row in rows for name in row))
+        if table == "objects":
+            return self.object_rows(), list(self._columns)
+        rows = self.rows()
+        return rows, list(dict.fromkeys(name for row in rows for name in row))
 
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
@@ -205,7 +262,11 @@ class Conversion(Outcome, OtherWords):
         return named_detections(objects.boxes, objects.labels, objects.scores, self.classes[1:], data)
 
     def to_torchvision(self) -> dict[str, Tensor]:
-        """The objects as torchvision's detectors and `torchmetrics` have them: boxes, labels from 1, and scores."""
+        """Convert the objects to what torchvision's detectors return and `torchmetrics` takes.
+
+        Returns:
+            `boxes` `(M, 4)`, `labels` `(M,)` from 1, and `scores` `(M,)`.
+        """
         objects = self.objects
         return {"boxes": objects.boxes.clone(), "labels": objects.labels.clone(), "scores": objects.scores.clone()}
 
@@ -225,21 +286,32 @@ class Conversion(Outcome, OtherWords):
         Raises:
             InputError: the class of an object has no category.
         """
-        objects, names = self.objects, self.classes[1:]
         if categories is None:
             categories = coco_categories()
-            category_names = {canonical_name(str(each["name"])) for each in categories}
-            strange = [name for name in names if canonical_name(name) not in category_names]
-            check(not strange, "categories", "those of the annotation file, for classes that COCO has not",
-                  f"None with the class {', '.join(strange[:3])}")  # fmt: skip
-        if any(isinstance(each, Mapping) for each in categories):
-            present = sorted(set(objects.labels.tolist()))
+            self._check_classes_in(categories)
+        objects = self.objects
+        return coco_results(image_id, objects.boxes, objects.labels, objects.scores, self._category_ids(categories))
+
+    def _check_classes_in(self, categories: Sequence[Mapping[str, Any]]) -> None:
+        """Raise `InputError` unless all classes are among COCO's own categories."""
+        known = {canonical_name(str(category["name"])) for category in categories}
+        strange = [name for name in self.classes[1:] if canonical_name(name) not in known]
+        check(
+            not strange,
+            "categories",
+            "those of the annotation file, for classes that COCO has not",
+            f"None with the class {', '.join(strange[:3])}",
+        )
+
+    def _category_ids(self, categories: Sequence[int | str] | Sequence[Mapping[str, Any]]) -> dict[int, int | str]:
+        """Find the category id of each class 1..K, or in categories of a file of each class that an object has."""
+        names = self.classes[1:]
+        if any(isinstance(category, Mapping) for category in categories):
+            present = sorted(set(self.objects.labels.tolist()))
             numbers = category_ids(categories, [names[label - 1] for label in present])
-            ids = dict(zip(present, numbers, strict=True))
-        else:
-            check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
-            ids = dict(enumerate(category_ids(categories), 1))
-        return coco_results(image_id, objects.boxes, objects.labels, objects.scores, ids)
+            return dict(zip(present, numbers, strict=True))
+        check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
+        return dict(enumerate(category_ids(categories), 1))
 
     def to_yolo(self, path: str | PathLike[str] | None = None) -> str:
         """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
@@ -258,8 +330,8 @@ class Conversion(Outcome, OtherWords):
         """
         width, height = self.size
         lines = []
-        for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), self._inside(), strict=True):
-            shares = (x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height
+        for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), self._boxes_inside(), strict=True):
+            shares = ((x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height)
             lines.append(f"{label - 1} {' '.join(f'{share:.6f}' for share in shares)}\n")
         return _written("".join(lines), path)
 
@@ -277,20 +349,29 @@ class Conversion(Outcome, OtherWords):
             InputError: no picture is given, or the record's is not known, or it has another size.
             DataError: the file cannot be read.
         """
-        shown = self.shown if picture is None and self.shown is not None else {}
-        picture = self.source if picture is None else picture
-        if picture is None:
-            raise InputError("picture: expected the picture, as the record does not come from a file, got None")
-        opened, (width, height) = open_large(picture, **shown), self.size
+        opened = self._opened(picture)
+        width, height = self.size
         check(opened.size == (width, height), "picture", f"the record's, {width} × {height} px", opened.size)
         crops = []
-        for x1, y1, x2, y2 in self._inside():
-            left, top = min(int(x1), width - 1), min(int(y1), height - 1)
-            crops.append(opened.read((left, top, max(math.ceil(x2), left + 1), max(math.ceil(y2), top + 1))))
+        for x1, y1, x2, y2 in self._boxes_inside():
+            # A box without area, or at the right or lower border, still has a pixel.
+            left = min(int(x1), width - 1)
+            top = min(int(y1), height - 1)
+            right = max(math.ceil(x2), left + 1)
+            bottom = max(math.ceil(y2), top + 1)
+            crops.append(opened.read((left, top, right, bottom)))
         return crops
 
-    def _inside(self) -> list[list[float]]:
-        """Boxes of the objects, cut at the borders of the picture."""
+    def _opened(self, picture: LargePicture | ImageLike | None) -> LargePicture:
+        """Open a picture, or the file that the record comes from with the values and bands that were shown."""
+        if picture is not None:
+            return open_large(picture)
+        if self.source is None:
+            raise InputError("picture: expected the picture, as the record does not come from a file, got None")
+        return open_large(self.source, **(self.shown or {}))
+
+    def _boxes_inside(self) -> list[list[float]]:
+        """Cut the boxes of the objects at the borders of the picture."""
         width, height = self.size
         return self.objects.boxes.minimum(torch.tensor([width, height] * 2)).clamp(min=0).tolist()
 
@@ -321,45 +402,50 @@ class Conversion(Outcome, OtherWords):
         """
         file = self.source if source is None else fspath(source)
         place = None if file is None else georeference(file)
-        rows = self.object_rows()
-        corners = [
-            [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
-            for row in rows
-        ]
-        if place is None:
-            shapes = [
-                {"type": "Polygon", "coordinates": [[[*point] for point in (*ring, ring[0])]]} for ring in corners
-            ]
-        else:
-            shapes = [box_on_earth(np.array(ring), place) for ring in corners]
-        names = "object", "class", "score", "confirmed", "look"
+        in_pixels = "pixels of the picture: x to the right, y down"
         collection: dict[str, Any] = {
             "type": "FeatureCollection",
-            "coordinates": "longitude and latitude, WGS 84"
-            if place is not None
-            else "pixels of the picture: x to the right, y down",
+            "coordinates": in_pixels if place is None else "longitude and latitude, WGS 84",
             "features": [
                 {
                     "type": "Feature",
-                    "properties": {name: row[name] for name in names},
-                    "geometry": shape,
+                    "properties": {name: row[name] for name in COLUMNS if name not in _PLACE},
+                    "geometry": _geometry(row, place),
                 }
-                for row, shape in zip(rows, shapes, strict=True)
+                for row in self.object_rows()
             ],
         }
         _written(json.dumps(collection, allow_nan=False), path)
         return collection
 
 
+def _geometry(row: Mapping[str, Any], place: PlaceOnEarth | None) -> dict[str, Any]:
+    """Make the GeoJSON geometry of an object's box, on earth or in pixels."""
+    corners = [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
+    if place is not None:
+        return box_on_earth(np.array(corners), place)
+    return {"type": "Polygon", "coordinates": [[[x, y] for x, y in (*corners, corners[0])]]}
+
+
+def _rounded_place(*edges: float | None) -> dict[str, float | None]:
+    """Round a point `x`, `y` and a box `x1`, `y1`, `x2`, `y2` for a table; None stays."""
+    return {name: None if edge is None else pixels(edge) for name, edge in zip(_PLACE, edges, strict=True)}
+
+
+def _without_nan(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Round numbers of classes for JSON, which has no NaN: these become None."""
+    return {name: None if math.isnan(number) else digits(number) for name, number in numbers.items()}
+
+
 def _written(text: str, path: str | PathLike[str] | None) -> str:
-    """The text, after it was written to a file if one is named."""
+    """Return a text, after it was written to a file if one is named."""
     if path is not None:
         write_text(path, text)
     return text
 
 
 def coco_categories() -> list[dict[str, Any]]:
-    """The categories of COCO's annotation files, as torchvision has them."""
+    """Return the categories of COCO's annotation files, as torchvision has them: `id` and `name` of each."""
     from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
     names = FasterRCNN_ResNet50_FPN_Weights.DEFAULT.meta["categories"]

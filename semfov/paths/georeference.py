@@ -15,6 +15,9 @@ from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, needing
 from semfov.io.files import check_regular
 
+PlaceOnEarth = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Longitude and latitude `(N, 2)` of points `(N, 2)` in pixels."""
+
 _GEO_TEXTS = 34737  # tag of the texts of a GeoTIFF, of which some programs make a reference system
 
 

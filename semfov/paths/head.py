@@ -22,9 +22,11 @@ from semfov.io.tables import pixels
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format
+from semfov.paths.kinds import HEAD
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
+from semfov.paths.words import Words
 from semfov.sensor.sphere import Boxes, panorama_directions
 
 _WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
@@ -61,6 +63,42 @@ _FORMAT = Format(
 """Format of the files of paths of eye and head."""
 
 
+class HeadWords(Words):
+    """Words for an episode of eye and head."""
+
+    record: "HeadPath"
+
+    def describe(self) -> str:
+        """Describe the outcome in one line."""
+        record = self.record
+        outcome = self.objects
+        if record.decision is not None:
+            certainty = f"there with probability {record.decision.probability:.2f}"
+            outcome = f"{record.target_name}: {record.decision.outcome} ({certainty})"
+        looks = f"{len(record)} look{'s' if len(record) != 1 else ''}"
+        turns = f"{record.turns} turn{'s' if record.turns != 1 else ''} of the head"
+        return f"{outcome} in {record.seconds[-1]:.1f} s of eye and head: {looks}, {turns}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why it ended, with the time limit of the scene where that ended it."""
+        sentence = super().why_it_ended()
+        if self.record.ending != "duration" or self.record.duration is None:
+            return sentence
+        return f"{sentence.removesuffix('.')}, {self.record.duration:g} s (duration)."
+
+    @property
+    def value(self) -> str:
+        """The unit of the values of looks."""
+        return "the expected gain per second"
+
+    @property
+    def sensor(self) -> str:
+        """The views of the head."""
+        width, height = self.record.views.world.size
+        fields = ", ".join(f"{field:g}" for field in self.record.views.fields)
+        return f"views of {width} × {height} px with fields of view of {fields} degrees"
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class HeadPath(Record):
     """The record of an episode: where eye and head looked, what was seen and what was believed.
@@ -93,7 +131,8 @@ class HeadPath(Record):
     values: tuple[float, ...] = ()
     duration: float | None = None
 
-    how = "head"
+    kind = HEAD
+    _words = HeadWords
     _format = _FORMAT
     _columns = (*COLUMNS, "pan", "tilt")
 
@@ -192,23 +231,6 @@ class HeadPath(Record):
             chosen &= label == self.target
         return self.views.world.places(detections.boxes[0, chosen], self.pose(look)), label[chosen], best[chosen]
 
-    def describe(self) -> str:
-        """Describe the outcome in one line."""
-        looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
-        turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
-        what = self.objects_in_words()
-        if self.decision is not None:
-            there = f"there with probability {self.decision.probability:.2f}"
-            what = f"{self.target_name}: {self.decision.outcome} ({there})"
-        return f"{what} in {self.seconds[-1]:.1f} s of eye and head: {looks}, {turns}"
-
-    def why_it_ended(self) -> str:
-        """Explain in one sentence why it ended, with the time limit of the scene where that ended it."""
-        sentence = super().why_it_ended()
-        if self.ending != "duration" or self.duration is None:
-            return sentence
-        return f"{sentence.removesuffix('.')}, {self.duration:g} s (duration)."
-
     def _looks(self) -> Iterator[RecordedLook]:
         """The looks; regions are the smallest boxes around what they show."""
         world = self.views.world
@@ -262,17 +284,6 @@ class HeadPath(Record):
                 pixels = resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)
             x, y = self.views.view_grid.centres[self.actions[look.number] % self.views.cells].tolist()
             yield LookView(pixels, world.size, self.detections[look.number].boxes[0], (x, y))
-
-    @property
-    def value_in_words(self) -> str:
-        """The unit of the values of looks."""
-        return "the expected gain per second"
-
-    def sensor_in_words(self) -> str:
-        """Describe the views of the head."""
-        wide, high = self.views.world.size
-        fields = ", ".join(f"{field:g}" for field in self.views.fields)
-        return f"views of {wide} × {high} px with fields of view of {fields} degrees"
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         views = self.views

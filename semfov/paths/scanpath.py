@@ -14,14 +14,17 @@ from semfov.belief import Belief, Grid
 from semfov.belief.observers.base import Observer
 from semfov.data.inputs import as_image
 from semfov.data.windowed import LargePicture
+from semfov.decision import Decision
 from semfov.detection.objects import LEAST
 from semfov.episode import STAGES, Step
 from semfov.errors import InputError, check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Text
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
+from semfov.paths.kinds import FOVEA
 from semfov.paths.look import LookView, RecordedLook, cell_columns
 from semfov.paths.stimulus import Stimulus
+from semfov.paths.words import MomentWords, Words
 
 _GRID: dict[str, Json] = {"grid": Array(Number(low=1, high=10_000, whole=True), 2), "size": Array(POSITIVE, 2)}
 """JSON values of a grid in a file."""
@@ -90,7 +93,7 @@ class _CellRecord(Record):
     grid: Grid
     seconds: tuple[Mapping[str, float], ...] = ()
 
-    how = "fovea"
+    kind = FOVEA
 
     _tensors: ClassVar[tuple[str, ...]]
     """Attributes that are tensors of a file; those that are None are left out."""
@@ -125,6 +128,48 @@ class _CellRecord(Record):
         return {**made, "grid": grid, "seconds": tuple(seconds)}
 
 
+class ScanpathWords(Words):
+    """Words for a search or an exploration with a fovea."""
+
+    record: "Scanpath"
+
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, or a `belief` without thresholds."""
+        return "belief" if self.record.ending == "detection" else "probability"
+
+    def describe(self) -> str:
+        """Describe the outcome of the episode in one line."""
+        record = self.record
+        shifts = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
+        if record.target is None:
+            return f"explored with {shifts}: {self.objects}"
+        if record.decision is None:
+            return f"“{record.target_name}” {'found after' if record.found else 'not found in'} {shifts}"
+        if record.closer:
+            shifts += f" and {len(record.closer)} closer look{'s' if len(record.closer) != 1 else ''}"
+        outcome = "not there" if record.decision.outcome == "absent" else record.decision.outcome
+        return f"“{record.target_name}” {outcome} after {shifts} ({self._certainty(record.decision)})"
+
+    def _certainty(self, decision: Decision) -> str:
+        """Say how sure the decision is."""
+        if self.record.ending == "detection":
+            # Beliefs without thresholds are no probabilities in the plain sense.
+            return f"by a detection at the gaze; its belief gives {decision.probability:.2f}"
+        place = "" if decision.place is None else f", {decision.place:.2f} at this place"
+        return f"probability {decision.probability:.2f}{place}"
+
+    @property
+    def lines(self) -> list[str]:
+        """The fixated cells, the first and the last of many, and the grid."""
+        grid = self.record.grid
+        cells = [f"({cell % grid.columns}, {cell // grid.columns})" for cell in self.record.cells.tolist()]
+        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
+        width, height = grid.extent.tolist()
+        cells_of_grid = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
+        return [f"looks at (column, row): {' '.join(path)} of {cells_of_grid}"]
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scanpath(_CellRecord):
     """Fixations of one episode in order, with the detections and the belief at each of them.
@@ -152,6 +197,11 @@ class Scanpath(_CellRecord):
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         scanpath.plot().savefig("scanpath.png")
         scanpath.save("scanpath.safetensors")
+
+    >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
+    >>> Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=torch.arange(2), fixations=none,
+    ...          detections=(), probabilities=none, values=none, found=True).describe()
+    '“cup” found after 1 gaze shift'
     """
 
     cells: Tensor
@@ -162,6 +212,7 @@ class Scanpath(_CellRecord):
     presence: Tensor | None = None
     stimulus: Stimulus | None = None
 
+    _words = ScanpathWords
     _format = _FORMAT
     _tensors = "cells", "fixations", "probabilities", "values", "posterior", "presence"
 
@@ -177,11 +228,6 @@ class Scanpath(_CellRecord):
         """Number of gaze shifts (saccades): fixations after the start."""
         return len(self) - 1
 
-    @property
-    def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, or a `belief` without thresholds."""
-        return "belief" if self.ending == "detection" else "probability"
-
     def views(self) -> list[Tensor]:
         """The foveated photograph at each fixation.
 
@@ -194,35 +240,6 @@ class Scanpath(_CellRecord):
         if self.stimulus is None:
             raise InputError("scanpath: expected one with its stimulus, as an agent makes it, got one without")
         return self.stimulus.views(self.fixations)
-
-    def describe(self) -> str:
-        """Describe the outcome of the episode in one line.
-
-        Returns:
-            The line.
-
-        >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
-        >>> Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=torch.arange(2), fixations=none,
-        ...          detections=(), probabilities=none, values=none, found=True).describe()
-        '“cup” found after 1 gaze shift'
-        """
-        shifts = f"{self.shifts} gaze shift{'s' if self.shifts != 1 else ''}"
-        if self.target is None:
-            return f"explored with {shifts}: {self.objects_in_words()}"
-        name, decision = self.classes[self.target], self.decision
-        if decision is None:
-            return f"“{name}” {'found after' if self.found else 'not found in'} {shifts}"
-        sure = f"probability {decision.probability:.2f}"
-        if self.ending == "detection":
-            # Beliefs without thresholds are no probabilities in the plain sense.
-            sure = f"by a detection at the gaze; its belief gives {decision.probability:.2f}"
-        elif decision.place is not None:
-            sure += f", {decision.place:.2f} at this place"
-        if self.closer:
-            shifts += f" and {len(self.closer)} closer look{'s' if len(self.closer) != 1 else ''}"
-        if decision.outcome == "found":
-            return f"“{name}” found after {shifts} ({sure})"
-        return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"
 
     def _looks(self) -> Iterator[RecordedLook]:
         belief = self.posterior
@@ -265,14 +282,6 @@ class Scanpath(_CellRecord):
         from semfov.report.notebook import scanpath_html
 
         return scanpath_html(self)
-
-    def _lines(self) -> list[str]:
-        grid = self.grid
-        cells = [f"({cell % grid.columns}, {cell // grid.columns})" for cell in self.cells.tolist()]
-        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
-        width, height = grid.extent.tolist()
-        of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
-        return [f"looks at (column, row): {' '.join(path)} of {of}"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
@@ -355,6 +364,25 @@ _FOVEA = Format(
 """Format of the files of moments of a fovea."""
 
 
+class FoveaMomentWords(MomentWords):
+    """Words for one frame that a fovea looks at."""
+
+    record: "FoveaMoment"
+
+    def describe(self) -> str:
+        """Describe belief and decision at the frame in a few words."""
+        highest = float(self.record.probability.max())
+        if self.record.target is None:
+            return f"p(object) up to {highest:.2f}"
+        return self.decision or f"p({self.record.target_name}) up to {highest:.2f}"
+
+    @property
+    def lines(self) -> list[str]:
+        """The frame and the fixated cell."""
+        row, column = divmod(self.record.cell, self.record.grid.columns)
+        return [f"frame {self.record.number}, at (column, row): ({column}, {row})"]
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class FoveaMoment(_CellRecord, Moment):
     """Look, belief and decision at one frame that a fovea looks at.
@@ -386,6 +414,7 @@ class FoveaMoment(_CellRecord, Moment):
     next_cell: int
     belief: Belief | None = field(default=None, compare=False)
 
+    _words = FoveaMomentWords
     _format = _FOVEA
     _tensors = "fixation", "probability", "visited"
     _plain = "number", "cell", "next_cell"
@@ -405,17 +434,6 @@ class FoveaMoment(_CellRecord, Moment):
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """The probability of the target, or of any object, in each cell."""
         return self.grid, self.probability
-
-    def describe(self) -> str:
-        """Describe belief and decision at the frame in a few words."""
-        highest = float(self.probability.max())
-        if self.target is None:
-            return f"p(object) up to {highest:.2f}"
-        return self._decided() or f"p({self.target_name}) up to {highest:.2f}"
-
-    def _lines(self) -> list[str]:
-        row, column = divmod(self.cell, self.grid.columns)
-        return [f"frame {self.number}, at (column, row): ({column}, {row})"]
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,9 @@ from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
+from semfov.paths.kinds import WINDOWS
 from semfov.paths.look import Box, RecordedLook
+from semfov.paths.words import MomentWords, Words
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
 from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.lattice import Lattice
@@ -59,6 +61,133 @@ _VALUES: dict[str, Json] = {
 """JSON values of the files of looks at windows."""
 
 
+class WindowWords(Words):
+    """Words for a search or an exploration with windows."""
+
+    record: "ZoomPath"
+
+    _sentences: ClassVar[Mapping[str, str]] = {
+        "worth": "No remaining look is expected to show enough new objects.",
+        "seconds": "The time was over.",
+        "stopped": "It was stopped.",
+        "windows": "No window is left that can show more.",
+        "detection": "A detection shows the target.",
+        "found": "The probability is high enough, and a detection shows the target.",
+        "absent": "No remaining look is worth a pass, and the target is probably absent.",
+        "undecided": "No remaining look is worth a pass, but the target is too probable to call it absent.",
+        "unseen": "No look shows a candidate: the probability follows from the class's frequency and low score.",
+        "first found": "The first look shows the target closely enough.",
+        "closer found": "A closer look confirmed the target.",
+        "closer absent": "No closer look was sure enough, and the target is probably absent.",
+        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
+    }
+    # `unseen` is for a photograph in which no look shows a place that may hold the target.
+
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
+        return "probability" if self.record.closer or self.record.ending == "decision" else self.measure
+
+    def describe(self) -> str:
+        """Describe the result in one line."""
+        record = self.record
+        looks = f"{record.passes} look{'s' if record.passes != 1 else ''}"
+        if record.decision is not None and record.target is not None:
+            certainty = f"there with probability {record.decision.probability:.2f}"
+            return f"{record.target_name}: {record.decision.outcome} ({certainty}) in {looks}"
+        return f"{self.objects}. {looks}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why it ended, or what a decision without candidates says."""
+        record = self.record
+        decided_in_photograph = record.ending == "decision" and record.lattice.levels == 1 and not record.closer
+        if decided_in_photograph and record.target is not None:
+            shown = [float(look.show[record.target - 1]) for look in record.window_looks]
+            if all(chance < PhotographPlaces.least for chance in shown):
+                return self._sentences["unseen"]
+        return super().why_it_ended()
+
+    @property
+    def objects(self) -> str:
+        """Number of the objects, by class where classes were searched for, and how many to expect in all.
+
+        Such as `36 people found; expect 36 to 54 in all`, or `No cup found`. Without a class to search for no number in
+        all is given, since the small rests of all classes add up to many.
+        """
+        text = super().objects
+        expected = []
+        for label in self.record.sought:
+            limits = self._range(label)
+            if limits is not None:
+                name = f" {plural(self.record.classes[label])}" if len(self.record.sought) > 1 else ""
+                expected.append(f"{_range_in_words(*limits)}{name}")
+        return f"{text}; expect {', '.join(expected)} in all" if expected else text
+
+    def _number_in_all(self, label: int) -> str:
+        """Say from how many to how many objects of a class are expected, in brackets; empty where it is not known."""
+        limits = self._range(label)
+        return "" if limits is None else f" ({_range_in_words(*limits)} in all)"
+
+    def _range(self, label: int) -> tuple[int, int] | None:
+        """Estimate from how many to how many objects of a class are in the picture, by a standard deviation.
+
+        It starts with those that are listed, unless fewer are expected. None where no number is estimated, and where
+        none is listed and less than one is expected.
+        """
+        record = self.record
+        if record.unseen is None:
+            return None
+        mean, variance = record._numbers().get(label, (math.nan, math.nan))
+        listed = len(record.objects.of([label]))
+        if math.isnan(mean) or (not listed and mean < 1):
+            return None
+        error = variance**0.5
+        low = max(round(mean - error), min(listed, round(mean)))
+        high = max(low, round(mean + error))
+        return low, high
+
+    @property
+    def _ending(self) -> str:
+        """End of the summary's first sentence; the number of looks stands before it."""
+        return " (the limit)." if self.record.ending == "passes" else super()._ending
+
+    @property
+    def value(self) -> str:
+        """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
+        searched = self.record.decision is not None
+        by_score = (self.decided_by if searched else self.measure) == "score"
+        if by_score or (self.record.lattice.levels == 1 and not searched):
+            return "the sum of the scores that the first look has in it"
+        if searched:
+            return "the probability that it shows the target, of a wide window at least a share of those in it"
+        return "the expected number of new objects in it, with a share of those that closer looks would then show"
+
+    @property
+    def sensor(self) -> str:
+        """The windows of the lattice and of the closer looks."""
+        lattice = self.record.lattice
+        width, height = lattice.canvas
+        magnifications = {*lattice.magnifications, *(look.window.fixation[2] for look in self.record.window_looks)}
+        names = list(dict.fromkeys(f"{magnification:.2g}" for magnification in sorted(magnifications)))
+        listed = ", ".join(names) if len(names) <= 6 else f"from {names[0]} to {names[-1]}"
+        return f"windows of {width} × {height} px at magnification{'s' if len(names) > 1 else ''} {listed}"
+
+    @property
+    def lines(self) -> list[str]:
+        """The fixations and magnifications of the looks, the first and the last of many."""
+        looks = []
+        for look in self.record:
+            x, y = look.fixation
+            looks.append(f"({x:.0f}, {y:.0f}) × {look.more['magnification']:.2f}")
+        path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
+        width, height = self.record.size
+        return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
+
+
+def _range_in_words(low: int, high: int) -> str:
+    return f"{low} to {high}" if low < high else str(low)
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ZoomPath(Record):
     """The record of a search or an exploration of a large picture.
@@ -97,29 +226,14 @@ class ZoomPath(Record):
     detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
-    how = "windows"
+    kind = WINDOWS
+    _words = WindowWords
     _format = Format("zoom path", _TENSORS, _VALUES)
-    _sentences: ClassVar[Mapping[str, str]] = {
-        "worth": "No remaining look is expected to show enough new objects.",
-        "seconds": "The time was over.",
-        "stopped": "It was stopped.",
-        "windows": "No window is left that can show more.",
-        "detection": "A detection shows the target.",
-        "found": "The probability is high enough, and a detection shows the target.",
-        "absent": "No remaining look is worth a pass, and the target is probably absent.",
-        "undecided": "No remaining look is worth a pass, but the target is too probable to call it absent.",
-        "unseen": "No look shows a candidate: the probability follows from the class's frequency and low score.",
-        "first found": "The first look shows the target closely enough.",
-        "closer found": "A closer look confirmed the target.",
-        "closer absent": "No closer look was sure enough, and the target is probably absent.",
-        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
-    }
-    # `unseen` is for a photograph in which no look shows a place that may hold the target.
 
     def __post_init__(self) -> None:
         """Derive what the looks and the decision tell."""
         object.__setattr__(self, "detections", tuple(look.detections for look in self.window_looks))
-        some = bool(self._sought) and len(self.objects) > 0
+        some = bool(self.sought) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
 
@@ -130,7 +244,7 @@ class ZoomPath(Record):
         It does where objects are listed of which five or more have a probability of one half, or where these make up
         three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
         """
-        return any(self._reacts_to([label]) for label in self._sought or self.candidates.labels.unique().tolist())
+        return any(self._reacts_to([label]) for label in self.sought or self.candidates.labels.unique().tolist())
 
     def _reacts_to(self, labels: Sequence[int]) -> bool:
         return len(self.objects.of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
@@ -147,8 +261,8 @@ class ZoomPath(Record):
         Where the detector hardly reacts to a class, one is estimated in pictures that are like those of the fit alone.
         """
         more, spread = self.unseen or (0.0, 0.0)
-        sought = self._sought or tuple(self.candidates.labels.unique().tolist())
-        counted = {*self._sought, *self.objects.labels.tolist()} if self._familiar else set[int]()
+        sought = self.sought or tuple(self.candidates.labels.unique().tolist())
+        counted = {*self.sought, *self.objects.labels.tolist()} if self._familiar else set[int]()
         chances = {label: self.candidates.of([label]).scores for label in sought}
         sums = {label: float(each.double().sum()) + 1e-9 for label, each in chances.items()}
         numbers = {}
@@ -174,68 +288,6 @@ class ZoomPath(Record):
         """`(width, height)` of the picture in pixels."""
         return self.lattice.size
 
-    @property
-    def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
-        return "probability" if self.closer or self.ending == "decision" else self.measure
-
-    def describe(self) -> str:
-        """Summarise the result."""
-        looks = f"{self.passes} look{'s' if self.passes != 1 else ''}"
-        if self.decision is not None and self.target is not None:
-            outcome = f"{self.decision.outcome} (there with probability {self.decision.probability:.2f})"
-            return f"{self.target_name}: {outcome} in {looks}"
-        return f"{self.objects_in_words()}. {looks}"
-
-    def why_it_ended(self) -> str:
-        """Explain in one sentence why the search or the exploration ended, or what a decision without candidates says.
-
-        Returns:
-            The sentence; empty if the reason is not known.
-        """
-        target, least = self.target, PhotographPlaces.least
-        decided = self.ending == "decision" and self.lattice.levels == 1 and not self.closer
-        if decided and target is not None and all(float(each.show[target - 1]) < least for each in self.window_looks):
-            return self._sentences["unseen"]
-        return super().why_it_ended()
-
-    def objects_in_words(self) -> str:
-        """Count the objects, by class where classes were searched for, and say how many to expect in all.
-
-        Without a class to search for no number in all is given, since the small rests of all classes add up to many.
-
-        Returns:
-            A phrase such as `36 people found; expect 36 to 54 in all`, or `No cup found`.
-        """
-        text = super().objects_in_words()
-        ranges = {label: self._range(label) for label in self._sought}
-        told = [(label, ends) for label, ends in ranges.items() if ends is not None]
-        if not told:
-            return text
-        several = len(ranges) > 1
-        each = [f"{_ends_in_words(*ends)}{f' {plural(self.classes[label])}' * several}" for label, ends in told]
-        return f"{text}; expect {', '.join(each)} in all"
-
-    def _number_in_words(self, label: int) -> str:
-        ends = self._range(label)
-        return "" if ends is None else f" ({_ends_in_words(*ends)} in all)"
-
-    def _range(self, label: int) -> tuple[int, int] | None:
-        """From how many objects of a class to how many are in the picture, by a standard deviation.
-
-        It starts with those that are listed, unless fewer are expected. None where no number is estimated, and where
-        none is listed and less than one is expected.
-        """
-        if self.unseen is None:
-            return None
-        mean, variance = self._numbers().get(label, (math.nan, math.nan))
-        listed = len(self.objects.of([label]))
-        if math.isnan(mean) or (not listed and mean < 1):
-            return None
-        error = variance**0.5
-        low = max(round(mean - error), min(listed, round(mean)))
-        return low, max(low, round(mean + error))
-
     def _looks(self) -> Iterator[RecordedLook]:
         clock = self.seconds or (None,) * len(self.window_looks)
         for number, (look, seconds, value) in enumerate(zip(self.window_looks, clock, self.values, strict=True)):
@@ -243,32 +295,6 @@ class ZoomPath(Record):
             more = {"magnification": window.fixation[2], "level": window.level}
             point, region = window.centre(self.lattice), window.region(self.lattice)
             yield RecordedLook(number, point, region, look.detections, seconds, chosen, more)
-
-    @property
-    def value_in_words(self) -> str:
-        """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
-        searched = self.decision is not None
-        if (self.decided_by if searched else self.measure) == "score" or (self.lattice.levels == 1 and not searched):
-            return "the sum of the scores that the first look has in it"
-        if searched:
-            return "the probability that it shows the target, of a wide window at least a share of those in it"
-        return "the expected number of new objects in it, with a share of those that closer looks would then show"
-
-    def sensor_in_words(self) -> str:
-        """Describe the windows of the lattice and of the closer looks."""
-        wide, high = self.lattice.canvas
-        looked = {*self.lattice.magnifications, *(look.window.fixation[2] for look in self.window_looks)}
-        told = list(dict.fromkeys(f"{magnification:.2g}" for magnification in sorted(looked)))
-        magnifications = ", ".join(told) if len(told) <= 6 else f"from {told[0]} to {told[-1]}"
-        several = "s" if len(told) > 1 else ""
-        return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
-
-    def _lines(self) -> list[str]:
-        points = [(*look.fixation, look.more["magnification"]) for look in self]
-        looks = [f"({x:.0f}, {y:.0f}) × {magnification:.2f}" for x, y, magnification in points]
-        path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
-        width, height = self.size
-        return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
@@ -308,6 +334,22 @@ class ZoomPath(Record):
         }
 
 
+class WindowMomentWords(WindowWords, MomentWords):
+    """Words for one frame whose windows are looked at."""
+
+    record: "WindowMoment"
+
+    def describe(self) -> str:
+        """Describe objects or decision at the frame in a few words."""
+        text = self.decision or self.objects
+        return f"{text}; the camera lost the scene" if self.record.lost else text
+
+    @property
+    def lines(self) -> list[str]:
+        """The frame, and the looks that count at it."""
+        return [f"frame {self.record.number}", *super().lines]
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class WindowMoment(ZoomPath, Moment):
     """The looks that count at one frame whose windows are looked at, and what they show.
@@ -330,6 +372,7 @@ class WindowMoment(ZoomPath, Moment):
     next_window: Window
     lost: bool = False
 
+    _words = WindowMomentWords
     _format = Format("window moment", _TENSORS, {**_VALUES, "number": WHOLE, "next_window": _WINDOW, "lost": Flag()})
 
     @property
@@ -347,14 +390,6 @@ class WindowMoment(ZoomPath, Moment):
         """The window that was looked at in this frame."""
         return self.window_looks[-1].window
 
-    def describe(self) -> str:
-        """Describe objects or decision at the frame in a few words."""
-        known = self._decided() or self.objects_in_words()
-        return f"{known}; the camera lost the scene" if self.lost else known
-
-    def _lines(self) -> list[str]:
-        return [f"frame {self.number}", *super()._lines()]
-
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
         window = {name: getattr(self.next_window, name) for name in _WINDOW_VALUES}
@@ -365,10 +400,6 @@ class WindowMoment(ZoomPath, Moment):
         made = super()._fields(tensors, record, shared)
         window = _window_from(record["next_window"], made["lattice"])
         return {**made, "number": record["number"], "next_window": window, "lost": record.get("lost", False)}
-
-
-def _ends_in_words(low: int, high: int) -> str:
-    return f"{low} to {high}" if low < high else str(low)
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:

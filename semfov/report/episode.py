@@ -119,7 +119,7 @@ def object_data(record: Record) -> Data:
         ],
         "count": len(rows),
         "confirmable": record.confirmable,
-        "turns": record.how == "head",
+        "turns": record.kind.turns,
         "best": None if record.best_place is None else record.best_place[0].tolist(),
     }
 

@@ -48,7 +48,7 @@ def record_html(record: Record) -> str:
             shapes.append(_rect((x1 - turn, y1, x2 - turn, y2), colour, line, title, dashed=dashed))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     sure = ", and confirmed ones green" if record.confirmable else ""
-    key = f"Objects from {record.threshold_in_words} are orange{sure}. " if len(record.objects) else ""
+    key = f"Objects from {record.words.threshold} are orange{sure}. " if len(record.objects) else ""
     key += "The best place, not sure enough, is dashed." if best is not None else ""
     return f"<div>{escape(record.summary())}<br>{drawing}<br>{key}</div>"
 

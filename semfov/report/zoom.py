@@ -34,21 +34,21 @@ def zoom_data(
     reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
     check(reduced, "picture", expected, source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    place = path.best_place_in_words().capitalize()
+    place = path.words.best_place.capitalize()
     reason = f"{path.why_it_ended()}{place and f' {place}.'}".strip()
-    result = f"{path.objects_in_words()}."
+    result = f"{path.words.objects}."
     if path.decision is not None:
-        what = "probability that the picture holds it" if path.decided_by == "probability" else "best score"
+        what = "probability that the picture holds it" if path.words.decided_by == "probability" else "best score"
         result = f"“{path.target_name}” {path.decision.outcome}, {what}: {path.decision.probability:.2f}."
     image = read_region(source, (0, 0, wide, high), path.size, min(width, wide))
     return {
         "name": name,
-        "sensor": path.sensor_in_words(),
+        "sensor": path.words.sensor,
         "decision": f"{result} {reason}".rstrip(),
         "summary": path.describe(),
         "size": [wide, high],
         "target": path.target_name,
-        "values": f"The value of a look is {path.value_in_words}.",
+        "values": f"The value of a look is {path.words.value}.",
         "truth": [] if boxes is None else boxes.tolist(),
         "image": jpeg_uri(image, width, quality),
         "looks": [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)],
@@ -66,11 +66,11 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
     closer = max((each for each in path.closer if each.number == number), key=lambda each: each.place, default=None)
     kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     turned, warm, ends = None, False, [each.seconds for each in path]
-    if number == 0 and path.how != "head" and len(ends) >= 3 and None not in ends:
+    if number == 0 and not path.kind.turns and len(ends) >= 3 and None not in ends:
         # The first look with the warm-up took over three times as long as the others usually did.
         first, *later = [end - start for start, end in pairwise([0.0, *map(float, ends)])]  # type: ignore[arg-type]
         warm = first > 3 * median(later)
-    if path.how == "head":
+    if path.kind.turns:
         pan, tilt, field = (look.more[name] for name in ("pan", "tilt", "field"))
         turned = f"pan {pan:z.0f}°, tilt {tilt:z.0f}°, field of view {field:.0f}°"
     where = f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}" if turned is None else f": {turned}"

@@ -47,7 +47,7 @@ def check_fixation(record: Record, fixation: int) -> int:
 def check_foveal(record: Record) -> None:
     """Raise `InputError` where a record has no belief over cells."""
     got = f"{type(record).__name__} ({record.how})"
-    check(record.how == "fovea", "scanpath", 'the record of a fovea, as how="fovea" makes it', got)
+    check(record.kind.grid, "scanpath", 'the record of a fovea, as how="fovea" makes it', got)
 
 
 def choose_fixations(record: Record, most: int) -> list[int]:

@@ -28,7 +28,7 @@ class LookPath:
         self._outlines: list[tuple[int, Any]] = []
         self._numbers: list[tuple[int, Any]] = []
         width = record.around
-        if record.how != "windows":
+        if record.kind.path:
             points = np.array([look.fixation for look in record]).reshape(-1, 2)
             found = bool(getattr(record, "found", False))
             self.gaze = GazePath(axes, points, record.size, found=found, around=width)

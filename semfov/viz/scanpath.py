@@ -161,7 +161,7 @@ def plot_scanpath(
         entries.append((FOUND, "-", f"confirmed: {name} ({count})"))
     if objects and others:
         rest = "not confirmed: " if count or scanpath.decision is not None else ""
-        entries.append((TARGET, "-", f"{rest}{name} from {scanpath.threshold_in_words} ({others})"))
+        entries.append((TARGET, "-", f"{rest}{name} from {scanpath.words.threshold} ({others})"))
     best = scanpath.best_place
     if objects and best is not None:
         entries.append((FOUND, "--", "best place, not sure enough"))
@@ -285,7 +285,7 @@ def plot_episode(
 
 def _draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
     """Draw the picture, the cells of a fovea, and the true boxes of the target."""
-    believed = record.belief_map(0) if isinstance(record, Record) and record.how == "fovea" else None
+    believed = record.belief_map(0) if isinstance(record, Record) and record.kind.grid else None
     grid = Grid(1, 1, record.size) if believed is None else believed[0]
     draw_image(axes, image, grid)
     draw_grid(axes, grid)

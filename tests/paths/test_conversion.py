@@ -18,7 +18,7 @@ from pycocotools.cocoeval import COCOeval
 from torchvision.utils import draw_bounding_boxes
 
 from semfov import Detections, Grid, InputError
-from semfov.cli.search import _check_places
+from semfov.cli.formats import GeoJson
 from semfov.data.large import open_large
 from tests import small
 from tests.refusals import refused, unusable
@@ -195,8 +195,8 @@ def test_a_system_without_a_place_gives_pixels_and_control_points_a_place(record
     assert "WGS 84" in points["coordinates"]
     ring = points["features"][1]["geometry"]["coordinates"][0]
     np.testing.assert_allclose(ring[0], [11.0, 46.0], atol=1e-8)
-    refused(r"out: expected pictures that all have .*points\.tif with one", _check_places, [*names, None])
-    _check_places([names[0], None])
+    refused(r"out: expected pictures that all have .*points\.tif with one", GeoJson().check_files, [*names, None])
+    GeoJson().check_files([names[0], None])
 
 
 def test_a_georeference_needs_rasterio(record, tmp_path, monkeypatch):

@@ -77,11 +77,11 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     """That of the most probable place, or without closer looks the best score; other searches name none."""
     looks = look((LEFT, 1, 0.2), (RIGHT, 2, 0.25)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.12))
     path = scanpath(*looks, target=1, decision=Decision("undecided", 0.7), least=0.5)
-    assert path.best_place_in_words() == "best place: box 10,10–30,30, score 0.20"
+    assert path.words.best_place == "best place: box 10,10–30,30, score 0.20"
     places = ((LEFT, 0.1, 0.9), (RIGHT, 0.3, 0.7))
     closer = tuple(CloseUp(0, 1, 0, torch.tensor(box), place, presence) for box, place, presence in places)
     path = replace(path, closer=closer)
-    assert path.best_place_in_words() == "best place: box 50,40–70,55, probability 0.30"
+    assert path.words.best_place == "best place: box 50,40–70,55, probability 0.30"
     assert "Best place: box 50,40–70,55, probability 0.30." in repr(path)
     box, probability = path.best_place
     assert (box.tolist(), probability) == (RIGHT, 0.3)
@@ -89,8 +89,8 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     told = _looks_text(path).splitlines()
     assert [line.endswith(", as decided") for line in told if "closer look " in line][:2] == [False, True]
     for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
-        assert replace(path, decision=other).best_place_in_words() == ""
-    assert replace(path, closer=(), detections=(look(), look())).best_place_in_words() == ""
+        assert replace(path, decision=other).words.best_place == ""
+    assert replace(path, closer=(), detections=(look(), look())).words.best_place == ""
 
 
 def test_looks_tell_the_target_first_and_count_detections_from_one_score_on():
@@ -137,7 +137,7 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
     assert path.to_dict()["expected"] == path.to_dict()["expected_error"] == {"cat": None, "cup": None}
     assert replace(path, least=0.5).describe().endswith(": 1 object found")
     assert list(replace(path, target=1).expected) == ["cup"]
-    assert replace(path, targets=(1, 2)).objects_in_words() == "1 cup, 1 cat found"
+    assert replace(path, targets=(1, 2)).words.objects == "1 cup, 1 cat found"
     rows = path.object_rows()
     json.dumps(rows)
     assert rows[0]["class"] == "cat"
@@ -217,12 +217,12 @@ def test_a_number_is_claimed_class_by_class():
     error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
     assert path.expected_error["cup"] == pytest.approx(error**0.5)
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
-    assert path.objects_in_words() == "2 cups, no cat found; expect 2 to 3 cups in all"
+    assert path.words.objects == "2 cups, no cat found; expect 2 to 3 cups in all"
     every = replace(path, targets=())
     # Of all classes only those are counted of which something is listed.
-    assert every.classes_in_words() == "2 cups (2 to 3 in all)"
-    assert replace(every, least=0.1).classes_in_words() == "3 cats, 2 cups (2 to 3 in all)"
-    assert replace(every, unseen=None).classes_in_words() == "2 cups"
+    assert every.words.classes == "2 cups (2 to 3 in all)"
+    assert replace(every, least=0.1).words.classes == "3 cats, 2 cups (2 to 3 in all)"
+    assert replace(every, unseen=None).words.classes == "2 cups"
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])
     values = path.to_dict()

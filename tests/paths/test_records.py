@@ -308,7 +308,7 @@ def test_the_first_look_was_not_chosen_by_a_value(make):
     ],
 )
 def test_a_record_tells_what_the_number_of_its_decision_is(record, word):
-    assert record.decided_by == word
+    assert record.words.decided_by == word
 
 
 @pytest.mark.parametrize("make", [zoom_path, head_path])
@@ -360,7 +360,7 @@ def test_a_look_is_at_the_centre_of_what_it_shows(make):
     assert next(iter(record)).fixation == (199.5, 149.5)
 
 
-@pytest.mark.parametrize("sentences", [Scanpath._sentences, ZoomPath._sentences])
+@pytest.mark.parametrize("sentences", [Scanpath._words._sentences, ZoomPath._words._sentences])
 def test_only_a_search_that_found_something_speaks_of_a_confirmed_target(sentences):
     """Closer looks confirm objects from 0.5 on; a decision may ask for more, and then stays undecided beside them."""
     assert [each for each, text in sentences.items() if "confirmed" in text] == ["closer found"]

@@ -122,7 +122,7 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     last = path.window_looks[2]
     near = [replace(last, window=replace(last.window, fixation=(0, 0, 1.5 + more))) for more in range(4)]
     for looks, told in ((near[:1], "magnifications 0.25, 0.5, 1, 1.5"), (near, "magnifications from 0.25 to 4.5")):
-        assert replace(path, window_looks=(*path.window_looks[:2], *looks)).sensor_in_words().endswith(told)
+        assert replace(path, window_looks=(*path.window_looks[:2], *looks)).words.sensor.endswith(told)
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
@@ -194,7 +194,7 @@ def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, dec
 
 def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_path, large_picture):
     path = replace(zoom_path, decision=Decision("undecided", 0.6), ending="passes")
-    place = path.best_place_in_words()
+    place = path.words.best_place
     assert place
     data = zoom_data(path, large_picture, name="field.png")
     assert f" {place.capitalize()}." in data["decision"]

@@ -237,7 +237,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, p
     same_looks(moments, path)
     assert moments[-1].decision is None
     assert (moments[-1].target, moments[-1].targets) == (path.target, path.targets)
-    assert moments[-1].describe() == moments[-1].objects_in_words() == path.objects_in_words()
+    assert moments[-1].describe() == moments[-1].words.objects == path.words.objects
 
 
 @pytest.mark.parametrize("kind", ["closely", "plain", "slices"])

@@ -1,0 +1,159 @@
+"""The words for a record: what was found, why it ended, and what its numbers are."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping
+from typing import ClassVar
+
+from semfov.data.classes import counted
+from semfov.detection.objects import box_text
+from semfov.paths.outcome import Outcome
+
+
+class Words(ABC):
+    """Words for a record; each kind of record has its own (`Record.words`).
+
+    Args:
+        record: the record.
+
+    Example::
+
+        words = agent.find_all("harbour.tif", "person").words
+        print(words.objects, words.threshold, words.why_it_ended())
+    """
+
+    _sentences: ClassVar[Mapping[str, str]] = {
+        "box": "The gaze is on a box of the target.",
+        "detection": "A detection shows the target at the gaze.",
+        "worth": "No look is expected to classify enough more cells correctly.",
+        "cells": "Every cell was fixated.",
+        "duration": "The next look would end after the time limit of the scene.",
+        "seconds": "The time was over.",
+        "stopped": "It was stopped.",
+        "found": "The target is probable enough, and was looked at closely enough.",
+        "absent": "No remaining cell is worth a look, and the target is probably absent.",
+        "undecided": "No remaining cell is worth a look, but the target is too probable to call it absent.",
+        "closer found": "A closer look confirmed the target.",
+        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
+    }
+    """Why it ended, by the ending, or by the outcome of the decision that ended the search."""
+
+    def __init__(self, record: Outcome) -> None:
+        self.record = record
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Describe the outcome in one line."""
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of the text form on the looks."""
+        return []
+
+    @property
+    def measure(self) -> str:
+        """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
+        return "score" if self.record.unseen is None else "probability"
+
+    @property
+    def threshold(self) -> str:
+        """From what on objects count, such as `probability 0.5`."""
+        return f"{self.measure} {self.record.least:g}"
+
+    @property
+    def decided_by(self) -> str:
+        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
+        return "probability"
+
+    @property
+    def value(self) -> str:
+        """What the value of a look is, for which it was chosen."""
+        return "the value of the acquisition function at its cell"
+
+    @property
+    def sensor(self) -> str | None:
+        """Through what was looked; None if it is not known."""
+        return None
+
+    @property
+    def objects(self) -> str:
+        """Number of the objects, by class where classes were searched for, such as `2 cups, no cat found`."""
+        record = self.record
+        labels = record.objects.labels
+        counts = [counted(int((labels == label).sum()), record.classes[label]) for label in record.sought]
+        text = f"{', '.join(counts) or counted(len(labels), 'object')} found"
+        return text[0].upper() + text[1:]
+
+    @property
+    def classes(self) -> str:
+        """Number of the objects by class, the most frequent first, and how many of each to expect in all."""
+        counts = Counter(self.record.objects.labels.tolist()).most_common()
+        return ", ".join(
+            f"{counted(count, self.record.classes[label])}{self._number_in_all(label)}" for label, count in counts
+        )
+
+    def _number_in_all(self, label: int) -> str:
+        """Say how many objects of a class to expect, in brackets; empty where it is not known."""
+        return ""
+
+    @property
+    def best_place(self) -> str:
+        """The most likely place of the target of an undecided search; empty for others and without one."""
+        place = self.record.best_place
+        if place is None:
+            return ""
+        box, number = place
+        measure = "probability" if self.record.closer else self.measure
+        return f"best place: box {box_text(box.tolist())}, {measure} {number:.2f}"
+
+    def why_it_ended(self) -> str:
+        """Explain in one sentence why the search or the exploration ended.
+
+        Returns:
+            The sentence; empty if the reason is not known.
+        """
+        record = self.record
+        if record.closer and record.found:
+            return self._why_found_closely()
+        if record.ending == "decision" and record.decision is not None:
+            outcome = record.decision.outcome
+            looked_closer = any(look.number != 0 for look in record.closer)
+            name = f"closer {outcome}" if looked_closer else outcome
+            return self._sentences.get(name, self._sentences[outcome])
+        if record.ending == "shifts":
+            return f"All {len(record) - 1} gaze shifts were made."
+        if record.ending == "passes":
+            return f"All {record.passes} passes were used." if record.passes != 1 else "The only pass was used."
+        return self._sentences.get(record.ending or "", "")
+
+    def _why_found_closely(self) -> str:
+        """Say that a closer look found the target; with windows as large as the picture the first look is one."""
+        decision = self.record.decision
+        box = None if decision is None else decision.box
+        numbers = [look.number for look in self.record.closer if box is not None and look.box.equal(box)]
+        sentence = self._sentences["closer found"]
+        return self._sentences.get("first found", sentence) if numbers == [0] else sentence
+
+    def summary(self) -> str:
+        """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""
+        text = self.describe() + self._ending
+        place = self.best_place.capitalize()
+        return f"{text} {place}." if place else text
+
+    @property
+    def _ending(self) -> str:
+        """End of the summary's first sentence, and why it ended."""
+        return f". {self.why_it_ended()}".rstrip()
+
+
+class MomentWords(Words):
+    """Words for one frame of a stream."""
+
+    @property
+    def decision(self) -> str | None:
+        """The decision in a few words; None without one."""
+        decision = self.record.decision
+        if decision is None:
+            return None
+        place = "" if decision.place is None else f" (there {decision.place:.2f})"
+        return f"{self.record.target_name}: {decision.outcome}, p {decision.probability:.2f}{place}"
