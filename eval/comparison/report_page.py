@@ -17,7 +17,8 @@ from eval.comparison.summary import LAST_COLUMN, Curve, curve_rows
 from semfov.metrics.episodes import FloatArray
 from semfov.paths.stimulus import Stimulus
 from semfov.report.episode import Data, episode_data
-from semfov.report.page import table_html, write_page
+from semfov.report.markup import table_html
+from semfov.report.page import write_page
 from semfov.runs.config import WHERE
 from semfov.runs.results import ResultRecord
 

@@ -21,8 +21,8 @@ from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.files import check_writable, plain_name
 from semfov.paths.gaze import GazePrediction
-from semfov.report.gaze import gaze_part, write_gaze_page
-from semfov.report.page import page_path
+from semfov.report.gaze import gaze_page_html, gaze_part
+from semfov.report.template import page_path, write_html
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 
@@ -128,7 +128,7 @@ class _GazeJob:
             parts = [each["part"] for each in outcomes]
             for number, part in zip(sorted(self.outcomes), parts, strict=True):
                 part["picture"]["name"] = names[number]
-            written.append(write_gaze_page(self.options.report, "semfov: where people look", parts))
+            written.append(write_html(self.options.report, gaze_page_html("semfov: where people look", parts)))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
 
 

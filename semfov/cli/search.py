@@ -45,7 +45,7 @@ from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.paths import Record
 from semfov.report import write_page
-from semfov.report.page import page_path
+from semfov.report.template import page_path
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.runs.workers import Where, run_tasks

@@ -24,7 +24,7 @@ from semfov.paths import Scanpath
 from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.viz.animation import render
-from semfov.viz.scanpath import plot_fixation
+from semfov.viz.look import plot_fixation
 
 _FIRST = torch.tensor([0])
 

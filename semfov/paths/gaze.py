@@ -342,10 +342,11 @@ class GazePrediction(OtherWords):
             InputError: the file does not end in `.html` or `.htm`, or an argument is out of range.
             DataError: the file cannot be written.
         """
-        from semfov.report.gaze import gaze_part, write_gaze_page
+        from semfov.report.gaze import gaze_page_html, gaze_part
+        from semfov.report.template import write_html
 
         part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed))
-        return write_gaze_page(path, f"semfov: where people look in {self.name}", [part])
+        return write_html(Path(path), gaze_page_html(f"semfov: where people look in {self.name}", [part]))
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
         """Write drawn scanpaths as a table that `semfov.data.fixations.read_table` reads.

@@ -3,18 +3,15 @@
 import base64
 from collections.abc import Sequence
 from html import escape
-from os import PathLike
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
-from semfov.io.files import write_text
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
-from semfov.report.page import colour_steps, filled, page_path
+from semfov.report.template import colour_steps, filled
 from semfov.viz.style import COLOURS, overlay_colours
 
 _WIDTH, _QUALITY = 960, 80
@@ -22,71 +19,98 @@ _MOST_STEPS = 12  # largest number of fixations of the slider
 
 
 def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
-    """What the page has of a prediction: maps relative to their largest values as bytes, contours, drawn scanpaths."""
+    """Collect what the page has of a prediction, as JSON values.
+
+    Args:
+        prediction: the prediction.
+        scanpaths: drawn scanpaths of viewers.
+
+    Returns:
+        `picture`, for the script: maps relative to their largest values as bytes, contours and scanpaths; and `facts`,
+        HTML.
+    """
     steps = min(max(map(len, scanpaths)), _MOST_STEPS)
     maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
-    relative = [(each / each.max() * 255).round().byte() for each in maps]
     picture = {
         "name": prediction.name,
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
-        "maps": [base64.b64encode(each.numpy().tobytes()).decode() for each in relative],
-        "contours": [_contours(each, prediction.size) for each in maps],
-        "paths": [[[round(x, 1), round(y, 1)] for x, y in each.points.tolist()] for each in scanpaths],
+        "maps": [_bytes_of_map(density) for density in maps],
+        "contours": [_contours(density, prediction.size) for density in maps],
+        "paths": [[[round(x, 1), round(y, 1)] for x, y in path.points.tolist()] for path in scanpaths],
     }
     return {"picture": picture, "facts": _facts(prediction)}
 
 
-def write_gaze_page(path: str | PathLike[str], title: str, parts: Sequence[Data]) -> Path:
-    """Write the page of one or several pictures; the path must end in `.html` or `.htm`."""
-    path = page_path(Path(path))
-    write_text(path, gaze_page_html(title, parts))
-    return path
+def _bytes_of_map(density: Tensor) -> str:
+    """Encode a density relative to its largest value as bytes, in base 64."""
+    relative = (density / density.max() * 255).round().byte()
+    return base64.b64encode(relative.numpy().tobytes()).decode()
 
 
 def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
-    """Make the page of one or several pictures."""
+    """Make the page of one or several pictures.
+
+    Args:
+        title: plain text.
+        parts: the pictures, from `gaze_part`.
+
+    Returns:
+        The HTML of the page.
+    """
     data = {
-        "pictures": [each["picture"] for each in parts],
+        "pictures": [part["picture"] for part in parts],
         "heat": colour_steps(overlay_colours()),
         "colours": list(COLOURS),
     }
-    contents = {
-        "title": escape(title),
-        "facts": "".join(
-            f'<section class="facts-of" id="facts-{number}"><h2>{escape(each["picture"]["name"])}</h2>'
-            f"{each['facts']}</section>"
-            for number, each in enumerate(parts)
-        ),
-    }
-    return filled("gaze", data, contents)
+    facts = [
+        f'<section class="facts-of" id="facts-{number}"><h2>{escape(part["picture"]["name"])}</h2>'
+        f"{part['facts']}</section>"
+        for number, part in enumerate(parts)
+    ]
+    return filled("gaze", data, {"title": escape(title), "facts": "".join(facts)})
 
 
 _MASSES = (0.8, 0.5, 0.25)  # shares of all fixations that the smallest regions inside the contours hold
 
 
 def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
-    """SVG paths around the smallest regions that hold given shares of all fixations, in pixels of the picture."""
+    """Draw the borders of the smallest regions that hold given shares of all fixations.
+
+    Args:
+        cells: `(rows, columns)`, the density.
+        size: `(width, height)` of the picture in pixels.
+
+    Returns:
+        An SVG path in pixels of the picture for each share.
+    """
     from contourpy import contour_generator
 
     values: NDArray[np.float64] = cells.double().numpy()
+    width, height = size
     rows, columns = values.shape
-    x = (np.arange(-1, columns + 1) + 0.5) * size[0] / columns
-    y = (np.arange(-1, rows + 1) + 0.5) * size[1] / rows
+    x = (np.arange(-1, columns + 1) + 0.5) * width / columns
+    y = (np.arange(-1, rows + 1) + 0.5) * height / rows
     # An edge of zeros closes the contours at the border of the picture.
-    made = contour_generator(x.clip(0, size[0]), y.clip(0, size[1]), np.pad(values, 1))
+    generator = contour_generator(x.clip(0, width), y.clip(0, height), np.pad(values, 1))
     ordered = np.sort(values.reshape(-1))[::-1]
-    levels = [ordered[min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)] for mass in _MASSES]
-    lines: list[list[NDArray[np.float64]]] = [made.lines(level) for level in levels]  # type: ignore[misc]
-    return [
-        "".join("M" + "L".join(f"{px:.0f},{py:.0f}" for px, py in line.tolist()) + "Z" for line in several)
-        for several in lines
-    ]
+    paths = []
+    for mass in _MASSES:
+        # The smallest region with this mass has the cells of the highest densities.
+        last = min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)
+        lines: list[NDArray[np.float64]] = generator.lines(ordered[last])  # type: ignore[assignment]
+        paths.append("".join(_svg_path(line) for line in lines))
+    return paths
+
+
+def _svg_path(line: NDArray[np.float64]) -> str:
+    """Draw a closed line through points `(n, 2)`."""
+    return "M" + "L".join(f"{x:.0f},{y:.0f}" for x, y in line.tolist()) + "Z"
 
 
 def _facts(prediction: GazePrediction) -> str:
-    """What is known of a picture without the script: entropy, terms, and places in order."""
+    """Tell what is known of a picture without the script: entropy, terms, and places in order."""
     bits = ", ".join(f"{name} {value:.2f}" for name, value in prediction.parts.items())
     rows = "".join(
         f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{100 * peak['share']:.1f} %</td></tr>"

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from html import escape
 
+from torch import Tensor
+
 from semfov.paths import Record, Scanpath
 from semfov.report.episode import episode_data, jpeg_uri
 from semfov.report.page import page_html
@@ -21,39 +23,80 @@ _QUALITY = 75  # of the photograph, a JPEG
 
 
 def record_html(record: Record) -> str:
-    """Draw the windows of the looks, numbered in their order, and the objects on the photograph, as HTML."""
+    """Draw the windows of the looks, numbered in their order, and the objects on the photograph.
+
+    Args:
+        record: the record.
+
+    Returns:
+        HTML, with the summary above the drawing and a key below it.
+    """
     width, height = record.size
-    unit = max(width, height) / _WIDTH
-    shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
-    if record.image is not None:
-        size = f'width="{width}" height="{height}" preserveAspectRatio="none"'
-        shapes = [f'<image href="{jpeg_uri(record.image, _WIDTH, _QUALITY)}" {size}/>']
+    unit = max(width, height) / _WIDTH  # pixels of the picture in about a pixel of the screen
+    shapes = [_photograph(record), *_window_shapes(record, unit), *_object_shapes(record, unit)]
+    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
+    return f"<div>{escape(record.summary())}<br>{drawing}<br>{_key(record)}</div>"
+
+
+def _photograph(record: Record) -> str:
+    """Place the photograph, or a grey rectangle where it was not kept."""
+    width, height = record.size
+    if record.image is None:
+        return f'<rect width="{width}" height="{height}" fill="#eee"/>'
+    uri = jpeg_uri(record.image, _WIDTH, _QUALITY)
+    return f'<image href="{uri}" width="{width}" height="{height}" preserveAspectRatio="none"/>'
+
+
+def _window_shapes(record: Record, unit: float) -> list[str]:
+    """Draw what each look shows that is not the whole picture, with its number."""
+    shapes = []
     for look in record:
         if record.is_whole(look.region):
             continue
         x1, y1 = look.region[:2]
         shapes.append(_rect(look.region, GAZE, unit))
-        at = f'x="{x1 + 3 * unit:.0f}" y="{y1 + 11 * unit:.0f}"'
+        place = f'x="{x1 + 3 * unit:.0f}" y="{y1 + 11 * unit:.0f}"'
         style = f'font-size="{11 * unit:.0f}" fill="{GAZE}" stroke="#fff" stroke-width="{3 * unit:.1f}"'
-        shapes.append(f'<text {at} {style} paint-order="stroke">{look.number}</text>')
-    rows, best, sides = record.object_rows()[:_MOST], record.best_place, ("x1", "y1", "x2", "y2")
-    marks = [
-        ([row[side] for side in sides], f"{row['class']} {row['score']:.2f}", row["confirmed"], False) for row in rows
-    ]
-    marks += [] if best is None else [(best[0].tolist(), f"best place {best[1]:.2f}", True, True)]
-    for (x1, y1, x2, y2), name, green, dashed in marks:
-        title = f"<title>{escape(name)}{', confirmed' * (green and not dashed)}</title>"
-        colour, line = (FOUND, 2 * unit) if green else (TARGET, 1.2 * unit)
-        for turn in (0, width) if x2 > width else (0,):
-            shapes.append(_rect((x1 - turn, y1, x2 - turn, y2), colour, line, title, dashed=dashed))
-    drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{_WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
-    sure = ", and confirmed ones green" if record.confirmable else ""
-    key = f"Objects from {record.words.threshold} are orange{sure}. " if len(record.objects) else ""
-    key += "The best place, not sure enough, is dashed." if best is not None else ""
-    return f"<div>{escape(record.summary())}<br>{drawing}<br>{key}</div>"
+        shapes.append(f'<text {place} {style} paint-order="stroke">{look.number}</text>')
+    return shapes
+
+
+def _object_shapes(record: Record, unit: float) -> list[str]:
+    """Draw the objects, confirmed ones in another colour, and the best place, dashed; both at both ends of a seam."""
+    width = record.size[0]
+    shapes = []
+    for row in record.object_rows()[:_MOST]:
+        name = escape(f"{row['class']} {row['score']:.2f}")
+        title = f"<title>{name}{', confirmed' * row['confirmed']}</title>"
+        colour, line = (FOUND, 2 * unit) if row["confirmed"] else (TARGET, 1.2 * unit)
+        box = (row["x1"], row["y1"], row["x2"], row["y2"])
+        shapes += [_rect(part, colour, line, title) for part in _at_both_ends(box, width)]
+    if record.best_place is not None:
+        place, chance = record.best_place
+        title = f"<title>best place {chance:.2f}</title>"
+        shapes += [_rect(box, FOUND, 2 * unit, title, dashed=True) for box in _at_both_ends(place.tolist(), width)]
+    return shapes
+
+
+def _at_both_ends(box: Sequence[float], width: float) -> list[tuple[float, float, float, float]]:
+    """Repeat a box that crosses the seam of a panorama at its other end."""
+    x1, y1, x2, y2 = box
+    return [(x1 - shift, y1, x2 - shift, y2) for shift in ((0, width) if x2 > width else (0,))]
+
+
+def _key(record: Record) -> str:
+    """Explain the colours of the boxes."""
+    key = ""
+    if len(record.objects):
+        confirmed = ", and confirmed ones green" if record.confirmable else ""
+        key = f"Objects from {record.words.threshold} are orange{confirmed}. "
+    if record.best_place is not None:
+        key += "The best place, not sure enough, is dashed."
+    return key
 
 
 def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", *, dashed: bool = False) -> str:
+    """Draw a box with a line of some width, and HTML inside."""
     x1, y1, x2, y2 = box
     side = f'x="{x1:.1f}" y="{y1:.1f}" width="{x2 - x1:.1f}" height="{y2 - y1:.1f}"'
     stroke = f'stroke="{colour}" stroke-width="{line:.1f}"'
@@ -62,21 +105,35 @@ def _rect(box: Sequence[float], colour: str, line: float, inside: str = "", *, d
 
 
 def scanpath_html(scanpath: Scanpath) -> str:
-    """The page to step through in a frame; a short text where the page would be too large."""
+    """Make the page of a scanpath in a frame, with pictures as fine as fit; a short text where none fit.
+
+    Args:
+        scanpath: the scanpath.
+
+    Returns:
+        HTML of at most `_MOST_CHARACTERS`.
+    """
     # Maps of classes fit beside those of background and entropy, and the acquisition values.
     cells = len(scanpath) * len(scanpath.grid)
-    room, bytes_of_map = _MAPS - 8 * cells, 4 * cells / 3
-    classes, words = min(len(scanpath.classes) - 1, int(room / bytes_of_map - 2)), scanpath.describe()
-    views = None if scanpath.stimulus is None or classes < 1 else scanpath.views()
-    name = "{} × {} px".format(*scanpath.size)
-    for width, quality in _FINENESS if classes >= 1 else ():
-        data = episode_data(scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality)
-        frame = (
-            f'<iframe title="{escape(words)}" sandbox="allow-scripts" loading="lazy" '
-            f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
-            f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
-        )
-        if len(frame.encode()) <= _MOST_CHARACTERS:
-            return frame
+    bytes_of_map = 4 * cells / 3
+    classes = min(len(scanpath.classes) - 1, int((_MAPS - 8 * cells) / bytes_of_map - 2))
+    if classes >= 1:
+        views = None if scanpath.stimulus is None else scanpath.views()
+        for width, quality in _FINENESS:
+            frame = _frame(scanpath, views, classes, width, quality)
+            if len(frame.encode()) <= _MOST_CHARACTERS:
+                return frame
     text = escape(repr(scanpath))
     return f"<pre>{text}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"
+
+
+def _frame(scanpath: Scanpath, views: Sequence[Tensor] | None, classes: int, width: int, quality: int) -> str:
+    """Make the page of a scanpath in a frame that shares nothing with the notebook."""
+    name = "{} × {} px".format(*scanpath.size)
+    data = episode_data(scanpath, scanpath.image, views, name=name, classes=classes, width=width, quality=quality)
+    words = scanpath.describe()
+    return (
+        f'<iframe title="{escape(words)}" sandbox="allow-scripts" loading="lazy" '
+        f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
+        f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
+    )

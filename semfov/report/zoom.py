@@ -9,6 +9,7 @@ from torch import Tensor
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
+from semfov.decision import CloseUp
 from semfov.errors import check
 from semfov.paths import Record, RecordedLook
 from semfov.paths.look import CONFIDENT, LookView, read_region
@@ -27,98 +28,165 @@ def zoom_data(
     width: int = 1280,
     quality: int = 75,
 ) -> Data:
-    """Collect the data of looks at a picture for a page, as JSON; each look at the resolution of the detector."""
-    source = open_large(photograph_of(path, None) if picture is None else picture)
-    wide, high = path.size
-    expected = f"the picture of the record, {wide} × {high} px, or a reduced one"
-    reduced = source.size[0] <= wide and abs(source.size[0] * high - source.size[1] * wide) <= max(wide, high)
-    check(reduced, "picture", expected, source.size)
+    """Collect the data of looks at a picture for a page, as JSON; each look at the resolution of the detector.
+
+    Args:
+        path: the record.
+        picture: the picture in full size or reduced; None takes the one that the record keeps.
+        name: name of the picture.
+        boxes: `(M, 4)`, true boxes of the target.
+        width: width in pixels to which the picture is reduced.
+        quality: of the JPEGs.
+
+    Returns:
+        The data, for `semfov.report.write_page`.
+
+    Raises:
+        InputError: the picture is not that of the record, or was not kept, or there is no look.
+    """
+    source = _opened(path, picture)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    place = path.words.best_place.capitalize()
-    reason = f"{path.why_it_ended()}{place and f' {place}.'}".strip()
-    result = f"{path.words.objects}."
-    if path.decision is not None:
-        what = "probability that the picture holds it" if path.words.decided_by == "probability" else "best score"
-        result = f"“{path.target_name}” {path.decision.outcome}, {what}: {path.decision.probability:.2f}."
-    image = read_region(source, (0, 0, wide, high), path.size, min(width, wide))
+    whole = (0, 0, *path.size)
+    image = read_region(source, whole, path.size, min(width, path.size[0]))
+    looks = [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)]
     return {
         "name": name,
         "sensor": path.words.sensor,
-        "decision": f"{result} {reason}".rstrip(),
+        "decision": _outcome_in_words(path),
         "summary": path.describe(),
-        "size": [wide, high],
+        "size": list(path.size),
         "target": path.target_name,
         "values": f"The value of a look is {path.words.value}.",
         "truth": [] if boxes is None else boxes.tolist(),
         "image": jpeg_uri(image, width, quality),
-        "looks": [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)],
+        "looks": looks,
         **object_data(path),
     }
 
 
+def _opened(path: Record, picture: LargePicture | ImageLike | None) -> LargePicture:
+    """Open the picture of a record, or a reduced one with the same proportions up to a pixel."""
+    source = open_large(photograph_of(path, None) if picture is None else picture)
+    width, height = path.size
+    across, down = source.size
+    same_proportions = abs(across * height - down * width) <= max(width, height)
+    expected = f"the picture of the record, {width} × {height} px, or a reduced one"
+    check(across <= width and same_proportions, "picture", expected, source.size)
+    return source
+
+
+def _outcome_in_words(path: Record) -> str:
+    """Tell the decision or the objects, why the record ended, and the best place of doubt."""
+    result = f"{path.words.objects}."
+    if path.decision is not None:
+        by_probability = path.words.decided_by == "probability"
+        measure = "probability that the picture holds it" if by_probability else "best score"
+        result = f"“{path.target_name}” {path.decision.outcome}, {measure}: {path.decision.probability:.2f}."
+    place = path.words.best_place.capitalize()
+    sentences = [result, path.why_it_ended(), f"{place}." if place else ""]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
 def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Data:
-    """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
-    (x, y), number, (x1, _, x2, _) = look.fixation, look.number, look.region
-    whole = path.is_whole(look.region)
+    """Tell of a look its window, the value for which it was chosen, its detections and what it shows most sharply."""
+    x1, _, x2, _ = look.region
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
     detections = _detections(path, look, view)
-    brought = Counter(path.classes[label] for label in path.objects.labels[path.objects.passes == number].tolist())
-    closer = max((each for each in path.closer if each.number == number), key=lambda each: each.place, default=None)
-    kinds = ", ".join(f"{count} × {label}" for label, count in brought.most_common())
-    turned, warm, ends = None, False, [each.seconds for each in path]
-    if number == 0 and not path.kind.turns and len(ends) >= 3 and None not in ends:
-        # The first look with the warm-up took over three times as long as the others usually did.
-        first, *later = [end - start for start, end in pairwise([0.0, *map(float, ends)])]  # type: ignore[arg-type]
-        warm = first > 3 * median(later)
-    if path.kind.turns:
-        pan, tilt, field = (look.more[name] for name in ("pan", "tilt", "field"))
-        turned = f"pan {pan:z.0f}°, tilt {tilt:z.0f}°, field of view {field:.0f}°"
-    where = f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}" if turned is None else f": {turned}"
-    where = ", at the whole picture" if whole else where
-    sentences = [f"Look {number} of {len(path) - 1}{where}."]
-    if look.value is not None:
-        sentences.append(f"Its value was {look.value:.2g}.")
-    if closer is not None:
-        sentences.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
-    sentences.append(f"Objects that no look shows more sharply: {kinds or 'none'}.")
+    closer = _closer_look(path, look)
+    turned = _pose_in_words(look) if path.kind.turns else None
+    brought = _brought_in_words(path, look)
     return {
         "view": jpeg_uri(view.pixels, max(1, round((x2 - x1) * magnification)), quality),
         "box": [round(side) for side in look.region],
         "size": list(view.size),
-        "whole": whole,
+        "whole": path.is_whole(look.region),
         "turned": turned,
-        "warm": warm,
+        "warm": look.number == 0 and _warmed_up(path),
         "magnification": magnification,
         "value": look.value,
         "seconds": look.seconds,
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
-        "brought": kinds or "none",
-        "status": " ".join(sentences),
+        "brought": brought,
+        "status": " ".join(
+            [
+                f"Look {look.number} of {len(path) - 1}{_where_in_words(path, look, magnification, turned)}.",
+                *([] if look.value is None else [f"Its value was {look.value:.2g}."]),
+                *([] if closer is None else [_closer_in_words(closer)]),
+                f"Objects that no look shows more sharply: {brought}.",
+            ]
+        ),
     }
 
 
+def _closer_look(path: Record, look: RecordedLook) -> CloseUp | None:
+    """Find the closer look that a look is, of several the surest; None for others."""
+    closer = [close_up for close_up in path.closer if close_up.number == look.number]
+    return max(closer, key=lambda close_up: close_up.place, default=None)
+
+
+def _closer_in_words(closer: CloseUp) -> str:
+    return f"It is a closer look: the target is there with a probability of {closer.place:.2f}."
+
+
+def _brought_in_words(path: Record, look: RecordedLook) -> str:
+    """Count the objects by class that no look shows more sharply."""
+    labels = path.objects.labels[path.objects.passes == look.number].tolist()
+    counts = Counter(path.classes[label] for label in labels)
+    return ", ".join(f"{count} × {name}" for name, count in counts.most_common()) or "none"
+
+
+def _pose_in_words(look: RecordedLook) -> str:
+    """Tell the pose of the head in a look."""
+    more = look.more
+    return f"pan {more['pan']:z.0f}°, tilt {more['tilt']:z.0f}°, field of view {more['field']:.0f}°"
+
+
+def _where_in_words(path: Record, look: RecordedLook, magnification: float, turned: str | None) -> str:
+    """Tell where a look was: at the whole picture, at a point, or in the pose of a head."""
+    if path.is_whole(look.region):
+        return ", at the whole picture"
+    if turned is not None:
+        return f": {turned}"
+    x, y = look.fixation
+    return f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}"
+
+
+def _warmed_up(path: Record) -> bool:
+    """Tell whether the first look seems to include the warm-up of the detector: over three times the usual time.
+
+    On the clock of a head there is no warm-up, and of fewer than three looks none is usual.
+    """
+    ends = [look.seconds for look in path if look.seconds is not None]
+    if path.kind.turns or len(path) < 3 or len(ends) < len(path):
+        return False
+    first, *later = [end - start for start, end in pairwise([0.0, *ends])]
+    return first > 3 * median(later)
+
+
 def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
-    """Detections of a look, those of the target first, with boxes and labels in the unit of the view."""
-    detections, rows = look.detections, []
-    columns = zip(
-        view.boxes.tolist(),
-        detections.boxes[0].tolist(),
-        detections.class_scores[0],
-        detections.labels[0].tolist(),
-        detections.confidence[0].tolist(),
-        strict=True,
-    )
-    for box, place, own, label, score in columns:
+    """Tell the detections of a look, those of the target first, with boxes and labels in the unit of the view."""
+    detections = look.detections
+    rows = []
+    for number, score in enumerate(detections.confidence[0].tolist()):
+        label = int(detections.labels[0, number])
         # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label and float(own[path.target - 1]) >= CONFIDENT:
-            label, score = path.target, float(own[path.target - 1])
+        if path.target is not None and label:
+            target_score = float(detections.class_scores[0, number, path.target - 1])
+            if target_score >= CONFIDENT:
+                label = path.target
+                score = target_score
         if score >= CONFIDENT:
-            first = label == path.target
-            rows.append((first, score, {"box": box, "place": place, "label": path.classes[label], "score": score}))
+            row = {
+                "box": view.boxes[number].tolist(),
+                "place": detections.boxes[0, number].tolist(),
+                "label": path.classes[label],
+                "score": score,
+            }
+            rows.append((label == path.target, score, row))
     rows.sort(key=lambda row: row[:2], reverse=True)
-    entries = [detection for _, _, detection in rows]
+    entries = [entry for _, _, entry in rows]
     # Names would cover small objects. The table has them.
     numbers = [str(number) for number in range(1, min(len(entries), _MOST_DETECTIONS) + 1)]
     return [*tagged(entries[:_MOST_DETECTIONS], numbers, view.size), *entries[_MOST_DETECTIONS:]]

@@ -8,7 +8,8 @@ from semfov.paths.look import CONFIDENT
 from semfov.viz.animation import animate
 from semfov.viz.belief import plot_belief, plot_belief_bars
 from semfov.viz.curves import plot_curves, plot_reliability
-from semfov.viz.scanpath import plot_episode, plot_fixation, plot_foveated_strip, plot_scanpath
+from semfov.viz.look import plot_fixation
+from semfov.viz.scanpath import plot_episode, plot_foveated_strip, plot_scanpath
 from semfov.viz.semantic import plot_semantic_map
 from semfov.viz.style import COLOURS, save_figure
 

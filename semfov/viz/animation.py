@@ -1,5 +1,7 @@
 """Animations of episodes: GIF by Pillow, and MP4 where ffmpeg is installed."""
 
+from __future__ import annotations
+
 import base64
 import io
 import shutil
@@ -8,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +21,12 @@ from semfov.errors import DataError, check
 from semfov.io.files import MADE_HERE, replacing
 from semfov.paths import Record
 from semfov.viz.drawing import photograph_of
-from semfov.viz.scanpath import LookFigure, views_of
+from semfov.viz.look import LookFigure, views_of
 from semfov.viz.style import STYLE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image as PillowImage
 
 _Frame = NDArray[np.uint8]
 
@@ -35,9 +41,11 @@ class Film:
     title: str = ""
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self.frames)
 
     def __repr__(self) -> str:
+        """Return the title and the size."""
         height, width = self.frames[0].shape[:2]
         return f"Film: {self.title}, {len(self)} frames of {width} × {height} px"
 
@@ -54,6 +62,7 @@ class Film:
         return [path, _save_mp4(ffmpeg, self.frames, path.with_suffix(".mp4"), self.seconds, self.hold)]
 
     def _repr_html_(self) -> str:
+        """Show the film in a notebook."""
         from html import escape
 
         file = io.BytesIO()
@@ -109,7 +118,7 @@ def animate(
     return film if path is None else film.save(path)[0]
 
 
-def render(figures: Iterable[Any], dpi: int = 90) -> list[_Frame]:
+def render(figures: Iterable[Figure], dpi: int = 90) -> list[_Frame]:
     """Draw matplotlib figures and return their pixels `(H, W, 3)`; each is drawn before the next is requested."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -122,16 +131,16 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[_Frame]:
     return frames
 
 
-def _write_gif(frames: Sequence[_Frame], file: Any, seconds: float, hold: float) -> None:
+def _write_gif(frames: Sequence[_Frame], file: BinaryIO, seconds: float, hold: float) -> None:
     """Write frames as a GIF with a common palette of 256 colours."""
-    first, *others = _in_one_palette(frames)
+    first, *following = _in_one_palette(frames)
     times = [int(1000 * seconds)] * len(frames)
     times[-1] += int(1000 * hold)
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=times, loop=0, comment=MADE_HERE)
+    first.save(file, format="GIF", save_all=True, append_images=following, duration=times, loop=0, comment=MADE_HERE)
 
 
-def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[Any]:
-    """Frames `(H, W, 3)` as Pillow images with a common palette, without which static parts of a film would flicker."""
+def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[PillowImage]:
+    """Convert frames `(H, W, 3)` to Pillow images with a common palette, without which static parts would flicker."""
     from PIL import Image
 
     chosen = [frames[round(n)] for n in np.linspace(0, len(frames) - 1, min(most, len(frames)))]
@@ -144,9 +153,10 @@ def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[Any]:
 
 
 def _save_mp4(ffmpeg: str, frames: Sequence[_Frame], path: Path, seconds: float, hold: float) -> Path:
+    """Write frames as an MP4 by ffmpeg; the last one is repeated to hold it."""
     height, width = frames[0].shape[:2]
-    stay = 1 + round(hold / seconds)
-    pixels = b"".join(frame.tobytes() for frame in [*frames[:-1], *[frames[-1]] * stay])
+    repeated = 1 + round(hold / seconds)
+    pixels = b"".join(frame.tobytes() for frame in [*frames[:-1], *[frames[-1]] * repeated])
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{1 / seconds:g}", "-i", "-"]
     # Players need even sizes, 4:2:0 colour and more than one frame per second.
     options = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-r", "10", "-f", "mp4"]

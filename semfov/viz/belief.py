@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.errors import InputError, check
 from semfov.paths import Scanpath
 from semfov.viz.drawing import (
@@ -28,14 +30,26 @@ if TYPE_CHECKING:
 
 
 def class_posterior(scanpath: Scanpath, target: int | None = None) -> tuple[Tensor, str]:
-    """Probability of a class in every cell after each look, `(n, X·Y)`, and the name of the class."""
+    """Select the probability of a class in every cell after each look.
+
+    Args:
+        scanpath: the episode.
+        target: index of the class; None takes the class that was searched for, by the belief of the search.
+
+    Returns:
+        `(n, X·Y)`, and the name of the class.
+
+    Raises:
+        InputError: there is no such class.
+    """
     index = scanpath.target if target is None else target
     if index is None:
         raise InputError("target: expected a class index, as nothing was searched for, got None")
     last = len(scanpath.classes) - 1
     check(0 <= index <= last, "target", f"a class index from 0 to {last}", index)
-    own = scanpath.posterior if index == scanpath.target else None
-    posterior = scanpath.probabilities[..., index] if own is None else own
+    posterior = scanpath.posterior if index == scanpath.target else None
+    if posterior is None:
+        posterior = scanpath.probabilities[..., index]
     return posterior.detach().cpu(), scanpath.classes[index]
 
 
@@ -78,18 +92,24 @@ def plot_belief(
     check_foveal(scanpath)
     check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most) if fixation is None else [check_fixation(scanpath, fixation)]
-    grey, (width, height) = scanpath.image if image is None else image, scanpath.grid.extent.tolist()
+    photograph = scanpath.image if image is None else image
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
-    size = max(2.6 * columns, 3.2) + 0.6, max(rows * (2.6 * height / width + 0.3), 2.2)
-    wide, high = size if fixation is None else (5.6, 4.6)
-    figure, panels = make_figure(rows, columns, width=wide, height=high, layout="compressed", axes=axes)
+    figure_width, figure_height = 5.6, 4.6
+    if fixation is None:
+        width, height = scanpath.grid.extent.tolist()
+        figure_width = max(2.6 * columns, 3.2) + 0.6
+        figure_height = max(rows * (2.6 * height / width + 0.3), 2.2)
+    figure, panels = make_figure(
+        rows, columns, width=figure_width, height=figure_height, layout="compressed", axes=axes
+    )
     used = panels[: len(fixations)]
     for panel, number in zip(used, fixations, strict=True):
-        drawn = draw_belief(panel, scanpath, number, target, grey)
+        drawn = draw_belief(panel, scanpath, number, target, photograph)
         if fixation is None:
             panel.set_title(f"fixation {number}: {panel.get_title()}", parse_math=False)
-    draw_scale(used, drawn, f"probability of {class_posterior(scanpath, target)[1]}")
+    _, name = class_posterior(scanpath, target)
+    draw_scale(used, drawn, f"probability of {name}")
     for panel in panels[len(fixations) :]:
         panel.remove()
     return figure
@@ -120,41 +140,56 @@ def plot_belief_bars(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         save_figure(plot_belief_bars(scanpath), "bars.pdf")
     """
-    from matplotlib import colormaps
-    from matplotlib.figure import Figure
-
     check_foveal(scanpath)
     chances, name = class_posterior(scanpath, target)
-    fixations, grid = choose_fixations(scanpath, most), scanpath.grid
+    fixations = choose_fixations(scanpath, most)
     highest = max(float(chances.max()), 1e-9)
-    if axes is None:
-        figure = Figure(figsize=(3.3 * len(fixations) + 0.4, 3.0), layout="constrained")
-        panels: list[Any] = [
-            figure.add_subplot(1, len(fixations), n + 1, projection="3d") for n in range(len(fixations))
-        ]
-    else:
-        check(len(axes) == len(fixations), "axes", f"{len(fixations)} axes, one for each fixation", len(axes))
-        solid = all(hasattr(each, "bar3d") for each in axes)
-        check(solid, "axes", 'axes with projection="3d"', "axes without it")
-        figure, panels = root(axes[0]), list(axes)
-    column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
+    panels = _solid_axes(axes, len(fixations))
     for panel, fixation in zip(panels, fixations, strict=True):
         bars = chances[fixation].numpy()
-        # Rows grow downwards in the picture and backwards in the plot.
-        depth = grid.rows - 1 - row
-        colours = colormaps[PROBABILITY](bars / highest)
-        panel.bar3d(column + 0.1, depth + 0.1, 0, 0.8, 0.8, bars, color=colours, shade=True)
-        panel.view_init(elev=32, azim=-65)
-        panel.set(xlim=(0, grid.columns), ylim=(0, grid.rows), zlim=(0, highest), xlabel="column", ylabel="row")
-        step = max(1, grid.columns // 5), max(1, grid.rows // 5)
-        columns, rows = range(0, grid.columns, step[0]), range(0, grid.rows, step[1])
-        panel.set_xticks([n + 0.5 for n in columns], [str(n) for n in columns])
-        panel.set_yticks([grid.rows - 0.5 - n for n in rows], [str(n) for n in rows])
-        panel.tick_params(labelsize=7, pad=-1)
-        panel.xaxis.labelpad = panel.yaxis.labelpad = -5
-        panel.set_box_aspect((4, 4, 2.6), zoom=1.05)
+        _draw_bars(panel, scanpath.grid, bars, highest)
         panel.set_title(f"fixation {fixation}: p({name}) up to {float(bars.max()):.2f}", parse_math=False)
-    return figure
+    return root(panels[0])
+
+
+def _solid_axes(axes: Sequence[Axes] | None, count: int) -> list[Any]:
+    """Check the given axes in 3D, of which there are `count`, or make a figure with them in a row."""
+    from matplotlib.figure import Figure
+
+    if axes is None:
+        figure = Figure(figsize=(3.3 * count + 0.4, 3.0), layout="constrained")
+        return [figure.add_subplot(1, count, number + 1, projection="3d") for number in range(count)]
+    check(len(axes) == count, "axes", f"{count} axes, one for each fixation", len(axes))
+    are_solid = all(hasattr(panel, "bar3d") for panel in axes)
+    check(are_solid, "axes", 'axes with projection="3d"', "axes without it")
+    return list(axes)
+
+
+def _draw_bars(panel: Any, grid: Grid, bars: NDArray[np.float32], highest: float) -> None:
+    """Draw a bar for each cell.
+
+    Args:
+        panel: axes in 3D.
+        grid: the cells.
+        bars: `(X·Y,)`, heights of the bars.
+        highest: upper end of the scale.
+    """
+    from matplotlib import colormaps
+
+    column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
+    # Rows grow downwards in the picture and backwards in the plot.
+    depth = grid.rows - 1 - row
+    colours = colormaps[PROBABILITY](bars / highest)
+    panel.bar3d(column + 0.1, depth + 0.1, 0, 0.8, 0.8, bars, color=colours, shade=True)
+    panel.view_init(elev=32, azim=-65)
+    panel.set(xlim=(0, grid.columns), ylim=(0, grid.rows), zlim=(0, highest), xlabel="column", ylabel="row")
+    columns = range(0, grid.columns, max(1, grid.columns // 5))
+    rows = range(0, grid.rows, max(1, grid.rows // 5))
+    panel.set_xticks([n + 0.5 for n in columns], [str(n) for n in columns])
+    panel.set_yticks([grid.rows - 0.5 - n for n in rows], [str(n) for n in rows])
+    panel.tick_params(labelsize=7, pad=-1)
+    panel.xaxis.labelpad = panel.yaxis.labelpad = -5
+    panel.set_box_aspect((4, 4, 2.6), zoom=1.05)
 
 
 def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | None, image: Tensor | None) -> AxesImage:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _Curves = Mapping[str, NDArray[np.float64]]
 
+_LEAST_IN_BIN = 20  # predictions of a bin, fewer of which tell little
 _REST = "0.6"  # colour of the curves that the legend does not name
 
 
@@ -58,16 +59,19 @@ def plot_curves(
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
     named = highlighted(curves)
     rest = [name for name in curves if name not in named]
-    for number, name in enumerate(rest):
-        others = f"{len(rest)} other{'s' if len(rest) != 1 else ''}" if number == 0 else None
-        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=_REST, linewidth=0.8, label=others, zorder=1)
+    label_of_rest: str | None = f"{len(rest)} other{'s' if len(rest) != 1 else ''}"
+    for name in rest:
+        shifts = np.arange(len(curves[name]))
+        axes.plot(shifts, 100 * curves[name], color=_REST, linewidth=0.8, label=label_of_rest, zorder=1)
+        label_of_rest = None  # one entry of the legend stands for all
     for order, name in enumerate(named):
-        curve, style = curves[name], line_style(order, len(named))
-        shifts = np.arange(len(curve))
-        axes.plot(shifts, 100 * curve, label=name, linewidth=1.6, **style)
+        style = line_style(order, len(named))
+        shifts = np.arange(len(curves[name]))
+        axes.plot(shifts, 100 * curves[name], label=name, linewidth=1.6, **style)
         error = None if errors is None else errors.get(name)
         if error is not None and np.isfinite(error).all():
-            low, high = 100 * (curve - error), 100 * (curve + error)
+            low = 100 * (curves[name] - error)
+            high = 100 * (curves[name] + error)
             axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
     axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -76,7 +80,8 @@ def plot_curves(
     lines, names = axes.get_legend_handles_labels()
     if len(curves) > len(COLOURS):
         # The grey curves were drawn first, below the others, but come last in the legend.
-        lines, names = [*lines[1:], lines[0]], [*names[1:], names[0]]
+        lines = [*lines[1:], lines[0]]
+        names = [*names[1:], names[0]]
     axes.legend(lines, names, loc="lower right", framealpha=0.9)
     if most is not None:
         axes.set_ylim(0, most)
@@ -84,7 +89,7 @@ def plot_curves(
 
 
 def highlighted(curves: _Curves) -> list[str]:
-    """The curves that a legend names: the highest on average, and random gaze as the reference."""
+    """Choose the curves that a legend names: the highest on average, and random gaze as the reference."""
     order = sorted(curves, key=lambda name: (not name.startswith("random"), -float(np.nanmean(curves[name]))))
     chosen = order[: len(COLOURS)]
     return [name for name in curves if name in chosen]
@@ -115,10 +120,11 @@ def plot_reliability(
     for order, (name, (probabilities, labels)) in enumerate(predictions.items()):
         confidence, predicted = probabilities.detach().cpu().max(-1)
         count, confident, right = reliability(confidence, predicted == labels.cpu(), bins).numpy()
-        filled = count >= 20
+        filled = count >= _LEAST_IN_BIN
         style = line_style(order, len(predictions))
-        at, share = confident[filled] / count[filled], right[filled] / count[filled]
-        above.plot(at, share, marker="o", markersize=4, label=name, **style)
+        mean_confidence = confident[filled] / count[filled]
+        accuracy = right[filled] / count[filled]
+        above.plot(mean_confidence, accuracy, marker="o", markersize=4, label=name, **style)
         below.stairs(count / count.sum(), np.linspace(0, 1, bins + 1), linewidth=1.4, **style)
     above.set(xlim=(0, 1), ylim=(0, 1), ylabel="fraction correct")
     above.legend(loc="upper left")

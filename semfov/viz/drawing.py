@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,22 +23,42 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-_Tag = tuple[LabelBox, str, str]  # a box, the text of its label, and its colour
-_LABEL, _SMALL = 6.5, 5.0  # font sizes of the labels of boxes, of few and of many
+_LABEL = 6.5  # font size of the labels of boxes
+_SMALL = 5.0  # font size of the labels of many boxes
+_LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the luma of Rec. 601
+
+
+class Tag(NamedTuple):
+    """Label of a box: the box, the text, and the colour of both."""
+
+    box: LabelBox
+    text: str
+    colour: str
 
 
 def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor:
-    """The given picture, or the one that the record kept, `(3, h, w)`."""
-    kept = record.image if isinstance(record, Record) else None
+    """Return the given picture, or the one that the record kept.
+
+    Args:
+        record: the record; fixations of people keep no picture.
+        image: a picture of any common kind; None takes the record's.
+
+    Returns:
+        `(3, h, w)`, RGB in [0, 1].
+
+    Raises:
+        InputError: the picture is neither given nor kept.
+    """
     if image is not None:
         return as_image(image)
-    if kept is None:
+    photograph = record.image if isinstance(record, Record) else None
+    if photograph is None:
         raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
-    return kept
+    return photograph
 
 
 def check_fixation(record: Record, fixation: int) -> int:
-    """The number of a look; negative numbers count from the end."""
+    """Return the number of a look; negative numbers count from the end."""
     count = len(record)
     check(-count <= fixation < count, "fixation", f"a number from 0 to {count - 1}, or -1 for the last", fixation)
     return fixation % count
@@ -51,7 +71,7 @@ def check_foveal(record: Record) -> None:
 
 
 def choose_fixations(record: Record, most: int) -> list[int]:
-    """Numbers of at most `most` looks: the first ones and the last."""
+    """List the numbers of at most `most` looks: the first ones and the last."""
     check(most >= 1, "most", "at least 1", most)
     count = len(record)
     return list(range(count)) if count <= most else [*range(most - 1), count - 1]
@@ -66,11 +86,11 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
 
 
 def picture_array(image: Tensor, *, grey: bool = False) -> Any:
-    """A picture `(3, h, w)` as an array for matplotlib; grey is the luma of Rec. 601."""
+    """Convert a picture `(3, h, w)` to an array `(h, w, 3)` for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
     pixels = image.detach().cpu().clamp(0, 1)
     if grey:
-        pixels = (pixels * pixels.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
+        pixels = (pixels * pixels.new_tensor(_LUMA)[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
     return pixels.permute(1, 2, 0).numpy()
 
 
@@ -94,12 +114,14 @@ def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
+    """Draw the borders between the cells of a grid."""
     from matplotlib.collections import LineCollection
 
     width, height = grid.extent.tolist()
-    across = [[(n * width / grid.columns, 0), (n * width / grid.columns, height)] for n in range(1, grid.columns)]
-    down = [[(0, n * height / grid.rows), (width, n * height / grid.rows)] for n in range(1, grid.rows)]
-    axes.add_collection(LineCollection(across + down, colors="white", linewidths=0.4, alpha=0.45), autolim=False)
+    across = [n * width / grid.columns for n in range(1, grid.columns)]
+    down = [n * height / grid.rows for n in range(1, grid.rows)]
+    lines = [[(x, 0), (x, height)] for x in across] + [[(0, y), (width, y)] for y in down]
+    axes.add_collection(LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45), autolim=False)
 
 
 def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: float = 1.2) -> list[Artist]:
@@ -130,41 +152,64 @@ def draw_look(
     target: int | None = None,
     obstacles: Sequence[LabelBox] = (),
 ) -> list[Artist]:
-    """Draw detections, each labelled with its best class other than background; frame `(width, height)`."""
-    tags: list[_Tag] = []
+    """Draw the detections of a look, each labelled with its best class other than background.
+
+    Args:
+        axes: axes that are laid out.
+        detections: a batch of one, with boxes in pixels of the view.
+        classes: names of the classes, background first.
+        frame: `(width, height)` of the view.
+        target: class that was searched for, whose detections have their own colour; None for all.
+        obstacles: rectangles that no label covers.
+
+    Returns:
+        What was drawn.
+    """
+    tags = []
     drawn: list[Artist] = []
-    for box, label, score in zip(
-        detections.boxes[0], detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True
-    ):
+    labels = detections.labels[0].tolist()
+    scores = detections.confidence[0].tolist()
+    for box, label, score in zip(detections.boxes[0], labels, scores, strict=True):
         colour = TARGET if label == target else OTHER
         x1, y1, x2, y2 = box.tolist()
-        tags.append(((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
+        tags.append(Tag((x1, y1, x2, y2), f"{classes[label]} {score:.2f}", colour))
         drawn += draw_boxes(axes, box[None], colour)
     return [*drawn, *draw_tags(axes, tags, frame, obstacles)]
 
 
 def draw_tags(
-    axes: Axes, tags: Sequence[_Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], *, many: bool = False
+    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], *, many: bool = False
 ) -> list[Artist]:
-    """Write the labels of boxes, so that none covers another; the figure must be laid out; frame `(width, height)`."""
+    """Write the labels of boxes, so that none covers another.
+
+    Args:
+        axes: axes that are laid out.
+        tags: the labels.
+        frame: `(width, height)` of the picture.
+        obstacles: rectangles that no label covers.
+        many: whether to write small.
+
+    Returns:
+        What was drawn.
+    """
     points = _SMALL if many else _LABEL
-    sizes = [text_size(axes, text, points) for _, text, _ in tags]
-    places = place_labels([box for box, _, _ in tags], sizes, frame, obstacles)
+    sizes = [text_size(axes, tag.text, points) for tag in tags]
+    places = place_labels([tag.box for tag in tags], sizes, frame, obstacles)
     inset = per_point(axes)
     return [
         axes.text(
             left + inset,
             top + inset,
-            text,
-            color="white" if lightness(colour) < 0.5 else "black",
+            tag.text,
+            color="white" if lightness(tag.colour) < 0.5 else "black",
             fontsize=points,
             va="top",
             clip_on=True,
             parse_math=False,
             zorder=4,
-            bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
+            bbox={"facecolor": tag.colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
         )
-        for (_, text, colour), (left, top, _, _) in zip(tags, places, strict=True)
+        for tag, (left, top, _, _) in zip(tags, places, strict=True)
     ]
 
 
@@ -185,10 +230,11 @@ def _text_width(text: str) -> float:
 
 
 def per_point(axes: Axes) -> float:
-    """Number of units of the axes in a point, once the figure is laid out."""
+    """Measure the number of units of the axes in a point, once the figure is laid out."""
     figure: Any = axes.figure
     box = axes.get_window_extent()
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    left, right = axes.get_xlim()
+    bottom, top = axes.get_ylim()
     # A picture keeps its proportions, so one scale serves both directions.
     return max(abs(right - left) / box.width, abs(top - bottom) / box.height) * figure.dpi / 72
 
@@ -197,4 +243,4 @@ def lightness(colour: Any) -> float:
     """Luma of a colour by Rec. 601, from 0 to 1."""
     from matplotlib.colors import to_rgb
 
-    return float(torch.tensor(to_rgb(colour)) @ torch.tensor([0.299, 0.587, 0.114]))
+    return float(torch.tensor(to_rgb(colour)) @ torch.tensor(_LUMA))

@@ -13,18 +13,40 @@ _Point = tuple[float, float]
 def place_labels(
     boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
-    """Rectangles for labels `(width, height)` of boxes: at a free corner of the box, or further down."""
-    corners = [
-        [(x1, y1), (x1, y2 - high), (x2 - wide, y1), (x2 - wide, y2 - high), (x1, y1 - high), (x1, y2)]
-        for (x1, y1, x2, y2), (wide, high) in zip(boxes, sizes, strict=True)
-    ]
+    """Place labels of boxes at a free corner of the box, or further down.
+
+    Args:
+        boxes: the boxes.
+        sizes: `(width, height)` of each label.
+        frame: `(width, height)` of the picture.
+        obstacles: rectangles that no label covers.
+
+    Returns:
+        The rectangle of each label.
+    """
+    corners = []
+    for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
+        inside = [(x1, y1), (x1, y2 - height), (x2 - width, y1), (x2 - width, y2 - height)]
+        corners.append([*inside, (x1, y1 - height), (x1, y2)])
     return place_within(corners, sizes, frame, obstacles)
 
 
 def place_numbers(
     points: Sequence[_Point], sizes: Sequence[_Size], frame: _Size, reach: float
 ) -> list[LabelBox | None]:
-    """Rectangles for the numbers of points: on the point where there is room, or else near it."""
+    """Place the numbers of points on the point where there is room, or else near it.
+
+    The last point and the first come first, as they matter most. A number covers neither another number nor a point.
+
+    Args:
+        points: the points.
+        sizes: `(width, height)` of each number.
+        frame: `(width, height)` of the picture.
+        reach: largest distance from the point.
+
+    Returns:
+        The rectangle of each number; None where there is no room.
+    """
     placed: list[LabelBox] = []
     places: list[LabelBox | None] = [None] * len(points)
     ends = [len(points) - 1, 0] if len(points) > 1 else [0]
@@ -33,32 +55,58 @@ def place_numbers(
         others = [point for point in points if point != points[number]]
         for x, y in _around(points[number], (width, height), reach):
             label = _into(x - width / 2, y - height / 2, width, height, frame)
-            x1, y1, x2, y2 = label
-            covers = any(boxes_meet(label, each) for each in placed)
-            if not covers and not any(x1 < x < x2 and y1 < y < y2 for x, y in others):
+            covers_label = any(boxes_meet(label, other) for other in placed)
+            if not covers_label and not any(_inside(point, label) for point in others):
                 places[number] = label
                 placed.append(label)
                 break
     return places
 
 
+def _inside(point: _Point, box: LabelBox) -> bool:
+    x, y = point
+    x1, y1, x2, y2 = box
+    return x1 < x < x2 and y1 < y < y2
+
+
 def place_within(
     candidates: Sequence[Iterable[_Point]], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
-    """Rectangles for labels whose first corner may be at any of several points: at a free one, or further down."""
+    """Place labels whose left upper corner may be at any of several points: at a free one, or further down.
+
+    Args:
+        candidates: for each label the points, the best first.
+        sizes: `(width, height)` of each label.
+        frame: `(width, height)` of the picture.
+        obstacles: rectangles that no label covers.
+
+    Returns:
+        The rectangle of each label.
+    """
     placed = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
         inside = [_into(x, y, width, height, frame) for x, y in points]
-        free = (label for label in inside if not any(boxes_meet(label, each) for each in placed))
-        x1, y1, x2, y2 = next(free, inside[0])
-        while covered := [other for other in placed if boxes_meet((x1, y1, x2, y2), other)]:
-            y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1
-        placed.append((x1, y1, x2, y2))
+        free = (label for label in inside if not _covered(label, placed))
+        label = next(free, inside[0])
+        while covered := _covered(label, placed):
+            label = _moved_down(label, max(other[3] for other in covered))
+        placed.append(label)
     return placed[len(obstacles) :]
 
 
+def _covered(label: LabelBox, placed: Sequence[LabelBox]) -> list[LabelBox]:
+    """Find the rectangles that a label would cover."""
+    return [other for other in placed if boxes_meet(label, other)]
+
+
+def _moved_down(label: LabelBox, top: float) -> LabelBox:
+    """Move a label down to a new upper border."""
+    x1, y1, x2, y2 = label
+    return x1, top, x2, top + y2 - y1
+
+
 def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
-    """The point itself, followed by rings of points around it."""
+    """Go through the point itself, and rings of points around it."""
     yield point
     radius = step = 0.6 * max(size)
     while radius <= reach:
@@ -69,5 +117,7 @@ def _around(point: _Point, size: _Size, reach: float) -> Iterator[_Point]:
 
 
 def _into(x: float, y: float, width: float, height: float, frame: _Size) -> LabelBox:
-    x, y = max(0.0, min(x, frame[0] - width)), max(0.0, min(y, frame[1] - height))
+    """Move a label with this left upper corner into the picture."""
+    x = max(0.0, min(x, frame[0] - width))
+    y = max(0.0, min(y, frame[1] - height))
     return x, y, x + width, y + height

@@ -1,9 +1,11 @@
 """The view and belief of an agent drawn into frames of a camera or a video, and video files of such frames."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,14 @@ from torch import Tensor
 from semfov.errors import DataError, needing
 from semfov.io.files import replacing
 from semfov.paths import Moment
+from semfov.paths.look import Box
 from semfov.paths.stimulus import in_bytes
 from semfov.viz.style import FOUND, GAZE, TARGET
 
+if TYPE_CHECKING:
+    from PIL.Image import Image as PillowImage
+
 _Frame = NDArray[np.uint8]
-_Box = tuple[float, float, float, float]
 
 _LONGEST = 640
 _LONGEST_OF_WINDOWS = 1280  # small objects of large frames are to be seen
@@ -32,54 +37,115 @@ def reduced(size: tuple[int, int], longest: int) -> tuple[int, int]:
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str, size: tuple[int, int] | None = None) -> _Frame:
-    """Draw what is known at a frame, and where the next look goes, into the frame `(3, H, W)`; `(h, w, 3)`.
+    """Draw what is known at a frame, and where the next look goes, into the frame.
 
-    The drawing has a `(width, height)`, or None for that of a frame of the video that is written.
+    Args:
+        image: `(3, H, W)`, the frame, of bytes or in [0, 1].
+        moment: the record of the frame.
+        text: line above the drawing.
+        size: `(width, height)` of the drawing; None takes that of a frame of the video that is written.
+
+    Returns:
+        `(h, w, 3)`, bytes.
     """
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image
 
-    (height, width), look, ahead = image.shape[-2:], moment.looks[-1], moment.next_region
-    size = size or reduced((width, height), _LONGEST if ahead is None else _LONGEST_OF_WINDOWS)
+    height, width = image.shape[-2:]
+    if size is None:
+        size = reduced((width, height), _LONGEST if moment.next_region is None else _LONGEST_OF_WINDOWS)
     pixels = in_bytes(image) if image.is_floating_point() else image
     picture = Image.fromarray(pixels.permute(1, 2, 0).cpu().numpy()).resize(size)
-    across, down = size[0] / width, size[1] / height
-
-    def drawn(box: Sequence[float], margin: int = 0) -> _Box:
-        """The box in pixels of the drawing."""
-        x1, y1, x2, y2 = (c * s for c, s in zip(box, (across, down) * 2, strict=True))
-        return min(x1, x2) - margin, min(y1, y2) - margin, max(x1, x2) + margin, max(y1, y2) + margin
-
-    believed = moment.belief_map(look.number)
-    if believed is not None:
-        grid, chances = believed
-        table = chances.detach().float().clamp(0, 1).reshape(grid.rows, grid.columns).cpu().numpy()
-        strength = Image.fromarray((table * 160).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
-        picture.paste(Image.new("RGB", size, TARGET), mask=strength)
-    draw = ImageDraw.Draw(picture)
-    mark: Any = draw.rectangle
-    here = drawn(look.region)
-    if ahead is not None:
-        for box, sure in zip(moment.objects.boxes.tolist(), moment.confirmed.tolist(), strict=True):
-            draw.rectangle(drawn(box), outline=FOUND if sure else TARGET, width=2)
-        draw.rectangle(drawn(ahead), outline=GAZE, width=1)
+    drawing = _MomentDrawing(picture, moment, (size[0] / width, size[1] / height))
+    drawing.draw_belief()
+    if moment.next_region is None:
+        drawing.draw_fixations()
     else:
-        (x, y), (u, v) = (((px + 0.5) * across, (py + 0.5) * down) for px, py in (look.fixation, moment.next_point))
-        draw.line((x, y, u, v), fill=GAZE, width=2)
-        mark, here = draw.ellipse, (x - 9, y - 9, x + 9, y + 9)
-        if moment.examined is not None:
-            mark, here = draw.rectangle, drawn(moment.examined.box.tolist(), 6)
-    mark(here, outline="white", width=5)
-    mark(here, outline=GAZE, width=3)
-    if moment.decision is not None and moment.decision.box is not None:
-        draw.rectangle(drawn(moment.decision.box.tolist()), outline=FOUND, width=3)
-    draw.rectangle((0, 0, size[0], 22), fill="black")
-    # Pillow's own font has no such sign.
-    draw.text((6, 2), text.replace("×", "x"), fill="white", font=ImageFont.load_default(14))
+        drawing.draw_windows(moment.next_region)
+    drawing.draw_decision()
+    drawing.write(text)
     return np.asarray(picture)
 
 
+class _MomentDrawing:
+    """Drawing of a moment into a picture.
+
+    Args:
+        picture: the reduced frame, which is drawn on.
+        moment: the record of the frame.
+        scale: pixels of the drawing for each pixel of the frame, across and down.
+    """
+
+    def __init__(self, picture: PillowImage, moment: Moment, scale: tuple[float, float]) -> None:
+        from PIL import ImageDraw
+
+        self.picture = picture
+        self.moment = moment
+        self.scale = scale
+        self.draw = ImageDraw.Draw(picture)
+
+    def draw_belief(self) -> None:
+        """Draw the probability in each cell, where there is a map."""
+        from PIL import Image
+
+        believed = self.moment.belief_map(self.moment.looks[-1].number)
+        if believed is None:
+            return
+        grid, chances = believed
+        size = self.picture.size
+        table = chances.detach().float().clamp(0, 1).reshape(grid.rows, grid.columns).cpu().numpy()
+        strength = Image.fromarray((table * 160).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+        self.picture.paste(Image.new("RGB", size, TARGET), mask=strength)
+
+    def draw_windows(self, next_region: Box) -> None:
+        """Draw the objects, the next window, and the window of this look."""
+        moment = self.moment
+        for box, confirmed in zip(moment.objects.boxes.tolist(), moment.confirmed.tolist(), strict=True):
+            self.draw.rectangle(self._scaled(box), outline=FOUND if confirmed else TARGET, width=2)
+        self.draw.rectangle(self._scaled(next_region), outline=GAZE, width=1)
+        self._mark(self.draw.rectangle, self._scaled(moment.looks[-1].region))
+
+    def draw_fixations(self) -> None:
+        """Draw a line to the next fixation, and a ring at this one, or a box around what was examined closely."""
+        x, y = self._scaled_point(self.moment.looks[-1].fixation)
+        self.draw.line((x, y, *self._scaled_point(self.moment.next_point)), fill=GAZE, width=2)
+        if self.moment.examined is None:
+            self._mark(self.draw.ellipse, (x - 9, y - 9, x + 9, y + 9))
+        else:
+            self._mark(self.draw.rectangle, self._scaled(self.moment.examined.box.tolist(), 6))
+
+    def draw_decision(self) -> None:
+        """Draw the box of the decision, where there is one."""
+        decision = self.moment.decision
+        if decision is not None and decision.box is not None:
+            self.draw.rectangle(self._scaled(decision.box.tolist()), outline=FOUND, width=3)
+
+    def write(self, text: str) -> None:
+        """Write a line of text at the upper border."""
+        from PIL import ImageFont
+
+        self.draw.rectangle((0, 0, self.picture.size[0], 22), fill="black")
+        # Pillow's own font has no such sign.
+        self.draw.text((6, 2), text.replace("×", "x"), fill="white", font=ImageFont.load_default(14))
+
+    def _mark(self, shape: Callable[..., None], box: Box) -> None:
+        """Draw a shape twice: a light line under a coloured one."""
+        shape(box, outline="white", width=5)
+        shape(box, outline=GAZE, width=3)
+
+    def _scaled(self, box: Sequence[float], margin: int = 0) -> Box:
+        """Convert a box to pixels of the drawing, with a margin."""
+        across, down = self.scale
+        left, right = sorted((box[0] * across, box[2] * across))
+        top, bottom = sorted((box[1] * down, box[3] * down))
+        return left - margin, top - margin, right + margin, bottom + margin
+
+    def _scaled_point(self, point: Sequence[float]) -> tuple[float, float]:
+        """Convert a point to pixels of the drawing."""
+        return (point[0] + 0.5) * self.scale[0], (point[1] + 0.5) * self.scale[1]
+
+
 def video_suffix() -> str:
-    """Suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
+    """Find the suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
     import tempfile
 
     import cv2
@@ -98,7 +164,18 @@ def video_suffix() -> str:
 
 @contextmanager
 def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
-    """Write frames to a video, whole or not at all."""
+    """Open a video to write frames to, whole or not at all.
+
+    Args:
+        path: the file, whose suffix is one of `VIDEO_CODECS`.
+        rate: frames a second.
+
+    Yields:
+        A function that adds a frame `(h, w, 3)`; all have the size of the first one.
+
+    Raises:
+        DataError: OpenCV is not installed, or cannot write such a video.
+    """
     with needing("OpenCV", path, "opencv-python-headless", DataError):
         import cv2
     codec = VIDEO_CODECS[path.suffix.lower()]

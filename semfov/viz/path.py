@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.paths import Record
+from semfov.paths.look import Box
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import LabelBox, place_numbers
 from semfov.viz.style import FOUND, GAZE, TIME
@@ -20,7 +21,15 @@ _POINTS = 6.5
 
 
 class LookPath:
-    """The looks of a record: outlines of what they show, and the path of the gaze or, of windows, their numbers."""
+    """The looks of a record: outlines of what they show, and the path of the gaze or, of windows, their numbers.
+
+    `gaze` is the path; None for windows, whose outlines have numbers instead. `number_boxes` are the rectangles of all
+    numbers, which labels should not cover.
+
+    Args:
+        axes: axes that are laid out.
+        record: the record.
+    """
 
     def __init__(self, axes: Axes, record: Record) -> None:
         self.gaze: GazePath | None = None
@@ -30,29 +39,39 @@ class LookPath:
         width = record.around
         if record.kind.path:
             points = np.array([look.fixation for look in record]).reshape(-1, 2)
-            found = bool(getattr(record, "found", False))
-            self.gaze = GazePath(axes, points, record.size, found=found, around=width)
+            self.gaze = GazePath(axes, points, record.size, found=record.found, around=width)
             self.number_boxes = self.gaze.number_boxes
-        room, middles = 0.025 * record.size[0], list[tuple[float, float]]()
         for look in record:
             border = record.outline(look)
             if border is None:
                 continue
             x, y = border.numpy().T
+            # The picture of a panorama repeats, so that an outline over its seam is drawn at both ends.
             for shift in (0.0,) if width is None else (-width, 0.0, width):
                 (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
                 self._outlines.append((look.number, line))
-            if self.gaze is None:
-                x1, y1, x2, y2 = look.region
-                left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
-                places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
-                # The corner farthest from other numbers, or the middle. Distances beyond the width of a number count
-                # the same, so that the first free corner is taken.
-                far = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in middles)]) for u, v in places]
-                middles.append(places[far.index(max(far))])
-                text = axes.text(*middles[-1], str(look.number), color="white", fontsize=6, ha="center", va="center",
-                                 bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
-                self._numbers.append((look.number, text))
+        if self.gaze is None:
+            self._write_numbers(axes, record)
+
+    def _write_numbers(self, axes: Axes, record: Record) -> None:
+        """Write the number of each look that shows a part of the picture into its outline."""
+        room = 0.025 * record.size[0]
+        middles: list[tuple[float, float]] = []
+        for look in record:
+            if record.outline(look) is None:
+                continue
+            middle = _number_place(look.region, room, middles)
+            text = axes.text(
+                *middle,
+                str(look.number),
+                color="white",
+                fontsize=6,
+                ha="center",
+                va="center",
+                bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8},
+            )
+            middles.append(middle)
+            self._numbers.append((look.number, text))
         self.number_boxes += [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in middles]
 
     def show(self, last: int) -> None:
@@ -65,8 +84,42 @@ class LookPath:
             line.set_linewidth(2.0 if number == last else 0.8)
 
 
+def _number_place(region: Box, room: float, others: list[tuple[float, float]]) -> tuple[float, float]:
+    """Choose where the number of a window stands: at the corner farthest from other numbers, or in the middle.
+
+    Distances beyond the width of a number count the same, so that the first free corner is taken.
+
+    Args:
+        region: `(x1, y1, x2, y2)`, what the look shows.
+        room: width of a number, in pixels of the picture.
+        others: middles of the other numbers.
+
+    Returns:
+        The middle of the number.
+    """
+    x1, y1, x2, y2 = region
+    left = x1 + room / 2
+    right = x2 - room / 2
+    top = y1 + room / 2
+    bottom = y2 - room / 2
+    places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
+    distances = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in others)]) for u, v in places]
+    return places[distances.index(max(distances))]
+
+
 class GazePath:
-    """Saccades as lines and fixations `(n, 2)` as numbered dots, laid out once; lines take the short way `around`."""
+    """Saccades as lines and fixations as numbered dots, laid out once.
+
+    `segments` `(pieces · n, 2, 2)` are the lines in their order, of which each saccade has `pieces`: one, or two around
+    a panorama, which leave it at one end and come back at the other. Row i of `path` and `colours` is a fixation.
+
+    Args:
+        axes: axes that are laid out.
+        fixations: `(n, 2)`, in pixels.
+        frame: `(width, height)` of the picture.
+        found: whether the target was found at the last one.
+        around: width after which the picture repeats; saccades then take the short way.
+    """
 
     def __init__(
         self,
@@ -80,72 +133,89 @@ class GazePath:
         from matplotlib import colormaps
         from matplotlib.collections import LineCollection
 
-        self.path, self.frame, self.found = fixations + 0.5, frame, found
+        self.path = fixations + 0.5
+        self.frame = frame
+        self.found = found
         count = len(self.path)
         self.colours = colormaps[TIME](np.linspace(0, 1, max(count, 2))[:count])
-        before, after = self.path[:-1], self.path[1:]
-        segments = [np.stack([before, after], 1)]
-        if around is not None:
-            way = after - before
-            way[:, 0] = (way[:, 0] + around / 2) % around - around / 2
-            segments = [np.stack([before, before + way], 1), np.stack([after - way, after], 1)]
-        self.segments = np.concatenate(segments, 1).reshape(-1, 2, 2)
-        self.each = len(segments)
-        coloured = np.repeat(self.colours[1:], self.each, 0)
-        self.lines: list[Any] = [
-            axes.add_collection(LineCollection(list(self.segments), colors=colours, linewidths=width), autolim=False)
-            for colours, width in (((1, 1, 1, 0.7), 1.6), (coloured, 0.8))
-        ]
+        pieces = _saccades(self.path, around)
+        self.pieces = len(pieces)
+        self.segments = np.concatenate(pieces, 1).reshape(-1, 2, 2)
+        # A light line below the coloured one shows it on any picture.
+        light = LineCollection(list(self.segments), colors=(1, 1, 1, 0.7), linewidths=1.6)
+        coloured = LineCollection(
+            list(self.segments), colors=np.repeat(self.colours[1:], self.pieces, 0), linewidths=0.8
+        )
+        self.lines: list[Any] = [axes.add_collection(lines, autolim=False) for lines in (light, coloured)]
         x, y = self.path.T
         self.dots = axes.scatter(x, y, s=16, c=self.colours, edgecolors="white", linewidths=0.6, zorder=5)
         self.numbers = self._numbers(axes)
         self.show(count - 1)
 
     def _numbers(self, axes: Axes) -> list[Annotation | None]:
-        scale, count = per_point(axes), len(self.path)
+        """Write the number of each fixation on its dot or near it; None where there is no room."""
+        scale = per_point(axes)
         # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
-        sizes = [((0.64 * len(str(n)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale) for n in range(count)]
+        sizes = [
+            ((0.64 * len(str(number)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale)
+            for number in range(len(self.path))
+        ]
         points = [(float(x), float(y)) for x, y in self.path]
         places = place_numbers(points, sizes, self.frame, 60 * scale)
         self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
-        written: list[Annotation | None] = []
-        for number, (point, place) in enumerate(zip(points, places, strict=True)):
-            if place is None:
-                written.append(None)
-                continue
-            colour = self.colours[number]
-            box = {"boxstyle": "round,pad=0.22,rounding_size=0.5", "facecolor": colour, "edgecolor": "white",
-                   "linewidth": 0.7}  # fmt: skip
-            middle = (place[0] + place[2]) / 2, (place[1] + place[3]) / 2
-            # A line joins a number to its point if it is not written on it.
-            off = max(abs(a - b) for a, b in zip(point, middle, strict=True)) > scale
-            arrow = {"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0}
-            text = axes.annotate(
-                str(number),
-                xy=point,
-                xytext=middle,
-                color="white" if lightness(colour) < 0.55 else "black",
-                fontsize=_POINTS,
-                fontweight="bold",
-                ha="center",
-                va="center",
-                zorder=6,
-                bbox=box,
-                arrowprops=arrow if off else None,
-            )
-            written.append(text)
-        return written
+        return [
+            None if place is None else self._number(axes, number, place, scale) for number, place in enumerate(places)
+        ]
+
+    def _number(self, axes: Axes, number: int, place: LabelBox, scale: float) -> Annotation:
+        """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
+        x, y = self.path[number].tolist()
+        left, top, right, bottom = place
+        middle = ((left + right) / 2, (top + bottom) / 2)
+        is_beside = max(abs(x - middle[0]), abs(y - middle[1])) > scale
+        colour = self.colours[number]
+        line = {"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0}
+        return axes.annotate(
+            str(number),
+            xy=(x, y),
+            xytext=middle,
+            color="white" if lightness(colour) < 0.55 else "black",
+            fontsize=_POINTS,
+            fontweight="bold",
+            ha="center",
+            va="center",
+            zorder=6,
+            bbox={
+                "boxstyle": "round,pad=0.22,rounding_size=0.5",
+                "facecolor": colour,
+                "edgecolor": "white",
+                "linewidth": 0.7,
+            },
+            arrowprops=line if is_beside else None,
+        )
 
     def show(self, last: int) -> None:
         """Show the fixations up to `last`; a frame marks its number, in green if the target was found there."""
         for lines in self.lines:
-            lines.set_segments(list(self.segments[: last * self.each]))
+            lines.set_segments(list(self.segments[: last * self.pieces]))
         self.dots.set_offsets(self.path[: last + 1])
         self.dots.set_facecolor([tuple(colour) for colour in self.colours[: last + 1]])
+        found_here = self.found and last == len(self.path) - 1
         for number, text in enumerate(self.numbers):
-            if text is not None:
-                text.set_visible(number <= last)
-                ends = number == last
-                box: Any = text.get_bbox_patch()
-                found = ends and self.found and last == len(self.path) - 1
-                box.set(edgecolor=FOUND if found else "white", linewidth=1.6 if ends else 0.7)
+            if text is None:
+                continue
+            is_last = number == last
+            text.set_visible(number <= last)
+            frame: Any = text.get_bbox_patch()
+            frame.set(edgecolor=FOUND if is_last and found_here else "white", linewidth=1.6 if is_last else 0.7)
+
+
+def _saccades(path: NDArray[np.float64], around: float | None) -> list[NDArray[np.float64]]:
+    """Make the lines between fixations `(n, 2)`: `(n - 1, 2, 2)`, around a panorama twice, once from each end."""
+    starts = path[:-1]
+    ends = path[1:]
+    if around is None:
+        return [np.stack([starts, ends], 1)]
+    steps = ends - starts
+    steps[:, 0] = (steps[:, 0] + around / 2) % around - around / 2
+    return [np.stack([starts, starts + steps], 1), np.stack([ends - steps, ends], 1)]

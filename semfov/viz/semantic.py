@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,7 +34,10 @@ _NAME_POINTS = 7
 
 
 def cell_entropy(scanpath: Scanpath) -> Tensor:
-    """Entropy in bits of the class of every cell after each look, `(n, X·Y)`; marginals are scaled to sum to 1."""
+    """Compute the entropy in bits of the class of every cell after each look, `(n, X·Y)`.
+
+    Marginal probabilities, as of a learned map, are scaled to sum to 1.
+    """
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
 
@@ -63,24 +66,32 @@ def plot_semantic_map(
         save_figure(plot_semantic_map(scanpath), "map.pdf")
     """
     check_foveal(scanpath)
-    fixation, grid = check_fixation(scanpath, fixation), scanpath.grid
+    number = check_fixation(scanpath, fixation)
     image = scanpath.image if image is None else image
-    width, height = grid.extent.tolist()
-    size = 12.4, 5.6 * height / width + 0.5
-    figure, (named, unsure) = make_figure(1, 2, width=size[0], height=size[1], layout="compressed", axes=axes)
-    drawn = draw_semantic_map(named, scanpath, fixation, image)
-    draw_scale(named, drawn, "probability of the most probable object")
-    if image is not None:
-        draw_image(unsure, image, grid, grey=True)
-    values = cell_entropy(scanpath)
-    style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
-    bits = draw_cells(unsure, grid, values[fixation], alpha=0.65 if image is not None else None, **style)
-    draw_cross(unsure, scanpath.fixations[fixation])
-    unsure.set_title(f"uncertainty after fixation {fixation}")
-    draw_scale(unsure, bits, "entropy (bits)")
+    width, height = scanpath.grid.extent.tolist()
+    figure, (map_axes, entropy_axes) = make_figure(
+        1, 2, width=12.4, height=5.6 * height / width + 0.5, layout="compressed", axes=axes
+    )
+    drawn = draw_semantic_map(map_axes, scanpath, number, image)
+    draw_scale(map_axes, drawn, "probability of the most probable object")
+    drawn = _draw_entropy(entropy_axes, scanpath, number, image)
+    draw_scale(entropy_axes, drawn, "entropy (bits)")
     lay_out(figure)
-    write_names(named, scanpath, fixation)
+    write_names(map_axes, scanpath, number)
     return figure
+
+
+def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
+    """Draw the entropy of every cell over a photograph, on a scale for all fixations."""
+    if image is not None:
+        draw_image(axes, image, scanpath.grid, grey=True)
+    values = cell_entropy(scanpath)
+    alpha = None if image is None else 0.65
+    style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
+    drawn = draw_cells(axes, scanpath.grid, values[fixation], alpha=alpha, **style)
+    draw_cross(axes, scanpath.fixations[fixation])
+    axes.set_title(f"uncertainty after fixation {fixation}")
+    return drawn
 
 
 def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
@@ -100,70 +111,114 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
     from matplotlib.patheffects import withStroke
 
     grid = scanpath.grid
-    named = named_regions(scanpath, fixation)
-    candidates, sizes = [], []
-    for name, region, _ in named:
-        centres = grid.centres[region] + 0.5
+    regions = named_regions(scanpath, fixation)
+    borders = LineCollection([side for _, cells, _ in regions for side in _borders(grid, cells)], colors="white")
+    borders.set(linewidths=1.3, zorder=3)
+    drawn: list[Artist] = [axes.add_collection(borders, autolim=False)]
+    candidates = []
+    sizes = []
+    for name, cells, _ in regions:
+        # The name stands on a cell of the region, as near as there is room to the middle.
+        centres = grid.centres[cells] + 0.5
         order = (centres - centres.mean(0)).norm(dim=-1).argsort(stable=True)
-        wide, high = text_size(axes, name, _NAME_POINTS)
-        candidates.append([(x - wide / 2, y - high / 2) for x, y in centres[order].tolist()])
-        sizes.append((wide, high))
-    width, height = grid.extent.tolist()
-    lines = LineCollection([side for _, region, _ in named for side in _borders(grid, region)], colors="white")
-    lines.set(linewidths=1.3, zorder=3)
-    written: list[Artist] = [axes.add_collection(lines, autolim=False)]
-    for (name, _, _), (x1, y1, x2, y2) in zip(named, place_within(candidates, sizes, (width, height)), strict=True):
+        width, height = text_size(axes, name, _NAME_POINTS)
+        candidates.append([(x - width / 2, y - height / 2) for x, y in centres[order].tolist()])
+        sizes.append((width, height))
+    frame_width, frame_height = grid.extent.tolist()
+    places = place_within(candidates, sizes, (frame_width, frame_height))
+    for (name, _, _), (x1, y1, x2, y2) in zip(regions, places, strict=True):
         text = axes.text((x1 + x2) / 2, (y1 + y2) / 2, name, color="black", fontsize=_NAME_POINTS, clip_on=True)
         text.set(ha="center", va="center", parse_math=False)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
-        written.append(text)
-    return written
+        drawn.append(text)
+    return drawn
 
 
-def _borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
-    """Sides of cells that bound a region."""
-    cells, edges = set(region), grid.edges.tolist()
+_Line = list[tuple[float, float]]
+
+
+def _borders(grid: Grid, region: Sequence[int]) -> list[_Line]:
+    """List the sides of cells that bound a region."""
+    cells = set(region)
+    edges = grid.edges.tolist()
     lines = []
     for cell in region:
-        column, (x1, y1, x2, y2) = cell % grid.columns, edges[cell]
-        sides = (
+        column = cell % grid.columns
+        x1, y1, x2, y2 = edges[cell]
+        neighbours: list[tuple[int | None, _Line]] = [
             (cell - 1 if column else None, [(x1, y1), (x1, y2)]),
             (cell + 1 if column + 1 < grid.columns else None, [(x2, y1), (x2, y2)]),
             (cell - grid.columns, [(x1, y1), (x2, y1)]),
             (cell + grid.columns, [(x1, y2), (x2, y2)]),
-        )
-        lines += [line for beside, line in sides if beside not in cells]
+        ]
+        lines += [side for neighbour, side in neighbours if neighbour not in cells]
     return lines
 
 
-def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
-    """Regions of adjacent cells with one class that beats background and 3 / K, or 0.5: name, cells, probability."""
-    grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
+class Region(NamedTuple):
+    """Region of adjacent cells with one class: its name, the cells, and its highest probability in them."""
+
+    name: str
+    cells: list[int]
+    probability: float
+
+
+def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[Region]:
+    """Find the regions of adjacent cells with one class that is more probable than background.
+
+    The class must also have a probability of 3 / K, or 0.5 where that is more, so that a map without knowledge, in
+    which all classes are equally probable, has no regions.
+
+    Args:
+        scanpath: the episode.
+        fixation: number of the fixation; -1 is the last.
+
+    Returns:
+        The regions, the largest first.
+    """
+    grid = scanpath.grid
+    probabilities = scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)
-    sure = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
-    best = torch.where(sure, label + 1, 0)
-    groups = _regions(best.reshape(grid.rows, grid.columns))
-    named = [(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max())) for cells in groups]
-    return sorted(named, key=lambda region: -len(region[1]))
+    least = min(0.5, 3 / len(scanpath.classes))
+    best = torch.where(objects > probabilities[:, 0].clamp(min=least), label + 1, 0)
+    regions = [
+        Region(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max()))
+        for cells in _regions(best.reshape(grid.rows, grid.columns))
+    ]
+    return sorted(regions, key=lambda region: -len(region.cells))
 
 
 def _regions(labels: Tensor) -> list[list[int]]:
-    """Regions of cells that touch at a side and share a label other than 0; labels `(Y, X)`."""
+    """Find the regions of cells that touch at a side and share a label other than 0.
+
+    Args:
+        labels: `(Y, X)`.
+
+    Returns:
+        The cells of each region in their order.
+    """
     rows, columns = labels.shape
-    flat, seen, groups = labels.flatten().tolist(), set[int](), []
-    for first in range(len(flat)):
-        if flat[first] == 0 or first in seen:
+    flat = labels.flatten().tolist()
+    visited: set[int] = set()
+    regions = []
+    for first, label in enumerate(flat):
+        if label == 0 or first in visited:
             continue
-        region, todo = [], [first]
-        seen.add(first)
-        while todo:
-            cell = todo.pop()
+        region = []
+        waiting = [first]
+        visited.add(first)
+        while waiting:
+            cell = waiting.pop()
             region.append(cell)
-            row, column = divmod(cell, columns)
-            beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-            near = {y * columns + x for y, x in beside if 0 <= y < rows and 0 <= x < columns} - seen
-            same = {other for other in near if flat[other] == flat[first]}
-            seen |= same
-            todo += same
-        groups.append(sorted(region))
-    return groups
+            new = {other for other in _neighbours(cell, rows, columns) - visited if flat[other] == label}
+            visited |= new
+            waiting += new
+        regions.append(sorted(region))
+    return regions
+
+
+def _neighbours(cell: int, rows: int, columns: int) -> set[int]:
+    """List the cells that share a side with a cell."""
+    row, column = divmod(cell, columns)
+    places = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+    return {y * columns + x for y, x in places if 0 <= y < rows and 0 <= x < columns}

@@ -85,17 +85,19 @@ def _show_in_notebook(figure: Figure) -> None:
     from IPython.display import display
     from matplotlib.figure import Figure
 
-    def printed(shown: Figure) -> Any:
-        _waiting[:] = [each for each in _waiting if each is not shown]
+    def print_once(shown: Figure) -> Any:
+        """Print a figure that is the last value of the cell, which then need not wait for the end."""
+        _waiting[:] = [waiting for waiting in _waiting if waiting is not shown]
         return print_figure(shown)
 
     def end_cell() -> None:
+        """Show the figures that the cell has made and not returned."""
         while _waiting:
             display(_waiting.pop(0))
 
     pictures = shell.display_formatter.formatters["image/png"]
     if Figure not in pictures.type_printers:
-        pictures.for_type(Figure, printed)
+        pictures.for_type(Figure, print_once)
         if hasattr(shell, "kernel"):  # a terminal can show no pictures
             shell.events.register("post_execute", end_cell)
     if hasattr(shell, "kernel"):
@@ -117,13 +119,28 @@ def make_figure(
     layout: Literal["constrained", "compressed"] = "constrained",
     axes: Sequence[Axes] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Make a figure of `width` × `height` inches without a window, or use the given axes."""
+    """Make a figure without a window, or use the given axes.
+
+    Args:
+        rows: rows of axes.
+        columns: columns of axes.
+        width: of the figure, in inches.
+        height: of the figure, in inches.
+        ratios: heights of the rows, relative to each other; None for equal ones.
+        layout: Matplotlib's layout.
+        axes: axes to use; None makes them.
+
+    Returns:
+        The figure, and its axes row by row.
+
+    Raises:
+        InputError: there are too few or too many axes.
+    """
     from matplotlib.figure import Figure
 
     if axes is not None:
-        every = list(axes)
-        check(len(every) == rows * columns, "axes", f"{rows * columns} axes", len(every))
-        return root(every[0]), every
+        check(len(axes) == rows * columns, "axes", f"{rows * columns} axes", len(axes))
+        return root(axes[0]), list(axes)
     figure = Figure(figsize=(width, height), layout=layout)
     return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=ratios).flat)
 
@@ -138,7 +155,7 @@ def only(ax: Axes | None) -> list[Axes] | None:
 
 
 def root(axes: Axes) -> Figure:
-    """The figure that contains axes, also where they are in a subfigure."""
+    """Return the figure that contains axes, also where they are in a subfigure."""
     part: Any = axes.figure
     # For a subfigure this is the whole figure, and for a figure it is the figure itself.
     return part.figure
@@ -168,17 +185,17 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
 
     path = Path(path)
     kinds = figure.canvas.get_supported_filetypes()
-    fits = path.suffix[1:].lower() in ("", *kinds)
-    check(fits, "path", f"a file that ends in {', '.join(f'.{kind}' for kind in kinds)}", path.name)
+    kind = path.suffix[1:].lower() or "png"
+    check(kind in kinds, "path", f"a file that ends in {', '.join(f'.{kind}' for kind in kinds)}", path.name)
+    metadata = {"Software": MADE_HERE} if kind == "png" else None
     with rc_context(_FILES), replacing(path) as temporary:
-        kind = path.suffix[1:].lower() or "png"
-        figure.savefig(temporary, dpi=dpi, format=kind, metadata={"Software": MADE_HERE} if kind == "png" else None)
+        figure.savefig(temporary, dpi=dpi, format=kind, metadata=metadata)
     return path
 
 
 @cache
 def overlay_colours() -> Colormap:
-    r"""Colour map of probabilities over a photograph: transparent at 0, with opacity :math:`\alpha = 0.85 \sqrt{p}`."""
+    r"""Make the colour map of probabilities over a photograph, whose opacity is :math:`\alpha = 0.85 \sqrt{p}`."""
     import numpy as np
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
@@ -190,6 +207,6 @@ def overlay_colours() -> Colormap:
 
 
 def line_style(order: int, count: int) -> dict[str, Any]:
-    """Colour and dashes of line `order` of `count` lines; no two are alike, and few lines differ in dashes too."""
+    """Choose colour and dashes of line `order` of `count`; no two are alike, and few lines differ in dashes too."""
     group = len(COLOURS) if count > len(COLOURS) else 2
     return {"color": COLOURS[order % len(COLOURS)], "linestyle": _LINES[order // group % len(_LINES)]}

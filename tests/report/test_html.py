@@ -21,8 +21,9 @@ from semfov.paths import GazePrediction
 from semfov.paths.stimulus import Stimulus, in_bytes
 from semfov.report import notebook, page_html, write_page
 from semfov.report.episode import episode_data
-from semfov.report.gaze import gaze_part, write_gaze_page
-from semfov.report.page import table_html
+from semfov.report.gaze import gaze_page_html, gaze_part
+from semfov.report.markup import table_html
+from semfov.report.template import write_html
 from tests import small
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 from tests.report.test_browser import axe, chromium, pytestmark, watched  # noqa: F401
@@ -233,7 +234,7 @@ def drawn(name, seed=0):
 def opened(chromium, hostile, tmp_path):  # noqa: F811
     """The page of two pictures."""
     pictures = [drawn(hostile), drawn("b.png", seed=1)]
-    path = write_gaze_page(tmp_path / "gaze.html", f"where people look in {hostile}", pictures)
+    path = write_html(tmp_path / "gaze.html", gaze_page_html(f"where people look in {hostile}", pictures))
     with watched(chromium, path) as page:
         yield page
 

@@ -18,7 +18,7 @@ from semfov import DataError, Detections, Grid, viz
 from semfov.data.fixations import Fixations
 from semfov.viz import animate, plot_fixation, plot_scanpath
 from semfov.viz.animation import Film, _in_one_palette, render
-from semfov.viz.scanpath import LookFigure, views_of
+from semfov.viz.look import LookFigure, views_of
 from semfov.viz.style import TIME
 from tests import small
 from tests.refusals import refused

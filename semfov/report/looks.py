@@ -1,0 +1,202 @@
+"""HTML of looks that is complete without the script: the picture with its objects, and a section for each look."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from semfov.detection.objects import box_text
+from semfov.paths.look import CONFIDENT
+from semfov.report.episode import Data
+from semfov.report.markup import facts_html, framed, left_out, picture, rect, table_html
+from semfov.viz.labels import LabelBox, place_labels, place_within
+
+_NAMED = 25  # largest number of objects whose names are shown at first; more would cover the picture
+
+
+def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str]) -> str:
+    """Make the article of a record: the picture with its objects and windows, the list of the objects, and all looks.
+
+    Args:
+        data: data of the record (`semfov.report.zoom.zoom_data`).
+        place: id of the article.
+        objects: HTML of the list of the objects.
+        facts: facts that are shown without the script, by their names; empty for none.
+
+    Returns:
+        HTML.
+    """
+    name = escape(data["name"])
+    noscript = f'<noscript><dl class="facts">{facts_html(facts)}</dl></noscript>' if facts else ""
+    looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
+    view = _view_word(data)
+    names_shown = " checked" if data["count"] <= _NAMED else ""
+    switches = (
+        f'<span class="switches"><label><input type="checkbox" class="windows-shown" checked> {view.title()}s</label> '
+        f'<label><input type="checkbox" class="names-shown"{names_shown}> Names</label></span>'
+    )
+    legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in _legend(data))
+    return (
+        f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>'
+        f'{noscript}<div class="panes"><figure class="overview"><figcaption><ul class="key">{legend}</ul>{switches}'
+        f'</figcaption>{_overview(data, place)}</figure><section class="found-objects" '
+        f'aria-labelledby="{place}-objects"><h4 id="{place}-objects">Objects</h4>{objects}</section></div>'
+        f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
+        f"Click on the number or the border of a {view} to choose its look, or on a row of the list.</p>"
+        f'<div class="looks">{looks}</div>'
+        f'<p class="hint">{data["values"]}</p></article>'
+    )
+
+
+def _view_word(data: Data) -> str:
+    """Say what a look shows: a view of a head, or a window."""
+    return "view" if data["turns"] else "window"
+
+
+def _legend(data: Data) -> list[tuple[str, str]]:
+    """Explain the boxes of the overview that there are: CSS class and text of each kind."""
+    confirmed = [found["confirmed"] for found in data["objects"]]
+    entries = []
+    if not all(confirmed):
+        entries.append(("objects", "object that was found"))
+    if any(confirmed):
+        entries.append(("sure", "confirmed by the decision or a closer look"))
+    if data["best"]:
+        entries.append(("best", "best place, not sure enough"))
+    if not all(look["whole"] for look in data["looks"]):
+        entries.append(("windows", f"{_view_word(data)} of a look, numbered in their order"))
+        entries.append(("now", "the chosen look"))
+    if data["truth"]:
+        entries.append(("truth", "true box"))
+    return entries
+
+
+def _overview(data: Data, place: str) -> str:
+    """Draw the picture with named objects and numbered windows."""
+    width, height = data["size"]
+    unit = max(width, height) / 640  # the drawing is about 640 pixels of the screen wide
+    windows = [(number, look["box"]) for number, look in enumerate(data["looks"]) if not look["whole"]]
+    sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
+    tags = place_labels([_corners(box) for _, box in windows], sizes, (width, height))
+    shapes = [rect(box, "truth") for box in data["truth"]]
+    shapes += _object_shapes(data, unit, tags)
+    if data["best"]:
+        shapes.append(f'<g class="best"><title>best place</title>{framed(data["best"])}</g>')
+    for (number, box), tag in zip(windows, tags, strict=True):
+        x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
+        text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
+        shapes.append(f'<g class="window" data-look="{number}">{framed(box)}{rect(tag, "tag")}{text}</g>')
+    objects = f"{data['count']} object{'s' if data['count'] != 1 else ''}"
+    label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
+    return (
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
+        f"{picture(data['image'], (width, height), f'{place}-picture')}{''.join(shapes)}"
+        f'<g class="chosen"></g></svg>'
+    )
+
+
+def _corners(box: Sequence[float]) -> LabelBox:
+    x1, y1, x2, y2 = box
+    return x1, y1, x2, y2
+
+
+def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> list[str]:
+    """Draw the objects, each with its name at a corner where it covers neither another one nor a number.
+
+    Args:
+        data: data of the record.
+        unit: length in pixels of the picture of about a pixel of the screen.
+        obstacles: rectangles of the numbers of the windows.
+
+    Returns:
+        SVG of each object.
+    """
+    width, height = data["size"]
+    names = [f"{found['label']} {found['score']:.2f}" for found in data["objects"]]
+    sizes = [(unit * (6.3 * len(name) + 4), unit * 13) for name in names]
+    corners = [_corner_places(found["box"], size) for found, size in zip(data["objects"], sizes, strict=True)]
+    places = place_within(corners, sizes, (width, height), obstacles)
+    shapes = []
+    for order, (found, name, where) in enumerate(zip(data["objects"], names, places, strict=True), 1):
+        x = where[0] + 2 * unit
+        y = (where[1] + where[3]) / 2
+        text = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{escape(name)}</text>'
+        kind = "object confirmed" if found["confirmed"] else "object"
+        confirmed = ", confirmed" if found["confirmed"] else ""
+        title = f"<title>{escape(name)}{confirmed}, look {found['look']}</title>"
+        inside = f"{title}{framed(found['box'])}{text}"
+        shapes.append(f'<g class="{kind}" data-look="{found["look"]}" data-object="{order}">{inside}</g>')
+    return shapes
+
+
+def _corner_places(box: Sequence[float], size: tuple[float, float]) -> list[tuple[float, float]]:
+    """List the places of a name of `(width, height)` at the borders of a box and beside it, left upper corners."""
+    x1, y1, x2, y2 = box
+    width, height = size
+    columns = (x1 + width / 2, x2 - width / 2, x1 - width / 2, x2 + width / 2)
+    rows = (y1 - height / 2, y2 + height / 2)
+    return [(x - width / 2, y - height / 2) for x in columns for y in rows]
+
+
+def _look(data: Data, number: int, place: str) -> str:
+    """Make the section of a look: its pixels with its detections, facts, and a table of the detections."""
+    look = data["looks"][number]
+    width, height = look["size"]
+    count = look["count"]
+    label = f"The window of look {number} with {count} detection{'s' if count != 1 else ''}"
+    title = f"Look {number}{': the whole picture' if look['whole'] else ''}"
+    return (
+        f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
+        f'<h4 id="{place}-title">{title}</h4>'
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{label}">'
+        f"{picture(look['view'], (width, height), f'{place}-view')}{_detection_shapes(look, data['target'])}</svg>"
+        f'<dl class="facts">{facts_html(_look_facts(look, number))}</dl>{_detection_table(look, number)}'
+        f"{left_out(count - len(look['detections']), 'detection')}</section>"
+    )
+
+
+def _detection_shapes(look: Data, target: str | None) -> str:
+    """Draw the detections of a look, and over all boxes their numbers."""
+    unit = look["size"][0] / 640
+    boxes, tags = [], []
+    for order, detection in enumerate(look["detections"], 1):
+        kind = "detection target" if detection["label"] == target else "detection"
+        boxes.append(f'<g class="{kind}">{framed(detection["box"])}</g>')
+        left, top, right, bottom = detection["tag"]
+        text = (
+            f'<text x="{left + 4 * unit:.1f}" y="{(top + bottom) / 2:.1f}" font-size="{19 * unit:.1f}" '
+            f'textLength="{max(right - left - 8 * unit, 0):.1f}" lengthAdjust="spacingAndGlyphs">{order}</text>'
+        )
+        tags.append(f'<g class="{kind}">{rect(detection["tag"], "tag")}{text}</g>')
+    return "".join(boxes + tags)
+
+
+def _look_facts(look: Data, number: int) -> dict[str, str]:
+    """Collect the facts about a look by their names."""
+    facts: dict[str, str] = {}
+    if look["turned"] is None:
+        x1, y1, x2, y2 = look["box"]
+        facts["Window"] = f"x {x1} to {x2}, y {y1} to {y2} ({x2 - x1} × {y2 - y1} px)"
+        facts["Magnification"] = f"{look['magnification']:.2g}"
+    else:
+        facts["Head"] = look["turned"]
+    if look["value"] is not None:
+        facts["Value when it was chosen"] = f"{look['value']:.2g}"
+    elif number == 0:
+        facts["Value when it was chosen"] = "none: the first look"
+    facts["Objects that no look shows more sharply"] = look["brought"]
+    if look["seconds"] is not None:
+        warm_up = ", with the warm-up of the detector" if look["warm"] else ""
+        facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"
+    if look["closer"] is not None:
+        facts["Closer look"] = look["closer"]
+    return facts
+
+
+def _detection_table(look: Data, number: int) -> str:
+    """Make the table of the detections of a look."""
+    threshold = f"from score {CONFIDENT:g} on"
+    if not look["detections"]:
+        return f"<p>No detections {threshold}.</p>"
+    rows = [["#", "class", "score", "box"]]
+    for order, detection in enumerate(look["detections"], 1):
+        rows.append([str(order), detection["label"], f"{detection['score']:.2f}", box_text(detection["place"])])
+    return table_html(rows, f"Detections of look {number} {threshold}, with boxes x1,y1–x2,y2 in picture pixels")

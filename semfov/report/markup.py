@@ -1,0 +1,59 @@
+"""HTML of boxes, pictures and tables, which the parts of pages share."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+
+def rect(box: Sequence[float], kind: str) -> str:
+    """Draw a box `(x1, y1, x2, y2)` of a CSS class in an SVG."""
+    x1, y1, x2, y2 = box
+    return f'<rect class="{kind}" x="{x1:g}" y="{y1:g}" width="{max(x2 - x1, 0):g}" height="{max(y2 - y1, 0):g}"/>'
+
+
+def framed(box: Sequence[float]) -> str:
+    """Draw a box twice: a light line under a coloured one."""
+    return rect(box, "under") + rect(box, "over")
+
+
+def picture(uri: str, size: Sequence[float], name: str) -> str:
+    """Place a picture with an id in an SVG, stretched to `(width, height)`."""
+    return f'<image id="{name}" href="{uri}" width="{size[0]}" height="{size[1]}" preserveAspectRatio="none"/>'
+
+
+def facts_html(facts: Mapping[str, str]) -> str:
+    """List facts by their names."""
+    return "".join(f"<div><dt>{name}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts.items())
+
+
+def left_out(count: int, what: str) -> str:
+    """Say how many objects or detections a list leaves out; empty for none."""
+    if not count:
+        return ""
+    return f"<p>{count} less confident {what}{'s are' if count != 1 else ' is'} left out.</p>"
+
+
+def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
+    """Make a table whose first row is its head and whose first column names the rows.
+
+    Args:
+        rows: texts, not escaped.
+        caption: what the table shows.
+
+    Returns:
+        HTML.
+    """
+    first, *others = rows
+    kinds = ["", *[' class="number"'] * (len(first) - 1)]
+    head = "".join(f'<th scope="col"{kind}>{escape(cell)}</th>' for kind, cell in zip(kinds, first, strict=True))
+    body = "".join(f"<tr>{_row(name, numbers)}</tr>" for name, *numbers in others)
+    label = escape(caption)
+    return (
+        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def _row(name: str, numbers: Sequence[str]) -> str:
+    """Make the cells of a row of a table."""
+    cells = "".join(f'<td class="number">{escape(cell)}</td>' for cell in numbers)
+    return f'<th scope="row">{escape(name)}</th>{cells}'

@@ -1,0 +1,211 @@
+"""Parts of a page, one for each record: episodes that the script draws, and looks that stand in the markup.
+
+The data of a part are JSON values, which `semfov.report.episode` and `semfov.report.zoom` collect. A part makes of them
+what the script reads, and the HTML of its places in the page.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from html import escape
+
+from semfov.detection.objects import box_text
+from semfov.report.episode import Data
+from semfov.report.looks import article_html
+from semfov.report.markup import left_out
+
+ABOUT = {
+    "name": "Photograph",
+    "pixels": "Size",
+    "detector": "Detector",
+    "sensor": "Sensor",
+    "passes": "Passes of the detector",
+    "decision": "Outcome",
+}
+"""Entries at the head of a part, by their keys in its data."""
+
+
+def part_of(data: Data, number: int) -> Part:
+    """Make the part of a page from the data of a record.
+
+    Args:
+        data: the data, which have `looks` where these stand in the markup, else `fixations`.
+        number: number of the part in the page.
+
+    Returns:
+        The part.
+    """
+    return LooksPart(data, number) if "looks" in data else EpisodePart(data, number)
+
+
+class Part(ABC):
+    """Part of a page for one record.
+
+    Args:
+        data: the data of the record.
+        number: number of the part in the page.
+    """
+
+    look: str
+    """What a look is called."""
+
+    nearest: str
+    """What the look is called that shows an object most sharply."""
+
+    def __init__(self, data: Data, number: int) -> None:
+        self.data = data
+        self.number = number
+
+    @property
+    @abstractmethod
+    def place(self) -> str:
+        """Start of the ids of its pictures."""
+
+    @property
+    def pictures(self) -> list[str]:
+        """Pictures that the script draws, as data URIs."""
+        return []
+
+    @property
+    def looks_html(self) -> str:
+        """Its article with looks; empty where the script draws them."""
+        return ""
+
+    @property
+    def section_html(self) -> str:
+        """Its section with objects below what the script draws; empty where its article has them."""
+        return ""
+
+    @abstractmethod
+    def script_data(self, numbers: Mapping[str, int]) -> Data:
+        """Make what the script reads; `numbers` are those of the pictures."""
+
+    @abstractmethod
+    def crop_source(self, found: Data) -> tuple[str, float, float]:
+        """Find the picture that shows an object most sharply.
+
+        Args:
+            found: data of the object.
+
+        Returns:
+            The id of the picture, and the place of its left upper corner, x and y in pixels of the record's picture.
+        """
+
+    def objects_html(self) -> str:
+        """List the objects with what their boxes show, most confident first."""
+        objects = self.data["objects"]
+        if not self.data["count"]:
+            return "<p>No objects were found.</p>"
+        heads = ["#", "", "class", "score", self.look, "box"]
+        if self.data["turns"]:
+            heads.insert(heads.index(self.look), "pan, tilt")
+        if self.data["confirmable"]:
+            heads.insert(heads.index("box"), "confirmed")
+        titles = "".join(
+            f'<th scope="col"><button type="button" class="sort">{head}</button></th>' if head else "<td></td>"
+            for head in heads
+        )
+        rows = "".join(self._object_row(order, found) for order, found in enumerate(objects, 1))
+        label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {self.nearest}"
+        return (
+            f'<div class="wide" tabindex="0" role="region" aria-label="{label}"><table class="objects" '
+            f'aria-label="{label}"><thead><tr>{titles}</tr></thead><tbody>{rows}</tbody></table></div>'
+            f"{left_out(self.data['count'] - len(objects), 'object')}"
+        )
+
+    def _object_row(self, order: int, found: Data) -> str:
+        """Make the row of an object in the list."""
+        cells = [escape(found["label"]), f"{found['score']:.2f}"]
+        if self.data["turns"]:
+            cells.append(f"{found['pan']:z.0f}°, {found['tilt']:z.0f}°")
+        cells.append(str(found["look"]))
+        if self.data["confirmable"]:
+            cells.append("yes" if found["confirmed"] else "no")
+        cells.append(box_text(found["box"]))
+        numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
+        return (
+            f'<tr data-object="{order}" data-look="{found["look"]}"><th scope="row">'
+            f'<button type="button" class="pick">{order}</button></th><td>{self._crop(found)}</td>{numbers}</tr>'
+        )
+
+    def _crop(self, found: Data) -> str:
+        """Show the box of an object with a margin; the crop refers to a picture that is in the page already."""
+        source, left, top = self.crop_source(found)
+        x1, y1, x2, y2 = found["box"]
+        margin = 0.1 * max(x2 - x1, y2 - y1, 1)
+        across = x2 - x1 + 2 * margin
+        down = y2 - y1 + 2 * margin
+        view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {across:.1f} {down:.1f}"
+        width = f"width: {min(4.0, 3 * across / down):.2f}rem"
+        return f'<svg class="crop" viewBox="{view}" style="{width}" aria-hidden="true"><use href="#{source}"/></svg>'
+
+
+class EpisodePart(Part):
+    """Part of a page that the script draws: an episode of a fovea (`semfov.report.episode.episode_data`)."""
+
+    look = "fixation"
+    nearest = "nearest fixation"
+
+    @property
+    def place(self) -> str:
+        """Start of the ids of the pictures of the chosen episode."""
+        return "episode"
+
+    @property
+    def pictures(self) -> list[str]:
+        """The photograph and the foveated views that there are."""
+        views = (fixation["view"] for fixation in self.data["fixations"])
+        return [uri for uri in (self.data["image"], *views) if uri is not None]
+
+    @property
+    def section_html(self) -> str:
+        """Its section with objects, which the script shows with its episode."""
+        name = f"objects-{self.number}"
+        return (
+            f'<section class="found-objects of-episode" id="{name}" aria-labelledby="{name}-title">'
+            f'<h3 id="{name}-title">Objects in {escape(self.data["name"])}</h3>{self.objects_html()}</section>'
+        )
+
+    def script_data(self, numbers: Mapping[str, int]) -> Data:
+        """Make what the script reads: all but the objects, with numbers in place of the pictures."""
+        data = {name: value for name, value in self.data.items() if name != "objects"}
+        data["image"] = numbers.get(self.data["image"])
+        data["fixations"] = [{**fixation, "view": numbers.get(fixation["view"])} for fixation in self.data["fixations"]]
+        data["article"] = f"objects-{self.number}"
+        return data
+
+    def crop_source(self, found: Data) -> tuple[str, float, float]:
+        """Find the picture of the chosen episode."""
+        return f"{self.place}-picture", 0, 0
+
+
+class LooksPart(Part):
+    """Part of a page that is complete in the markup (`semfov.report.zoom.zoom_data`); the script chooses a look."""
+
+    look = "look"
+    nearest = "sharpest look"
+
+    @property
+    def place(self) -> str:
+        """Id of its article."""
+        return f"large-{self.number}"
+
+    @property
+    def looks_html(self) -> str:
+        """Its article; without the script the facts stand in it, except for those of the first part of the page."""
+        facts = {ABOUT[name]: self.data[name] for name in ABOUT if self.data[name] is not None}
+        return article_html(self.data, self.place, self.objects_html(), {} if self.number == 0 else facts)
+
+    def script_data(self, numbers: Mapping[str, int]) -> Data:
+        """Make what the script reads: facts and words about the looks."""
+        looks = [{"box": look["box"], "status": look["status"]} for look in self.data["looks"]]
+        return {**{name: self.data[name] for name in (*ABOUT, "summary")}, "article": self.place, "looks": looks}
+
+    def crop_source(self, found: Data) -> tuple[str, float, float]:
+        """Find the picture of the look that shows an object most sharply."""
+        if self.data["turns"]:  # views of a head are no parts of the picture
+            return f"{self.place}-picture", 0, 0
+        number = found["look"]
+        left, top = self.data["looks"][number]["box"][:2]
+        return f"{self.place}-look-{number}-view", left, top

@@ -1,0 +1,169 @@
+"""The objects of a record in figures: boxes with labels, the picture below them, and the legend of the boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.fixations import Fixations
+from semfov.paths import Record
+from semfov.viz.drawing import Tag, draw_boxes, draw_grid, draw_image, draw_tags
+from semfov.viz.labels import LabelBox
+from semfov.viz.style import FOUND, TARGET, TRUTH
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+_NAMED = 15  # largest number of objects whose labels name their class where only one class was searched for
+_LABELLED = 60  # largest number of objects that have labels
+_LEGEND_LETTERS = 115  # largest number of letters of a legend in one line
+
+
+class LegendEntry(NamedTuple):
+    """Entry of a legend: colour, line style and text."""
+
+    colour: str
+    line: str
+    text: str
+
+
+class Mark(NamedTuple):
+    """Box `(x1, y1, x2, y2)` that a figure draws, in a colour, with a line of a style and a width.
+
+    `text` is that of its label; None for a box without one.
+    """
+
+    box: LabelBox
+    colour: str
+    line: str
+    width: float
+    text: str | None = None
+
+
+def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
+    """Draw the picture, the cells of a fovea, and the true boxes of the target.
+
+    Args:
+        axes: axes to draw in.
+        record: the record, or the fixations of a person.
+        image: `(3, h, w)`, the picture.
+        boxes: `(M, 4)`, true boxes; None for none.
+    """
+    grid = Grid(1, 1, record.size)
+    if isinstance(record, Record) and record.kind.grid:
+        believed = record.belief_map(0)
+        grid = grid if believed is None else believed[0]
+    draw_image(axes, image, grid)
+    draw_grid(axes, grid)
+    if boxes is not None:
+        draw_boxes(axes, boxes, TRUTH, "--", 1.8)
+
+
+def annotation_entries(record: Record, boxes: Tensor | None) -> list[LegendEntry]:
+    """Make the entry of a legend for the true boxes of the target, where there are any."""
+    if boxes is None or not len(boxes):
+        return []
+    return [LegendEntry(TRUTH, "--", f"annotated: {record.target_name or 'target'}")]
+
+
+def object_entries(record: Record) -> list[LegendEntry]:
+    """Make the entries of a legend for the boxes of a record: objects, the best place, and refuted places."""
+    name = record.target_name or "objects"
+    confirmed = int(record.confirmed.sum())
+    others = len(record.objects) - confirmed
+    entries = []
+    if confirmed:
+        entries.append(LegendEntry(FOUND, "-", f"confirmed: {name} ({confirmed})"))
+    if others:
+        # Where nothing can be confirmed, that an object was not goes without saying.
+        rest = "not confirmed: " if confirmed or record.decision is not None else ""
+        entries.append(LegendEntry(TARGET, "-", f"{rest}{name} from {record.words.threshold} ({others})"))
+    best = record.best_place
+    if best is not None:
+        entries.append(LegendEntry(FOUND, "--", "best place, not sure enough"))
+    if any(best is None or not look.box.equal(best[0]) for look in record.refuted):
+        entries.append(LegendEntry(FOUND, ":", "not confirmed by a closer look"))
+    return entries
+
+
+def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
+    """Draw a legend below the axes, in two columns if it is long; none without entries."""
+    from matplotlib.lines import Line2D
+
+    if not entries:
+        return
+    letters = sum(len(entry.text) + 6 for entry in entries)
+    legend = axes.legend(
+        [Line2D([], [], linewidth=1.8, color=entry.colour, linestyle=entry.line) for entry in entries],
+        [entry.text for entry in entries],
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0),
+        ncols=len(entries) if letters < _LEGEND_LETTERS else 2,
+        frameon=False,
+        handlelength=1.6,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def object_marks(record: Record, last: int | None = None) -> list[Mark]:
+    """List the boxes of a record in the order in which they are drawn.
+
+    First come places that a closer look refuted, then the objects, the most confident last, over the others, and then
+    the best place of an undecided search. A box over the seam of a panorama is drawn at both ends.
+
+    Args:
+        record: the record.
+        last: number of the last look that counts; None for all.
+
+    Returns:
+        The boxes, with labels for objects and for the best place.
+    """
+    last = len(record) if last is None else last
+    marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
+    rows = [row for row in record.object_rows() if row["look"] <= last]
+    many = len(rows) > _NAMED
+    one_class = many and record.target is not None
+    width = record.size[0]
+    for row in reversed(rows):
+        score = f"{row['score']:.2f}"
+        text = score if one_class else f"{row['class']} {score}"
+        colour = FOUND if row["confirmed"] else TARGET
+        line_width = 2.0 if row["confirmed"] else 0.8 if many else 1.2
+        for shift in (0, width) if row["x2"] > width else (0,):
+            box = (row["x1"] - shift, row["y1"], row["x2"] - shift, row["y2"])
+            marks.append(Mark(box, colour, "-", line_width, text))
+    if record.best_place is not None and last >= len(record) - 1:
+        best, chance = record.best_place
+        has_label = bool((record.objects.boxes == best).all(-1).any())
+        marks.append(Mark(_corners(best), FOUND, "--", 2.4, None if has_label else f"best place {chance:.2f}"))
+    return marks
+
+
+def draw_marks(axes: Axes, marks: Sequence[Mark]) -> list[Artist]:
+    """Draw boxes without their labels; returns what was drawn."""
+    return [
+        artist for mark in marks for artist in draw_boxes(axes, Tensor([mark.box]), mark.colour, mark.line, mark.width)
+    ]
+
+
+def draw_mark_labels(axes: Axes, record: Record, marks: Sequence[Mark], obstacles: Sequence[LabelBox]) -> None:
+    """Write the labels of the boxes of a record, of many those of the most confident ones.
+
+    Args:
+        axes: axes that are laid out.
+        record: the record.
+        marks: boxes of all its looks (`object_marks`).
+        obstacles: rectangles that no label covers.
+    """
+    tags = [Tag(mark.box, mark.text, mark.colour) for mark in reversed(marks) if mark.text is not None]
+    draw_tags(axes, tags[:_LABELLED], record.size, obstacles, many=len(record.objects) > _NAMED)
+
+
+def _corners(box: Tensor) -> LabelBox:
+    x1, y1, x2, y2 = box.tolist()
+    return x1, y1, x2, y2
