@@ -24,7 +24,9 @@ showed the target at the gaze in a search whose belief has no thresholds, no loo
 made, every cell was fixated, the passes were used up, no window was left that can show the target, the time on this
 machine was over, the time of the scene was over, or the caller stopped it."""
 
-WHOLE, POSITIVE, CHANCE = Number(low=0, whole=True), Number(above=0), Number(0, 1)
+WHOLE = Number(low=0, whole=True)
+POSITIVE = Number(above=0)
+CHANCE = Number(0, 1)
 
 _DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
 _CLOSER = {
@@ -63,7 +65,7 @@ _SHARED = {
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = "target", "found", "least", "source", "shown", "detector", "ending"
+_PLAIN = ("target", "found", "least", "source", "shown", "detector", "ending")  # attributes that are JSON values
 
 
 _OTHERS = {
@@ -80,7 +82,15 @@ _OTHERS = {
 
 
 class Format:
-    """Format of the files of one kind of records: what they have beside the attributes of the base."""
+    """Format of the files of one kind of records.
+
+    A file is one of safetensors. Detections of all looks stand in a row, without padding, and `lengths` separates them.
+
+    Args:
+        kind: name of the kind, which a file holds.
+        tensors: tensors beside those of all records, such as detections.
+        record: JSON values beside those of all records.
+    """
 
     def __init__(self, kind: str, tensors: Mapping[str, Field], record: Mapping[str, Json]) -> None:
         self.kind = kind
@@ -93,63 +103,111 @@ class Format:
         tensors: Mapping[str, Tensor],
         record: Mapping[str, Any],
     ) -> None:
+        """Write the file of a record, atomically.
+
+        Args:
+            path: the file.
+            fields: attributes of the record by their names, of which those of all records are taken.
+            tensors: the tensors of its kind.
+            record: the JSON values of its kind.
+
+        Raises:
+            InputError: the name is that of a table, a page, a picture or a film.
+            DataError: the file cannot be written.
+        """
         call = _OTHERS.get(Path(path).suffix.lower())
         name = repr(fspath(path))
         check(call is None, "path", "a file of a record, such as 'record.safetensors'", f"{name}; use {call}({name})")
-        looks: tuple[Detections, ...] = fields["detections"]
         decision: Decision | None = fields["decision"]
-        # The detections of all looks in a row, without padding; `lengths` separates them again.
-        names = *_DETECTIONS, "confidence"
-        whole = {name: torch.cat([getattr(look, name)[0] for look in looks]) for name in names} | dict(tensors)
-        values: dict[str, Any] = {
+        values = {
             "kind": self.kind,
             "version": __version__,
             "classes": list(fields["classes"]),
-            "lengths": [look.mask.shape[-1] for look in looks],
+            "lengths": [look.mask.shape[-1] for look in fields["detections"]],
             **{name: fields[name] for name in _PLAIN},
             "targets": list(fields["targets"]),
-            "decision": decision and {name: getattr(decision, name) for name in _DECISION},
+            "decision": None if decision is None else {name: getattr(decision, name) for name in _DECISION},
             "closer": [{name: getattr(look, name) for name in _CLOSER} for look in fields["closer"]],
             **record,
         }
-        if decision is not None and decision.box is not None:
-            whole["box"] = decision.box
-        if fields["photograph"] is not None:
-            whole["photograph"] = fields["photograph"]
-        if fields["closer"]:
-            whole["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
-        write_file(path, whole, values)
+        write_file(path, {**_shared_tensors(fields), **tensors}, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-        """Read and check a file that `write` wrote: its tensors, its JSON values, and the attributes of the base."""
+        """Read and check a file that `write` wrote.
+
+        Args:
+            path: the file.
+
+        Returns:
+            Its tensors, its JSON values, and the attributes of all records by their names.
+
+        Raises:
+            InputError: a value is missing, or does not suit the others.
+            DataError: the file is missing or damaged, or of another kind.
+        """
         tensors, record = read(path, self.kind)
         record.pop("kind")
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
-        classes, lengths, targets = (record[name] for name in ("classes", "lengths", "targets"))
-        target, photograph = record.get("target"), tensors.get("photograph")
-        check(target is None or 1 <= target < len(classes), "target", "the index of a class", target)
-        check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
-        check(all(1 <= each < len(classes) for each in targets), "targets", "indices of classes", targets)
-        sides = (1,) if photograph is None else photograph.shape[1:]
-        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
-        names = [name for name in (*_DETECTIONS, "confidence") if name in tensors]
-        looks = zip(*(tensors[name].split(lengths) for name in names), strict=True)
-        decision, closer = record.get("decision"), record["closer"]
+        _check_shared(tensors, record)
+        decision = record.get("decision")
         boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
-        check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
-        for look in closer:
-            last = max(look["fixation"] or 0, look["number"] or 0)
-            fits = last < len(lengths) and 1 <= look["target"] < len(classes)
-            check(fits, "closer", f"a look below {len(lengths)} and the index of a class", look)
         shared = {
             **{name: record.get(name) for name in _PLAIN},
-            "classes": tuple(classes),
-            "targets": tuple(targets),
-            "photograph": photograph,
-            "detections": tuple(Detections(*(part[None] for part in look)) for look in looks),
+            "classes": tuple(record["classes"]),
+            "targets": tuple(record["targets"]),
+            "photograph": tensors.get("photograph"),
+            "detections": _separated(tensors, record["lengths"]),
             "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
-            "closer": tuple(CloseUp(**look, box=box) for look, box in zip(closer, boxes, strict=True)),
+            "closer": tuple(CloseUp(**look, box=box) for look, box in zip(record["closer"], boxes, strict=True)),
         }
         return tensors, record, shared
+
+
+def _shared_tensors(fields: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
+    looks: tuple[Detections, ...] = fields["detections"]
+    decision: Decision | None = fields["decision"]
+    tensors = {}
+    for name in (*_DETECTIONS, "confidence"):
+        tensors[name] = torch.cat([getattr(look, name)[0] for look in looks])
+    if decision is not None and decision.box is not None:
+        tensors["box"] = decision.box
+    if fields["photograph"] is not None:
+        tensors["photograph"] = fields["photograph"]
+    if fields["closer"]:
+        tensors["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
+    return tensors
+
+
+def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detections, ...]:
+    """Separate the detections of the looks, batches of one."""
+    names = [name for name in (*_DETECTIONS, "confidence") if name in tensors]
+    looks = zip(*(tensors[name].split(lengths) for name in names), strict=True)
+    return tuple(Detections(*(part[None] for part in look)) for look in looks)
+
+
+def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
+    """Raise `InputError` where values of a file, each of which is allowed, do not suit each other."""
+    classes = len(record["classes"])
+    lengths = record["lengths"]
+    target = record.get("target")
+    targets = record["targets"]
+    check(target is None or 1 <= target < classes, "target", "the index of a class", target)
+    check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
+    check(all(1 <= label < classes for label in targets), "targets", "indices of classes", targets)
+    if "photograph" in tensors:
+        sides = tensors["photograph"].shape[1:]
+        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
+    closer = record["closer"]
+    boxes = len(tensors.get("closer_boxes", ()))
+    check(boxes == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", boxes)
+    for look in closer:
+        last = max(look["fixation"] or 0, look["number"] or 0)
+        check(
+            last < len(lengths) and 1 <= look["target"] < classes,
+            "closer",
+            f"a look below {len(lengths)} and the index of a class",
+            look,
+        )

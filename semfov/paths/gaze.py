@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_MOST_FIXATIONS = 100  # of a drawn scanpath
+_SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations in a time is bounded
 _REACH = 0.05  # distance, in longer sides of the picture, within which probability belongs to a peak
 
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
@@ -98,30 +100,22 @@ class GazePrediction(OtherWords):
             DataError: the file of the model is missing or damaged.
         """
         detector = looking.detector if isinstance(looking, Eye) else looking
-        if isinstance(model, str | PathLike):
-            model = FixationDensity.from_pretrained(model)
-        expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
-        check(model is None or isinstance(model, FixationDensity), "model", expected, type(model).__name__)
-        if model is not None:
-            model.check_compatible(detector)
-        model = shared_density(detector) if model is None else deepcopy(model).cpu()
+        fitted = _model_for(detector, model)
         size = int(image.shape[-1]), int(image.shape[-2])
         with torch.no_grad():
             if seen is None:
-                canvas, placement = detector.fit(image[None])
-                maps = detector.feature_maps(canvas, [*model.layers])
-                features = FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
+                fixations = None
+                features = _sharp_features(detector, image, fitted)
             elif isinstance(looking, Eye):
-                seen = _fixations_of(seen, "seen", size, source)
-                points = torch.from_numpy(seen.points).to(image)
-                views = looking.features(looking.open(image[None]), points, [*model.layers])
-                features = features_so_far(views, points, points[None])
+                fixations = _fixations_of(seen, "seen", size, source)
+                features = _foveal_features(looking, image, fixations, fitted)
             else:
                 raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
-            there = image.dtype == model.read.dtype and image.device == model.read.device
-            terms = (model if there else deepcopy(model).to(image)).terms(features, size[::-1])
-        terms, looks = {name: each.cpu() for name, each in terms.items()}, None if seen is None else len(seen)
-        return cls(model, terms, size, reduced_copy(image), source, looks)
+            suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
+            terms = (fitted if suits else deepcopy(fitted).to(image)).terms(features, size[::-1])
+        on_processor = {name: term.cpu() for name, term in terms.items()}
+        number = None if fixations is None else len(fixations)
+        return cls(fitted, on_processor, size, reduced_copy(image), source, number)
 
     @cached_property
     def density(self) -> Tensor:
@@ -142,14 +136,17 @@ class GazePrediction(OtherWords):
     @property
     def parts(self) -> dict[str, float]:
         """What each term adds: divergence in bits of the density from the one without the term, by its name."""
-        whole, parts = self.cells.log(), {}
+        log_density = self.cells.log()
+        parts = {}
         for name in self.terms:
-            rest = sum((term[0] for other, term in self.terms.items() if other != name), torch.zeros_like(whole))
-            parts[name] = float((self.cells * (whole - rest + rest.logsumexp((0, 1)))).sum() / math.log(2))
+            others = (term[0] for other, term in self.terms.items() if other != name)
+            without = sum(others, torch.zeros_like(log_density))
+            log_ratio = log_density - without + without.logsumexp((0, 1))
+            parts[name] = float((self.cells * log_ratio).sum() / math.log(2))
         return parts
 
     def peaks(self, count: int = 5) -> list[dict[str, float]]:
-        """The places where most fixations are expected, the most likely first.
+        """List the places where most fixations are expected, the most likely first.
 
         Args:
             count: largest number of places.
@@ -173,18 +170,18 @@ class GazePrediction(OtherWords):
         width, height = self.size
         x = (torch.arange(columns) + 0.5) * (width / columns)
         y = (torch.arange(rows) + 0.5) * (height / rows)
-        places = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
-        distance = torch.cdist(places, places) / (_REACH * max(self.size))
+        centres = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+        distance = torch.cdist(centres, centres) / (_REACH * max(self.size))
         share = (distance <= 1).to(self.cells) @ self.cells.flatten()
         value = (1 - distance).clamp(min=0).to(self.cells) @ self.cells.flatten()
-        free = torch.ones(len(places), dtype=torch.bool)
-        found: list[dict[str, float]] = []
+        free = torch.ones(len(centres), dtype=torch.bool)
+        places: list[dict[str, float]] = []
         while bool(free.any()):  # all of them, since a later place can have a larger share
             best = int(torch.where(free, value, -1.0).argmax())
-            at = places[best].tolist()
-            found.append({"x": pixels(at[0] - 0.5), "y": pixels(at[1] - 0.5), "share": digits(float(share[best]))})
+            x_best, y_best = centres[best].tolist()
+            places.append({"x": pixels(x_best - 0.5), "y": pixels(y_best - 0.5), "share": digits(float(share[best]))})
             free &= distance[best] > 2
-        return sorted(found, key=lambda place: -place["share"])
+        return sorted(places, key=lambda place: -place["share"])
 
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.
@@ -205,24 +202,44 @@ class GazePrediction(OtherWords):
         check_whole(people, "people", 1, 10_000)
         check_number(seconds, "seconds", 0.1, 60.0)
         generator = torch.Generator().manual_seed(seed)
-        model, (width, height) = self.model, self.size
-        side = torch.tensor([width, height])
-        drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
-        mean, spread = model.start.cpu().float()
-        start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
-        start = torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
-        most = min(100, math.ceil(seconds * 1000 / 60) + 1)  # fixations of a scanpath
-        spans = model.duration.cpu().float()
-        spans = torch.cat([spans, spans[-1:].expand(max(most - len(spans), 0), -1)])[:most]
-        times = (spans[:, 0] + spans[:, 1] * torch.randn(people, most, generator=generator)).exp()
-        ends = (times + model.pause.cpu().float()).cumsum(1)
-        lengths = ((ends < seconds * 1000).sum(1) + 1).clamp(max=most)
-        paths = model.sample(self.terms, (height, width), start, int(lengths.max()), generator)
+        start = self._first_fixations(people, generator)
+        durations, lengths = self._drawn_durations(people, seconds, generator)
+        paths = self.model.sample(self.terms, self.size[::-1], start, int(lengths.max()), generator)
         viewers = []
-        for number, (path, length, time) in enumerate(zip(paths, lengths.tolist(), times, strict=True), 1):
-            points, spent = path[:length].double().numpy(), time[:length].double().round().numpy()
+        for number, (path, length, times) in enumerate(zip(paths, lengths.tolist(), durations, strict=True), 1):
+            points = path[:length].double().numpy()
+            spent = times[:length].double().round().numpy()
             viewers.append(Fixations(self.name, f"viewer {number}", points, self.size, spent))
         return viewers
+
+    def _first_fixations(self, people: int, generator: torch.Generator) -> Tensor:
+        """Draw the first fixation of each viewer, `(people, 2)`, within two standard deviations and the picture."""
+        side = torch.tensor(self.size)
+        drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
+        mean, spread = self.model.start.cpu().float()
+        start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
+        return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
+
+    def _drawn_durations(self, people: int, seconds: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw durations of fixations in milliseconds, and count those that begin in the time.
+
+        Durations are log-normal; the last distribution of the model stands for all later fixations, too.
+
+        Args:
+            people: number of viewers.
+            seconds: time for which each views the picture.
+            generator: of the draws.
+
+        Returns:
+            `(people, n)`, and the number of each viewer's fixations, `(people,)`.
+        """
+        count = min(_MOST_FIXATIONS, math.ceil(seconds * 1000 / _SHORTEST) + 1)
+        spans = self.model.duration.cpu().float()
+        spans = torch.cat([spans, spans[-1:].expand(max(count - len(spans), 0), -1)])[:count]
+        durations = (spans[:, 0] + spans[:, 1] * torch.randn(people, count, generator=generator)).exp()
+        ends = (durations + self.model.pause.cpu().float()).cumsum(1)
+        lengths = ((ends < seconds * 1000).sum(1) + 1).clamp(max=count)
+        return durations, lengths
 
     @property
     def name(self) -> str:
@@ -235,25 +252,29 @@ class GazePrediction(OtherWords):
         return self.photograph.float() / 255
 
     def given(self, scanpaths: Sequence[Fixations], number: int) -> Tensor:
-        """Mean density over the cells of the next fixation of viewers after `number` fixations, `(rows, columns)`.
+        """Predict the mean density over the cells of the next fixation of viewers after `number` fixations.
 
         Args:
             scanpaths: their scanpaths; those that are shorter are left out.
             number: number of fixations so far, at least 1.
 
         Returns:
-            The density; that of all fixations where no scanpath is long enough.
+            `(rows, columns)`; the density of all fixations where no scanpath is long enough.
         """
-        long_enough = [each.resized(self.size).points[:number] for each in scanpaths if len(each) >= number]
-        points = [torch.from_numpy(each) for each in long_enough]
+        points = [
+            torch.from_numpy(scanpath.resized(self.size).points[:number])
+            for scanpath in scanpaths
+            if len(scanpath) >= number
+        ]
         if not points:
             return self.cells
         with torch.no_grad():
-            given = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
-        return torch.stack([*given.values()]).sum(0).flatten(1).softmax(1).mean(0).view_as(self.cells)
+            terms = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
+        log_density = torch.stack([*terms.values()]).sum(0).flatten(1)
+        return log_density.softmax(1).mean(0).view_as(self.cells)
 
     def next_density(self, scanpath: ScanpathLike) -> Tensor:
-        """Probability of a viewer's next fixation in each pixel of the picture, after the fixations so far.
+        """Predict the probability of a viewer's next fixation in each pixel, after the fixations so far.
 
         What is known of the picture is the same as for `density`: all of it, or with `agent.gaze(picture,
         seen=scanpath)` what a fovea has shown at these fixations.
@@ -389,16 +410,18 @@ class GazePrediction(OtherWords):
 
     def describe(self) -> str:
         """Describe the prediction in one line."""
-        first, plural = self.peaks(1)[0], "" if self.seen == 1 else "s"
+        first = self.peaks(1)[0]
         reach = _REACH * max(self.size)
-        known = "" if self.seen is None else f", after {self.seen} fixation{plural} seen by the fovea"
+        seen = ""
+        if self.seen is not None:
+            seen = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
         return (
             f"{100 * first['share']:.0f} % of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
-            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{known}"
+            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{seen}"
         )
 
     def __repr__(self) -> str:
-        """The description, and the places where most fixations are expected."""
+        """Return the description, and the places where most fixations are expected."""
         lines = [
             f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {100 * peak['share']:.0f} %"
             for number, peak in enumerate(self.peaks(), 1)
@@ -406,21 +429,68 @@ class GazePrediction(OtherWords):
         return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
 
     def _over_pixels(self, log: Tensor) -> Tensor:
-        """Probability in each pixel, `(H, W)`, by a log density over the cells, up to a constant."""
-        over = F.interpolate(log[None, None], self.size[::-1], mode="bilinear", align_corners=False)[0, 0]
-        return (over - over.logsumexp((0, 1))).exp()
+        """Interpolate a log density over the cells, up to a constant, to the probability in each pixel, `(H, W)`."""
+        log = F.interpolate(log[None, None], self.size[::-1], mode="bilinear", align_corners=False)[0, 0]
+        return (log - log.logsumexp((0, 1))).exp()
 
     def _log(self) -> Tensor:
-        """Log density over the cells, up to a constant."""
+        """Sum the terms to the log density over the cells, `(rows, columns)`, up to a constant."""
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
 
 
+def _model_for(detector: Detector, model: FixationDensity | str | PathLike[str] | None) -> FixationDensity:
+    """Find the model for a detector: the shipped one, or a copy of the given one, checked.
+
+    Args:
+        detector: the detector.
+        model: the model, or its file or folder; None for the one that is shipped.
+
+    Returns:
+        The model, on the processor.
+    """
+    if model is None:
+        return shared_density(detector)
+    if isinstance(model, str | PathLike):
+        model = FixationDensity.from_pretrained(model)
+    expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
+    check(isinstance(model, FixationDensity), "model", expected, type(model).__name__)
+    model.check_compatible(detector)
+    return deepcopy(model).cpu()
+
+
+def _sharp_features(detector: Detector, image: Tensor, model: FixationDensity) -> FeatureMaps:
+    """Compute the layers of the detector that the model reads, from the whole picture `(3, H, W)`."""
+    canvas, placement = detector.fit(image[None])
+    maps = detector.feature_maps(canvas, [*model.layers])
+    return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
+
+
+def _foveal_features(eye: Eye, image: Tensor, fixations: Fixations, model: FixationDensity) -> FeatureMaps:
+    """Compute the layers of the detector that the model reads, from what the eye has seen at fixations."""
+    points = torch.from_numpy(fixations.points).to(image)
+    views = eye.features(eye.open(image[None]), points, [*model.layers])
+    return features_so_far(views, points, points[None])
+
+
 def _fixations_of(given: object, argument: str, size: tuple[int, int], source: str | None) -> Fixations:
-    """The fixations of one viewer in pixels of the picture of `(width, height)`; those far outside give a warning."""
+    """Convert the fixations of one viewer to pixels of the picture; those far outside give a warning.
+
+    Args:
+        given: fixations, a record, or points.
+        argument: name of the argument.
+        size: `(width, height)` of the picture.
+        source: file of the picture; None if it is not known.
+
+    Returns:
+        The fixations.
+
+    Raises:
+        InputError: they are not those of one viewer of this picture.
+    """
     one = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
     if isinstance(given, Record):
         given = given.as_fixations(given.source or source or "")
-    elif isinstance(given, list | tuple) and any(isinstance(each, Fixations | Record) for each in given):
+    elif isinstance(given, list | tuple) and any(isinstance(entry, Fixations | Record) for entry in given):
         check(False, argument, one, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
     elif isinstance(given, list | tuple | np.ndarray | Tensor):
         try:

@@ -21,35 +21,37 @@ PlaceOnEarth = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _GEO_TEXTS = 34737  # tag of the texts of a GeoTIFF, of which some programs make a reference system
 
 
-def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """The map from pixels of a GeoTIFF, or of another raster, to longitude and latitude; → `(N, 2)`."""
+def georeference(source: str) -> PlaceOnEarth | None:
+    """Find where the pixels of a picture lie on earth.
+
+    Args:
+        source: file of the picture.
+
+    Returns:
+        The map from pixels to longitude and latitude; None for a picture without a place on earth.
+
+    Raises:
+        InputError: the picture has a georeference, and rasterio is not installed.
+        DataError: the file cannot be read.
+    """
     kind = Path(source).suffix.lower()
     if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None
     with needing("rasterio", f"source: {source}", '"semfov[geo]"'):
-        import rasterio.transform
         from rasterio.warp import transform
 
-    try:
-        with quiet_decoders, raster_settings():
-            picture = open_raster(source)
-        with picture:
-            system, affine = picture.crs, picture.transform
-            points, system_of_points = picture.gcps
-            if affine.is_identity and points:
-                system, affine = system_of_points, rasterio.transform.from_gcps(points)
-    except (rasterio.errors.RasterioError, OSError) as error:
-        raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
+    system, affine = _system_and_transform(source)
     if system is None or affine.is_identity:  # a system alone does not say where the picture lies
         return None
     try:
-        x, y = transform(system, "EPSG:4326", [affine.c], [affine.f])
+        longitude, latitude = transform(system, "EPSG:4326", [affine.c], [affine.f])
     except Exception:  # a system of its own, such as that of a building site, has no place on earth; of any error
         return None
-    if not np.isfinite([*x, *y]).all():
+    if not np.isfinite([*longitude, *latitude]).all():
         return None
 
     def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Convert pixels to longitude and latitude."""
         column, row = points.T
         x = affine.a * column + affine.b * row + affine.c
         y = affine.d * column + affine.e * row + affine.f
@@ -58,22 +60,53 @@ def georeference(source: str) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     return place
 
 
+def _system_and_transform(source: str) -> tuple[Any, Any]:
+    """Read the reference system of a raster, None for none, and its affine transform, fitted to points if it has these.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    import rasterio.transform
+
+    try:
+        with quiet_decoders, raster_settings():
+            picture = open_raster(source)
+        with picture:
+            points, system_of_points = picture.gcps
+            if picture.transform.is_identity and points:
+                return system_of_points, rasterio.transform.from_gcps(points)
+            return picture.crs, picture.transform
+    except (rasterio.errors.RasterioError, OSError) as error:
+        raise DataError(f"{source}: expected a readable GeoTIFF, got: {error}") from None
+
+
 _STEPS = 4  # along a side of a box, each shorter than half the way round the globe
 
 
-def box_on_earth(
-    corners: NDArray[np.float64], place: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-) -> dict[str, Any]:
-    """The GeoJSON geometry of a box with corners `(4, 2)` in pixels, which `place` puts on earth."""
+def box_on_earth(corners: NDArray[np.float64], place: PlaceOnEarth) -> dict[str, Any]:
+    """Make the GeoJSON geometry of a box.
+
+    Args:
+        corners: `(4, 2)`, in pixels, in their order around the box.
+        place: where pixels lie on earth.
+
+    Returns:
+        A polygon, or two where the box crosses the antimeridian.
+    """
     share = np.arange(_STEPS)[:, None] / _STEPS
     sides = corners[:, None] + (np.roll(corners, -1, 0) - corners)[:, None] * share
     return polygon_on_earth(place(sides.reshape(-1, 2)), _STEPS)
 
 
 def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any]:
-    """The GeoJSON geometry of a ring of longitudes and latitudes `(N, 2)`, cut at the antimeridian (RFC 7946, 3.1.9).
+    """Make the GeoJSON geometry of a ring, cut at the antimeridian (RFC 7946, 3.1.9).
 
-    Its corners are some of the places, `every` one from the first on.
+    Args:
+        ring: `(N, 2)`, longitudes and latitudes.
+        every: one of how many places is a corner, from the first on.
+
+    Returns:
+        A polygon, or two where the ring crosses the antimeridian.
 
     >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
     [-160.0, 1.0]
@@ -91,25 +124,28 @@ def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any
 
 
 def _closed(corners: NDArray[np.float64]) -> list[list[float]]:
-    """A ring of GeoJSON, whose last corner is the first one."""
+    """Close a ring of GeoJSON, whose last corner is the first one."""
     rounded = corners.round(8).tolist()  # a millimetre
     return [*rounded, rounded[0]]
 
 
 def _cut(corners: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    """The part of a ring that lies west (1) or east (-1) of the antimeridian."""
-    kept: list[NDArray[np.float64]] = []
-    for here, following in zip(corners, np.roll(corners, -1, 0), strict=True):
-        before, after = side * (180.0 - here[0]), side * (180.0 - following[0])
-        if before >= 0:
-            kept.append(here)
-        if before * after < 0:
-            share = before / (before - after)
-            kept.append(np.array([180.0, here[1] + (following[1] - here[1]) * share]))
-    return np.array(kept)
+    """Cut the part of a ring `(N, 2)` that lies west (1) or east (-1) of the antimeridian."""
+    part: list[NDArray[np.float64]] = []
+    for corner, following in zip(corners, np.roll(corners, -1, 0), strict=True):
+        # Distances to the antimeridian in degrees, positive on the wanted side.
+        distance = side * (180.0 - corner[0])
+        following_distance = side * (180.0 - following[0])
+        if distance >= 0:
+            part.append(corner)
+        if distance * following_distance < 0:
+            share = distance / (distance - following_distance)
+            part.append(np.array([180.0, corner[1] + (following[1] - corner[1]) * share]))
+    return np.array(part)
 
 
 def _is_referenced(source: str) -> bool:
+    """Tell whether a TIFF is a GeoTIFF; refuse a reference system that names a file."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     check_regular(source)

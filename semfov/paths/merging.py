@@ -18,25 +18,58 @@ def merge_fixations(
     cut: Sequence[Tensor] | None = None,
     around: float | None = None,
 ) -> Objects:
-    """Merge detections `(L,)` of fixations, the nearest the sharpest, and closer looks, sharper still, into objects."""
+    """Merge the detections of fixations and of closer looks into objects.
+
+    Of several boxes of one object the one of the nearest fixation is kept, as it was seen the most sharply. Closer
+    looks are sharper still.
+
+    Args:
+        looks: detections of each look, batches of one.
+        distances: `(L,)` for each look, distances of the fixation to the boxes.
+        closer: closer looks.
+        cut: `(L,)` boolean for each look, boxes that the border of the view cuts; None for none.
+        around: width in pixels after which the picture repeats; None for other pictures.
+
+    Returns:
+        The objects from score 0.05 on, most confident first.
+    """
     rows = []
-    for number, (seen, distance) in enumerate(zip(looks, distances, strict=True)):
-        chosen = seen.mask[0] & (seen.confidence[0] >= FAINTEST)
-        broken = torch.zeros_like(chosen) if cut is None else cut[number]
-        every = seen.boxes[0], seen.confidence[0], seen.labels[0], torch.full_like(chosen, number, dtype=torch.int64)
-        rows.append([each[chosen].detach().cpu() for each in (*every, broken, -distance)])
+    for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
+        chosen = detections.mask[0] & (detections.confidence[0] >= FAINTEST)
+        columns = (
+            detections.boxes[0],
+            detections.confidence[0],
+            detections.labels[0],
+            torch.full_like(chosen, number, dtype=torch.int64),
+            torch.zeros_like(chosen) if cut is None else cut[number],
+            -distance,
+        )
+        rows.append([column[chosen].detach().cpu() for column in columns])
     for look in closer:
-        place = [torch.tensor([each]) for each in (look.place, look.target, look.of_look, False, 1.0)]
-        rows.append([look.box[None].detach().cpu(), *place])
+        # No distance is above 0, so that a closer look is nearer than all fixations.
+        values = (look.place, look.target, look.of_look, False, 1.0)
+        rows.append([look.box[None].detach().cpu(), *(torch.tensor([value]) for value in values)])
     if not rows:
         return Objects.none()
-    columns = (torch.cat(each) for each in zip(*rows, strict=True))
-    columns = (each.float() if each.is_floating_point() else each for each in columns)
-    return merge_looks(*columns, score=0.0, around=around).above(FAINTEST)
+    merged = [_single(torch.cat(column)) for column in zip(*rows, strict=True)]
+    return merge_looks(*merged, score=0.0, around=around).above(FAINTEST)
+
+
+def _single(column: Tensor) -> Tensor:
+    """Convert numbers of any precision to single precision; others stay."""
+    return column.float() if column.is_floating_point() else column
 
 
 def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
-    """Distance of a point `(2,)` to boxes `(L, 4)`, `(L,)`; 0 inside a box."""
-    at = (point + 0.5).to(boxes)
-    beside = torch.maximum(boxes[:, :2] - at, at - boxes[:, 2:]).clamp(min=0)
-    return torch.linalg.vector_norm(beside, dim=-1)
+    """Compute the distance of a point to boxes.
+
+    Args:
+        boxes: `(L, 4)`.
+        point: `(2,)`, with pixel centres at integers.
+
+    Returns:
+        `(L,)`, 0 inside a box.
+    """
+    point = (point + 0.5).to(boxes)
+    outside = torch.maximum(boxes[:, :2] - point, point - boxes[:, 2:]).clamp(min=0)
+    return torch.linalg.vector_norm(outside, dim=-1)

@@ -69,7 +69,7 @@ class Outcome(ABC):
 
     @abstractmethod
     def _looks(self) -> Iterator[RecordedLook]:
-        """The looks in their order, made anew."""
+        """Make the looks in their order, anew."""
 
     @property
     @abstractmethod

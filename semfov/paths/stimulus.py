@@ -19,7 +19,14 @@ LONGEST = 1280  # longer side of a kept photograph, in pixels; larger photograph
 
 @dataclass(frozen=True)
 class Stimulus:
-    """The canvas `(3, H, W)` in bytes from which views are made by the sensor of the eye, or by one of its settings."""
+    """The canvas from which foveated views are made.
+
+    Attributes:
+        canvas: `(3, H, W)`, bytes, the photograph as it was fitted into the detector's input.
+        placement: where the photograph lies on the canvas.
+        settings: settings of the eye, from which a sensor is made where there is none.
+        sensor: sensor of the eye; None after the record was read from a file.
+    """
 
     canvas: Tensor
     placement: Placement
@@ -28,6 +35,7 @@ class Stimulus:
 
     @classmethod
     def of(cls, eye: Eye, image: Tensor) -> Self:
+        """Make the stimulus of a photograph `(3, H, W)`, or of a batch of one."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
         with torch.no_grad():
@@ -42,15 +50,25 @@ class Stimulus:
             return None
         got = len(tensors.keys() & {"photograph", "canvas"}) + len(values)
         check(got == 4, "photograph", "photograph, canvas, placement and settings together", f"{got} of these 4")
-        canvas, placement = tensors["canvas"], Placement(**{name: tuple(each) for name, each in values[0].items()})
+        placement_values, settings = values
+        placement = Placement(**{name: tuple(pair) for name, pair in placement_values.items()})
+        canvas = tensors["canvas"]
         for axis in (0, 1):
-            room, side = canvas.shape[2 - axis], placement.size[axis] * placement.scale[axis]
-            fits = round(side) >= 1 and placement.offset[axis] + round(side) <= room
-            check(fits, "placement", f"the photograph on a canvas of {room} px", f"{side:g} px")
-        return cls(canvas, placement, values[1])
+            room = canvas.shape[2 - axis]
+            side = placement.size[axis] * placement.scale[axis]
+            lies_inside = round(side) >= 1 and placement.offset[axis] + round(side) <= room
+            check(lies_inside, "placement", f"the photograph on a canvas of {room} px", f"{side:g} px")
+        return cls(canvas, placement, settings)
 
     def views(self, fixations: Tensor) -> list[Tensor]:
-        """Foveated views without the border of the canvas, those of `Eye.pictures` up to the rounding to bytes."""
+        """Make the foveated views of fixations, those of `Eye.pictures` up to the rounding to bytes.
+
+        Args:
+            fixations: `(n, 2)`, in pixels of the photograph.
+
+        Returns:
+            `(3, h, w)` of each, without the border of the canvas.
+        """
         check_shape(fixations, "fixations", None, 2)
         settings = self.settings["sensor"]
         sensor = sensor_of(settings) if self.sensor is None else self.sensor
@@ -69,13 +87,16 @@ class Stimulus:
 
 def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     """Reduce a picture to the bytes that a record keeps for its drawings, `(3, h, w)`."""
-    width, height = (picture.shape[-1], picture.shape[-2]) if isinstance(picture, Tensor) else picture.size
-    scale = min(1.0, LONGEST / max(width, height))
-    wide, high = max(1, round(width * scale)), max(1, round(height * scale))
     if isinstance(picture, Tensor):
-        return in_bytes(picture if scale == 1 else resize(picture[None], (wide, high))[0])
+        width, height = picture.shape[-1], picture.shape[-2]
+    else:
+        width, height = picture.size
+    scale = min(1.0, LONGEST / max(width, height))
+    reduced_size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if isinstance(picture, Tensor):
+        return in_bytes(picture if scale == 1 else resize(picture[None], reduced_size)[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
-    return resized(pixels, (high, wide))[0].contiguous()
+    return resized(pixels, reduced_size[::-1])[0].contiguous()
 
 
 def in_bytes(image: Tensor) -> Tensor:
