@@ -4,6 +4,7 @@ import importlib
 import inspect
 from functools import cache
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 MODULES = (
@@ -41,23 +42,35 @@ MODULES = (
 
 @cache
 def entries() -> dict[str, list[tuple[str, Any]]]:
-    """List the public classes and functions of each module. Each of them is listed in one module only."""
-    seen: set[int] = set()
-    found: dict[str, list[tuple[str, Any]]] = {}
+    """List the public classes and functions of each module. Each of them is listed in one module only.
+
+    Returns:
+        Names and objects, by the name of the module.
+    """
+    listed: set[int] = set()
+    by_module: dict[str, list[tuple[str, Any]]] = {}
     # The top-level package comes last, because it re-exports names of the others.
     for name in (*MODULES[1:], MODULES[0]):
         module = importlib.import_module(name)
-        public = getattr(module, "__all__", None) or [n for n, t in vars(module).items() if _own(t, name)]
-        objects = [(n, getattr(module, n)) for n in sorted(public)]
-        objects = [(n, t) for n, t in objects if (inspect.isclass(t) or inspect.isfunction(t)) and id(t) not in seen]
-        seen |= {id(t) for _, t in objects}
-        found[name] = objects
-    return {name: found[name] for name in MODULES if found[name]}
+        objects = [(public, getattr(module, public)) for public in sorted(_public_names(module))]
+        by_module[name] = [(public, obj) for public, obj in objects if _is_documented(obj) and id(obj) not in listed]
+        listed |= {id(obj) for _, obj in by_module[name]}
+    return {name: by_module[name] for name in MODULES if by_module[name]}
 
 
-def _own(obj: Any, module: str) -> bool:
-    public = inspect.isclass(obj) or inspect.isfunction(obj)
-    return public and obj.__module__ == module and not obj.__name__.startswith("_")
+def _public_names(module: ModuleType) -> list[str]:
+    """List the names in `__all__`, or without it those of the classes and functions that the module defines."""
+    names: list[str] = getattr(module, "__all__", [])
+    return names or [
+        name
+        for name, obj in vars(module).items()
+        if _is_documented(obj) and obj.__module__ == module.__name__ and not obj.__name__.startswith("_")
+    ]
+
+
+def _is_documented(obj: object) -> bool:
+    """Tell whether the reference documents an object: a class or a function."""
+    return inspect.isclass(obj) or inspect.isfunction(obj)
 
 
 def place(module: str, name: str, obj: Any) -> str:
@@ -82,6 +95,7 @@ def place(module: str, name: str, obj: Any) -> str:
 
 
 def _is_module(name: str) -> bool:
+    """Tell whether there is a module of this name."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:
@@ -89,10 +103,14 @@ def _is_module(name: str) -> bool:
 
 
 def pages() -> dict[str, str]:
-    """Write the pages of the reference in Markdown, one for each module. mkdocstrings fills in the docstrings."""
-    found = {}
+    """Write the pages of the reference in Markdown, one for each module. mkdocstrings fills in the docstrings.
+
+    Returns:
+        The pages, by the name of the module.
+    """
+    texts = {}
     for module, objects in entries().items():
         about = (inspect.getdoc(importlib.import_module(module)) or "").split("\n\n")[0]
         names = [f"::: {place(module, name, obj)}" for name, obj in objects]
-        found[module] = "\n\n".join([f"# {module} {{#{module}}}", about, *names, ""])
-    return found
+        texts[module] = "\n\n".join([f"# {module} {{#{module}}}", about, *names, ""])
+    return texts

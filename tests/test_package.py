@@ -21,8 +21,8 @@ ROOT = PACKAGE.parent
 SUBPACKAGES = [
     "version", "words", "errors", "threads", "io", "data", "settings", "motion", "sensor", "detection", "observation",
     "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye", "episode", "decision",
-    "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets", "agent", "metrics", "human", "viz",
-    "report", "runs", "fit", "envs", "cli", "__main__",
+    "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets", "agent", "metrics", "human",
+    "viz", "report", "runs", "fit", "envs", "cli", "__main__",
 ]  # fmt: skip
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are
 # the packages that draw. Its methods import them when they are called, and nothing of them when the record is made.

@@ -96,8 +96,8 @@ class PictureOptions(AgentOptions):
             `300,3000`, or `auto` for percentiles (none: 0 and the largest value of 8 or 16 bits).
         bands: bands of a TIFF or a raster that are red, green and blue, as `4,3,2`, or one as grey (none: those that
             the file names).
-        out: file of results, `.json`, `.jsonl`, `.csv`, `.geojson` or `.coco.json`, or a folder for figures and
-            results; `-` writes JSON lines to standard output, and everything else to standard error.
+        out: file of results, in a format that `--help` lists, or a folder for figures and results; `-` writes JSON
+            lines to standard output, and everything else to standard error.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
             where), `belief_bars` (of a search) and `animation`; `none` draws nothing (not given: all but `belief_bars`,
             if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are

@@ -7,6 +7,7 @@ from semfov.paths.head import HeadPath
 from semfov.paths.look import RecordedLook
 from semfov.paths.scanpath import FoveaMoment, Scanpath
 from semfov.paths.windows import WindowMoment, ZoomPath
+from semfov.paths.words import Words
 
 __all__ = [
     "Ending",
@@ -18,5 +19,6 @@ __all__ = [
     "Record",
     "Scanpath",
     "WindowMoment",
+    "Words",
     "ZoomPath",
 ]
