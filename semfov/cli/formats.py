@@ -205,8 +205,8 @@ class Coco(ResultsFormat):
 
         names = record.classes[1:]
         categories = coco_categories()
-        known = {canonical_name(category["name"]) for category in categories}
-        if not {canonical_name(name) for name in names} <= known:
+        names_in_coco = {canonical_name(category["name"]) for category in categories}
+        if not {canonical_name(name) for name in names} <= names_in_coco:
             categories = [{"id": number, "name": name} for number, name in enumerate(names, 1)]
         annotations = []
         for result in record.to_coco(0, categories):
@@ -216,6 +216,7 @@ class Coco(ResultsFormat):
 
     def text(self, rows: Sequence[Row]) -> str:
         """Write images, annotations and categories; pictures and annotations are numbered from 1."""
+        # Rows have no ids, since pictures come in any order, and those before them may be skipped.
         looked_at = _looked_at(rows)
         images = []
         annotations: list[Values] = []

@@ -22,7 +22,7 @@ from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
-from semfov.paths.conversion import Conversion
+from semfov.paths.conversion import Conversion, Values
 from semfov.paths.files import Format
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
 
@@ -124,8 +124,9 @@ class Record(Conversion):
         """
         for look in self:
             x1, y1, x2, y2 = whole_pixels(look.region, self.size)
-            across = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
-            pixels = read_region(source, (x1, y1, x2, y2), self.size, across)
+            # Read no more pixels than the detector saw of it.
+            width_seen = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
+            pixels = read_region(source, (x1, y1, x2, y2), self.size, width_seen)
             boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
             x, y = look.fixation
             yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
@@ -214,7 +215,7 @@ class Record(Conversion):
 
         return write_page(Path(path), f"semfov: {self.describe()}", [self.page_data(**options)])
 
-    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
+    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> Values:
         """Collect the data of the record for a page (`semfov.report.zoom.zoom_data`, for a scanpath `episode_data`).
 
         Args:
@@ -275,16 +276,17 @@ class Record(Conversion):
         except InputError as error:
             got = " ".join(str(error).split())
             raise DataError(f"{path}: expected a complete {cls._format.kind}, got: {got}") from None
+        # What a record derives from its looks is in the file, too, and no argument.
         arguments = {field.name for field in fields_of(cls) if field.init}
         return cls(**{name: value for name, value in fields.items() if name in arguments})
 
     @abstractmethod
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
         """Tensors and JSON values of a file, beside those of the base."""
 
     @classmethod
     @abstractmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: Values) -> Values:
         """Make the other attributes from the tensors and JSON values of a file."""
 
 

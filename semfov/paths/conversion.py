@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     import pandas
     import supervision
 
+Values = dict[str, Any]
+"""JSON values by name: a row of a table, or an object of a file."""
+
 _Table = Literal["looks", "objects"]  # tables of a record
 
 _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
@@ -81,7 +84,7 @@ class Conversion(Outcome, OtherWords):
         """
         return self.words.summary()
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[Values]:
         """Make a table of the looks, of plain values, whose first columns all kinds of records have.
 
         `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
@@ -94,13 +97,14 @@ class Conversion(Outcome, OtherWords):
         Returns:
             One dictionary for each look.
         """
+        # Of several closer looks after one look, the surest counts.
         closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda look: look.place)}
         brought = Counter(self.objects.passes.tolist())
-        rows: list[dict[str, Any]] = []
+        rows: list[Values] = []
         for look in self:
             detections = confident_detections(look.detections)
             count = int(detections.count)
-            row: dict[str, Any] = {
+            row: Values = {
                 "look": look.number,
                 **_rounded_place(*look.fixation, *look.region),
                 "detections": count,
@@ -116,7 +120,7 @@ class Conversion(Outcome, OtherWords):
             rows.append(row)
         return rows
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Values:
         """Convert the outcome, the objects (`object_rows`) and the looks (`rows`) to JSON values.
 
         Returns:
@@ -139,7 +143,7 @@ class Conversion(Outcome, OtherWords):
             "looks": self.rows(),
         }
 
-    def _decision_values(self) -> dict[str, Any]:
+    def _decision_values(self) -> Values:
         """Make JSON values of the decision, with the point and the box of a found target; empty without one."""
         decision = self.decision
         if decision is None:
@@ -153,7 +157,7 @@ class Conversion(Outcome, OtherWords):
             **_rounded_place(*point, *box),
         }
 
-    def object_rows(self) -> list[dict[str, Any]]:
+    def object_rows(self) -> list[Values]:
         """Make a table of the objects, of plain values, most confident first.
 
         `x1`, `y1`, `x2` and `y2` are the box of the object and `x` and `y` the middle of the box, in picture pixels.
@@ -231,7 +235,7 @@ class Conversion(Outcome, OtherWords):
         """
         return _written(json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", path)
 
-    def _table(self, table: str) -> tuple[list[dict[str, Any]], list[str]]:
+    def _table(self, table: str) -> tuple[list[Values], list[str]]:
         """Make the rows and the names of the columns of a table."""
         check(table in get_args(_Table), "table", "looks or objects", table)
         if table == "objects":
@@ -272,7 +276,7 @@ class Conversion(Outcome, OtherWords):
 
     def to_coco(
         self, image_id: int | str = 1, categories: Sequence[int | str] | Sequence[Mapping[str, Any]] | None = None
-    ) -> list[dict[str, Any]]:
+    ) -> list[Values]:
         """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
 
         Args:
@@ -294,8 +298,8 @@ class Conversion(Outcome, OtherWords):
 
     def _check_classes_in(self, categories: Sequence[Mapping[str, Any]]) -> None:
         """Raise `InputError` unless all classes are among COCO's own categories."""
-        known = {canonical_name(str(category["name"])) for category in categories}
-        strange = [name for name in self.classes[1:] if canonical_name(name) not in known]
+        names_in_coco = {canonical_name(str(category["name"])) for category in categories}
+        strange = [name for name in self.classes[1:] if canonical_name(name) not in names_in_coco]
         check(
             not strange,
             "categories",
@@ -307,6 +311,7 @@ class Conversion(Outcome, OtherWords):
         """Find the category id of each class 1..K, or in categories of a file of each class that an object has."""
         names = self.classes[1:]
         if any(isinstance(category, Mapping) for category in categories):
+            # A file may lack classes of the detector, of which there is no object.
             present = sorted(set(self.objects.labels.tolist()))
             numbers = category_ids(categories, [names[label - 1] for label in present])
             return dict(zip(present, numbers, strict=True))
@@ -377,7 +382,7 @@ class Conversion(Outcome, OtherWords):
 
     def to_geojson(
         self, path: str | PathLike[str] | None = None, *, source: str | PathLike[str] | None = None
-    ) -> dict[str, Any]:
+    ) -> Values:
         """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
 
         For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84), and a box over the antimeridian
@@ -403,7 +408,7 @@ class Conversion(Outcome, OtherWords):
         file = self.source if source is None else fspath(source)
         place = None if file is None else georeference(file)
         in_pixels = "pixels of the picture: x to the right, y down"
-        collection: dict[str, Any] = {
+        collection: Values = {
             "type": "FeatureCollection",
             "coordinates": in_pixels if place is None else "longitude and latitude, WGS 84",
             "features": [
@@ -419,8 +424,9 @@ class Conversion(Outcome, OtherWords):
         return collection
 
 
-def _geometry(row: Mapping[str, Any], place: PlaceOnEarth | None) -> dict[str, Any]:
+def _geometry(row: Mapping[str, Any], place: PlaceOnEarth | None) -> Values:
     """Make the GeoJSON geometry of an object's box, on earth or in pixels."""
+    # Outer rings are counterclockwise (RFC 7946, 3.1.6), as seen with y down in the picture and with north up on earth.
     corners = [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
     if place is not None:
         return box_on_earth(np.array(corners), place)
@@ -444,7 +450,7 @@ def _written(text: str, path: str | PathLike[str] | None) -> str:
     return text
 
 
-def coco_categories() -> list[dict[str, Any]]:
+def coco_categories() -> list[Values]:
     """Return the categories of COCO's annotation files, as torchvision has them: `id` and `name` of each."""
     from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 

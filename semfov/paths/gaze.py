@@ -412,12 +412,12 @@ class GazePrediction(OtherWords):
         """Describe the prediction in one line."""
         first = self.peaks(1)[0]
         reach = _REACH * max(self.size)
-        seen = ""
+        limit = ""
         if self.seen is not None:
-            seen = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
+            limit = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
         return (
             f"{100 * first['share']:.0f} % of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
-            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{seen}"
+            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{limit}"
         )
 
     def __repr__(self) -> str:
@@ -487,17 +487,17 @@ def _fixations_of(given: object, argument: str, size: tuple[int, int], source: s
     Raises:
         InputError: they are not those of one viewer of this picture.
     """
-    one = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
+    expected = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
     if isinstance(given, Record):
         given = given.as_fixations(given.source or source or "")
     elif isinstance(given, list | tuple) and any(isinstance(entry, Fixations | Record) for entry in given):
-        check(False, argument, one, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
+        check(False, argument, expected, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
     elif isinstance(given, list | tuple | np.ndarray | Tensor):
         try:
             given = Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
         except InputError as error:
-            raise InputError(f"{argument}: expected {one}, got a {type(given).__name__} ({error})") from None
+            raise InputError(f"{argument}: expected {expected}, got a {type(given).__name__} ({error})") from None
     if not isinstance(given, Fixations):
-        raise InputError(f"{argument}: expected {one}, got {type(given).__name__}")
+        raise InputError(f"{argument}: expected {expected}, got {type(given).__name__}")
     check_viewed(given, argument, size, source)
     return warn_of_frames(argument, [given], stacklevel=4)[0].resized(size)

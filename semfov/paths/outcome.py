@@ -211,8 +211,8 @@ class Outcome(ABC):
             return None
         places = [(look.box, look.place) for look in self.closer]
         if not places:
-            seen = self.candidates.of(self.sought)
-            places = list(zip(seen.boxes, seen.scores.tolist(), strict=True))
+            candidates = self.candidates.of(self.sought)
+            places = list(zip(candidates.boxes, candidates.scores.tolist(), strict=True))
         return max(places, key=lambda place: place[1], default=None)
 
     @property

@@ -88,7 +88,7 @@ class Stimulus:
 def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     """Reduce a picture to the bytes that a record keeps for its drawings, `(3, h, w)`."""
     if isinstance(picture, Tensor):
-        width, height = picture.shape[-1], picture.shape[-2]
+        height, width = picture.shape[-2:]
     else:
         width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))

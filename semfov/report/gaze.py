@@ -14,7 +14,8 @@ from semfov.report.episode import Data, jpeg_uri
 from semfov.report.template import colour_steps, filled
 from semfov.viz.style import COLOURS, overlay_colours
 
-_WIDTH, _QUALITY = 960, 80
+_WIDTH = 960  # of the picture in pixels
+_QUALITY = 80  # of the picture as JPEG
 _MOST_STEPS = 12  # largest number of fixations of the slider
 
 

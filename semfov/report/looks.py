@@ -81,7 +81,8 @@ def _overview(data: Data, place: str) -> str:
     if data["best"]:
         shapes.append(f'<g class="best"><title>best place</title>{framed(data["best"])}</g>')
     for (number, box), tag in zip(windows, tags, strict=True):
-        x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
+        x = (tag[0] + tag[2]) / 2
+        y = (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
         shapes.append(f'<g class="window" data-look="{number}">{framed(box)}{rect(tag, "tag")}{text}</g>')
     objects = f"{data['count']} object{'s' if data['count'] != 1 else ''}"
@@ -115,9 +116,9 @@ def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> li
     corners = [_corner_places(found["box"], size) for found, size in zip(data["objects"], sizes, strict=True)]
     places = place_within(corners, sizes, (width, height), obstacles)
     shapes = []
-    for order, (found, name, where) in enumerate(zip(data["objects"], names, places, strict=True), 1):
-        x = where[0] + 2 * unit
-        y = (where[1] + where[3]) / 2
+    for order, (found, name, label) in enumerate(zip(data["objects"], names, places, strict=True), 1):
+        x = label[0] + 2 * unit
+        y = (label[1] + label[3]) / 2
         text = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{escape(name)}</text>'
         kind = "object confirmed" if found["confirmed"] else "object"
         confirmed = ", confirmed" if found["confirmed"] else ""
@@ -156,11 +157,13 @@ def _look(data: Data, number: int, place: str) -> str:
 def _detection_shapes(look: Data, target: str | None) -> str:
     """Draw the detections of a look, and over all boxes their numbers."""
     unit = look["size"][0] / 640
-    boxes, tags = [], []
+    boxes = []
+    tags = []
     for order, detection in enumerate(look["detections"], 1):
         kind = "detection target" if detection["label"] == target else "detection"
         boxes.append(f'<g class="{kind}">{framed(detection["box"])}</g>')
         left, top, right, bottom = detection["tag"]
+        # Fonts of browsers differ: the text is stretched or squeezed into its rectangle.
         text = (
             f'<text x="{left + 4 * unit:.1f}" y="{(top + bottom) / 2:.1f}" font-size="{19 * unit:.1f}" '
             f'textLength="{max(right - left - 8 * unit, 0):.1f}" lengthAdjust="spacingAndGlyphs">{order}</text>'

@@ -46,8 +46,7 @@ def zoom_data(
     """
     source = _opened(path, picture)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    whole = (0, 0, *path.size)
-    image = read_region(source, whole, path.size, min(width, path.size[0]))
+    image = read_region(source, (0, 0, *path.size), path.size, min(width, path.size[0]))
     looks = [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)]
     return {
         "name": name,
@@ -68,10 +67,10 @@ def _opened(path: Record, picture: LargePicture | ImageLike | None) -> LargePict
     """Open the picture of a record, or a reduced one with the same proportions up to a pixel."""
     source = open_large(photograph_of(path, None) if picture is None else picture)
     width, height = path.size
-    across, down = source.size
-    same_proportions = abs(across * height - down * width) <= max(width, height)
+    source_width, source_height = source.size
+    same_proportions = abs(source_width * height - source_height * width) <= max(width, height)
     expected = f"the picture of the record, {width} × {height} px, or a reduced one"
-    check(across <= width and same_proportions, "picture", expected, source.size)
+    check(source_width <= width and same_proportions, "picture", expected, source.size)
     return source
 
 

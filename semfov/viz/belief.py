@@ -95,7 +95,8 @@ def plot_belief(
     photograph = scanpath.image if image is None else image
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
-    figure_width, figure_height = 5.6, 4.6
+    figure_width = 5.6
+    figure_height = 4.6
     if fixation is None:
         width, height = scanpath.grid.extent.tolist()
         figure_width = max(2.6 * columns, 3.2) + 0.6

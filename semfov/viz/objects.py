@@ -127,13 +127,15 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
     rows = [row for row in record.object_rows() if row["look"] <= last]
     many = len(rows) > _NAMED
+    # Names would only repeat the class that was searched for, and take room that many labels do not have.
     one_class = many and record.target is not None
+    thin = 0.8 if many else 1.2
     width = record.size[0]
     for row in reversed(rows):
         score = f"{row['score']:.2f}"
         text = score if one_class else f"{row['class']} {score}"
         colour = FOUND if row["confirmed"] else TARGET
-        line_width = 2.0 if row["confirmed"] else 0.8 if many else 1.2
+        line_width = 2.0 if row["confirmed"] else thin
         for shift in (0, width) if row["x2"] > width else (0,):
             box = (row["x1"] - shift, row["y1"], row["x2"] - shift, row["y2"])
             marks.append(Mark(box, colour, "-", line_width, text))
@@ -160,6 +162,7 @@ def draw_mark_labels(axes: Axes, record: Record, marks: Sequence[Mark], obstacle
         marks: boxes of all its looks (`object_marks`).
         obstacles: rectangles that no label covers.
     """
+    # The labels of the most confident objects are placed first, and have the best places.
     tags = [Tag(mark.box, mark.text, mark.colour) for mark in reversed(marks) if mark.text is not None]
     draw_tags(axes, tags[:_LABELLED], record.size, obstacles, many=len(record.objects) > _NAMED)
 

@@ -98,11 +98,8 @@ def _number_place(region: Box, room: float, others: list[tuple[float, float]]) -
         The middle of the number.
     """
     x1, y1, x2, y2 = region
-    left = x1 + room / 2
-    right = x2 - room / 2
-    top = y1 + room / 2
-    bottom = y2 - room / 2
-    places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
+    corners = [(x, y) for y in (y1 + room / 2, y2 - room / 2) for x in (x1 + room / 2, x2 - room / 2)]
+    places = [*corners, ((x1 + x2) / 2, (y1 + y2) / 2)]
     distances = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in others)]) for u, v in places]
     return places[distances.index(max(distances))]
 

@@ -20,8 +20,11 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette, whose colours differ under every common form of colour blindness."""
 
-GAZE, TARGET, FOUND, TRUTH, OTHER = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[4], COLOURS[5]
-"""Colours with a meaning: gaze, detections of the target, the found target, annotated boxes, other detections."""
+GAZE = COLOURS[0]
+TARGET = COLOURS[1]  # detections of the target
+FOUND = COLOURS[2]  # the found target
+TRUTH = COLOURS[4]  # annotated boxes
+OTHER = COLOURS[5]  # other detections
 
 _LINES = ("-", "--", "-.", ":")
 
