@@ -40,6 +40,7 @@ from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor
 from semfov.viz import plot_belief_bars, plot_foveated_strip
 from semfov.viz.drawing import (
+    Tag,
     choose_fixations,
     draw_boxes,
     draw_cells,
@@ -210,7 +211,7 @@ def _foveal_scene(example: Example) -> Figure:
     distances = example.grid.box_distance(boxes, example.fixation).tolist()
     names = [example.scanpath.classes[label] for label in detections.labels[0].tolist()]
     tags = [
-        ((x1, y1, x2, y2), f"{name}, d = {distance:.2f}", OTHER)
+        Tag((x1, y1, x2, y2), f"{name}, d = {distance:.2f}", OTHER)
         for (x1, y1, x2, y2), name, distance in zip(boxes.tolist(), names, distances, strict=True)
     ]
     draw_tags(axes, tags, example.frame, [])

@@ -255,7 +255,7 @@ class Record(Conversion):
             InputError: the name is that of a table, a page, a picture or a film.
             DataError: the file cannot be written.
         """
-        self._format.write(path, vars(self), *self._contents())
+        self._format.write(path, self, *self._contents())
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:

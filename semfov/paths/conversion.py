@@ -168,7 +168,7 @@ class Conversion(Outcome, OtherWords):
         """
         objects = self.objects
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
-        rows = []
+        rows: list[Values] = []
         for label, score, confirmed, look, box in zip(*(column.tolist() for column in columns), strict=True):
             x1, y1, x2, y2 = box
             rows.append(

@@ -1,9 +1,9 @@
 """Files of records: tensors, with JSON values that describe them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
@@ -81,6 +81,23 @@ _OTHERS = {
 """Calls that write files with these ends of names."""
 
 
+class _Shared(Protocol):
+    """What all records have, beside the attributes that are JSON values."""
+
+    @property
+    def classes(self) -> Sequence[str]: ...
+    @property
+    def targets(self) -> Sequence[int]: ...
+    @property
+    def detections(self) -> Sequence[Detections]: ...
+    @property
+    def decision(self) -> Decision | None: ...
+    @property
+    def closer(self) -> Sequence[CloseUp]: ...
+    @property
+    def photograph(self) -> Tensor | None: ...
+
+
 class Format:
     """Format of the files of one kind of records.
 
@@ -99,7 +116,7 @@ class Format:
     def write(
         self,
         path: str | PathLike[str],
-        fields: Mapping[str, Any],
+        outcome: _Shared,
         tensors: Mapping[str, Tensor],
         record: Mapping[str, Any],
     ) -> None:
@@ -107,7 +124,7 @@ class Format:
 
         Args:
             path: the file.
-            fields: attributes of the record by their names, of which those of all records are taken.
+            outcome: the record, whose attributes that all records have are written.
             tensors: the tensors of its kind.
             record: the JSON values of its kind.
 
@@ -118,19 +135,19 @@ class Format:
         call = _OTHERS.get(Path(path).suffix.lower())
         name = repr(fspath(path))
         check(call is None, "path", "a file of a record, such as 'record.safetensors'", f"{name}; use {call}({name})")
-        decision: Decision | None = fields["decision"]
+        decision = outcome.decision
         values = {
             "kind": self.kind,
             "version": __version__,
-            "classes": list(fields["classes"]),
-            "lengths": [look.mask.shape[-1] for look in fields["detections"]],
-            **{name: fields[name] for name in _PLAIN},
-            "targets": list(fields["targets"]),
+            "classes": list(outcome.classes),
+            "lengths": [look.mask.shape[-1] for look in outcome.detections],
+            **{name: getattr(outcome, name) for name in _PLAIN},
+            "targets": list(outcome.targets),
             "decision": None if decision is None else {name: getattr(decision, name) for name in _DECISION},
-            "closer": [{name: getattr(look, name) for name in _CLOSER} for look in fields["closer"]],
+            "closer": [{name: getattr(look, name) for name in _CLOSER} for look in outcome.closer],
             **record,
         }
-        write_file(path, {**_shared_tensors(fields), **tensors}, values)
+        write_file(path, {**_shared_tensors(outcome), **tensors}, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
         """Read and check a file that `write` wrote.
@@ -165,19 +182,17 @@ class Format:
         return tensors, record, shared
 
 
-def _shared_tensors(fields: Mapping[str, Any]) -> dict[str, Tensor]:
+def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
     """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
-    looks: tuple[Detections, ...] = fields["detections"]
-    decision: Decision | None = fields["decision"]
     tensors = {}
     for name in (*_DETECTIONS, "confidence"):
-        tensors[name] = torch.cat([getattr(look, name)[0] for look in looks])
-    if decision is not None and decision.box is not None:
-        tensors["box"] = decision.box
-    if fields["photograph"] is not None:
-        tensors["photograph"] = fields["photograph"]
-    if fields["closer"]:
-        tensors["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
+        tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
+    if outcome.decision is not None and outcome.decision.box is not None:
+        tensors["box"] = outcome.decision.box
+    if outcome.photograph is not None:
+        tensors["photograph"] = outcome.photograph
+    if outcome.closer:
+        tensors["closer_boxes"] = torch.stack([look.box for look in outcome.closer])
     return tensors
 
 

@@ -157,7 +157,7 @@ def object_data(record: Record) -> Data:
     objects = []
     for row, score in zip(rows[:_DRAWN], record.objects.scores.tolist(), strict=False):
         box = [row[edge] for edge in ("x1", "y1", "x2", "y2")]
-        more = {name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row}
+        more: Data = {name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row}
         objects.append({"box": box, "label": row["class"], "score": score, **more})
     return {
         "pixels": f"{width} × {height} px",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
 
@@ -96,9 +96,10 @@ def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
 
     if not entries:
         return
+    styles: list[dict[str, Any]] = [{"color": entry.colour, "linestyle": entry.line} for entry in entries]
     letters = sum(len(entry.text) + 6 for entry in entries)
     legend = axes.legend(
-        [Line2D([], [], linewidth=1.8, color=entry.colour, linestyle=entry.line) for entry in entries],
+        [Line2D([], [], linewidth=1.8, **style) for style in styles],
         [entry.text for entry in entries],
         loc="upper center",
         bbox_to_anchor=(0.5, 0),
