@@ -21,9 +21,11 @@ from semfov.detection.onnx import OnnxDetector
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_spans
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import Gist
+from semfov.zoom.pooling import pool_spans
+from semfov.zoom.survey import STEPS
 
 _LOOK_METADATA_KEY = "semfov.look"
 

@@ -15,7 +15,8 @@ from semfov.io.compatibility import learned_for
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import CASE, features
+from semfov.zoom.evidence import CASE
+from semfov.zoom.hint_maps import features
 
 KINDS = (
     FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, GlimpseEvidence,

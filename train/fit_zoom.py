@@ -38,7 +38,8 @@ from semfov.runs.command import command
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker
-from semfov.zoom.evidence import GlimpseEvidence, Survey
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.survey import Survey
 from train.outputs import write_outputs
 from train.zoom_choice import choose_foresight, choose_patience
 from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, PicturesFit, RefitPart

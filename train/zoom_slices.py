@@ -7,11 +7,13 @@ from torch import Tensor
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import WindowStep, look_by_look
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_hit
+from semfov.zoom.pooling import pool
+from semfov.zoom.survey import STEPS
 
 
 def look_for_slice(
@@ -98,7 +100,7 @@ def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
     x1, y1, x2, y2 = window.cells
     row = min(max((y1 + y2) // 2, 0), belief.lattice.rows - 1)
     column = min(max((x1 + x2) // 2, 0), belief.lattice.columns - 1)
-    return int(belief.source[row, column]) < level
+    return int(belief.closest_level[row, column]) < level
 
 
 def odds_of(belief: ZoomBelief, window: Window) -> float:

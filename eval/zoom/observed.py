@@ -6,10 +6,10 @@ from torch.nn import functional as F
 
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
-from semfov.zoom.evidence import STEPS
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.survey import STEPS
 
 
 class ObservedRates:

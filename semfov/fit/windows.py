@@ -22,8 +22,9 @@ from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.workers import prepare_worker, run_tasks
-from semfov.zoom.evidence import GlimpseEvidence, Survey
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
+from semfov.zoom.survey import Survey
 
 _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, those with the most objects
 

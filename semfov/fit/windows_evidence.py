@@ -26,10 +26,12 @@ from semfov.fit.training import descend
 from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
 from semfov.zoom.belief import before_of
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, Survey, pool
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLooks, half_steps
+from semfov.zoom.pooling import pool
+from semfov.zoom.survey import STEPS, Survey
 
 _SHOWN_CLASSES = 8  # largest number of classes of a mosaic, shown clearly, whose rates are fitted in one step
 _HINTED_CLASSES = 4  # and that of classes that are only hinted at

@@ -8,69 +8,107 @@ from torch import Tensor
 from semfov.data.windowed import LargePicture
 from semfov.zoom.lattice import Lattice
 
+_CORNER = 64  # side in pixels of the corners in which a colour of the border is looked for
+
+_Colour = tuple[int, ...]
 _Spans = list[tuple[int, int]]
+"""First and end of several parts of a line."""
 
 
 def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
-    """Cells `(rows, columns)` without data, or of a corner's colour up to the border; None where no cell is blank."""
-    (width, height), (wide, high) = lattice.size, (min(64, length) for length in lattice.size)
-    corners = [(x, y, x + wide, y + high) for y in (0, height - high) for x in (0, width - wide)]
-    parts = [picture.pixels(box) for box in corners]
-    colours: set[tuple[int, ...]] = {tuple(part[0, 0].tolist()) for part in parts if (part == part[0, 0]).all()}
+    """Find cells without data, and cells of a corner's colour that reach the border of the picture.
+
+    Args:
+        picture: source of the pixels.
+        lattice: its cells.
+
+    Returns:
+        `(rows, columns)` boolean; None where no cell is blank.
+    """
+    colours = _corner_colours(picture, lattice.size)
     if not colours and picture.nothing is None:
         return None
-    reduction = picture.reduction(1 / lattice.magnifications[0])
-    pixels = picture.read((0, 0, width, height), reduction).numpy()
-    blank, (height, width) = np.zeros((lattice.rows, lattice.columns), bool), pixels.shape[1:]
-    down = _spans(lattice.rows, lattice.pitch[1] * (height / lattice.size[1]), height)
-    across = _spans(lattice.columns, lattice.pitch[0] * (width / lattice.size[0]), width)
-    # A pixel of each cell first: most cells have another colour, and the others are few strips.
-    some = pixels[:, [first for first, _ in down]][:, :, [first for first, _ in across]]
-    rows, columns = ([(n, n + 1) for n in range(length)] for length in blank.shape)
+    width, height = lattice.size
+    pixels = picture.read((0, 0, width, height), picture.reduction(1 / lattice.magnifications[0])).numpy()
+    pixel_rows, pixel_columns = pixels.shape[1:]
+    down = _cell_pixels(lattice.rows, lattice.pitch[1] * (pixel_rows / height), pixel_rows)
+    across = _cell_pixels(lattice.columns, lattice.pitch[0] * (pixel_columns / width), pixel_columns)
+    blank = np.zeros((lattice.rows, lattice.columns), bool)
     for colour in colours:
-        perhaps = _from_border(_of_colour(some, colour, rows, columns))
-        for x1, x2 in _runs(perhaps.any(0)):
-            for y1, y2 in _runs(perhaps[:, x1:x2].any(1)):
-                perhaps[y1:y2, x1:x2] &= _of_colour(pixels, colour, down[y1:y2], across[x1:x2])
-        blank |= _from_border(perhaps)
+        blank |= _border_of_colour(pixels, colour, down, across)
     if picture.nothing is not None:
         blank |= _of_colour(pixels, picture.nothing, down, across)
     return torch.from_numpy(blank) if blank.any() else None
 
 
-def _of_colour(pixels: NDArray[np.uint8], colour: tuple[int, ...], down: _Spans, across: _Spans) -> NDArray[np.bool_]:
-    """Whether all pixels of some cells have a colour, up to rounding; pixels `(3, h, w)` → `(rows, columns)`."""
-    low, span = np.array([(max(value, 1) - 1, min(value, 254) - max(value, 1) + 2) for value in colour]).T.astype(
-        np.uint8
-    )
-    (top, bottom), (left, right) = ((spans[0][0], spans[-1][1]) for spans in (down, across))
-    part, width = pixels[:, top:bottom, left:right].transpose(1, 2, 0), right - left
+def _corner_colours(picture: LargePicture, size: tuple[int, int]) -> set[_Colour]:
+    """Find the colours of the corners that have one colour alone."""
+    width, height = size
+    across = min(_CORNER, width)
+    down = min(_CORNER, height)
+    colours = set()
+    for y in (0, height - down):
+        for x in (0, width - across):
+            corner = picture.pixels((x, y, x + across, y + down))
+            if (corner == corner[0, 0]).all():
+                colours.add(tuple(corner[0, 0].tolist()))
+    return colours
+
+
+def _border_of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
+    """Find cells of a colour that reach the border over cells of it; `down` and `across` are the pixels of cells."""
+    # A pixel of each cell first: most cells have another colour, and the others are few strips.
+    sample = pixels[:, [first for first, _ in down]][:, :, [first for first, _ in across]]
+    single_rows = [(row, row + 1) for row in range(len(down))]
+    single_columns = [(column, column + 1) for column in range(len(across))]
+    candidates = _reaching_border(_of_colour(sample, colour, single_rows, single_columns))
+    for x1, x2 in _runs(candidates.any(0)):
+        for y1, y2 in _runs(candidates[:, x1:x2].any(1)):
+            candidates[y1:y2, x1:x2] &= _of_colour(pixels, colour, down[y1:y2], across[x1:x2])
+    return _reaching_border(candidates)
+
+
+def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
+    """Find cells all of whose pixels have a colour, up to rounding; pixels `(3, h, w)` → `(rows, columns)`."""
+    lowest = np.array([max(value, 1) - 1 for value in colour], np.uint8)
+    highest = np.array([min(value, 254) + 1 for value in colour], np.uint8)
+    top = down[0][0]
+    bottom = down[-1][1]
+    left = across[0][0]
+    right = across[-1][1]
+    width = right - left
+    part = pixels[:, top:bottom, left:right].transpose(1, 2, 0).reshape(bottom - top, -1)
     # Bytes below the lowest wrap round to large ones.
-    other = part.reshape(bottom - top, -1) - np.tile(low, width) > np.tile(span, width)
-    other = np.stack([other[first - top : end - top].any(0) for first, end in down])
-    other = np.logical_or.reduce(other.reshape(len(down), width, -1), -1)
-    return ~np.stack([other[:, first - left : end - left].any(1) for first, end in across], 1)
+    differs = part - np.tile(lowest, width) > np.tile(highest - lowest, width)
+    differs = np.stack([differs[first - top : end - top].any(0) for first, end in down])
+    differs = np.logical_or.reduce(differs.reshape(len(down), width, -1), -1)
+    return ~np.stack([differs[:, first - left : end - left].any(1) for first, end in across], 1)
 
 
-def _spans(cells: int, pitch: float, length: int) -> _Spans:
-    """First and end of the pixels of each cell; those at the border of two cells count for both."""
-    firsts = [min(int(cell * pitch), length - 1) for cell in range(cells)]
-    return [(first, min(max(int(np.ceil((n + 1) * pitch)), first + 1), length)) for n, first in enumerate(firsts)]
+def _cell_pixels(cells: int, pitch: float, length: int) -> _Spans:
+    """List first and end of the pixels of each cell; those at the border of two cells count for both."""
+    spans = []
+    for cell in range(cells):
+        first = min(int(cell * pitch), length - 1)
+        end = max(int(np.ceil((cell + 1) * pitch)), first + 1)
+        spans.append((first, min(end, length)))
+    return spans
 
 
-def _runs(marked: NDArray[np.bool_] | np.bool_) -> list[tuple[int, int]]:
-    """First and end of each run of marked places in a row."""
-    turns = np.flatnonzero(np.diff(np.pad(marked.astype(np.int8), 1))).tolist()
-    return [*zip(turns[::2], turns[1::2], strict=True)]
+def _runs(marked: NDArray[np.bool_] | np.bool_) -> _Spans:
+    """List first and end of each run of marked places in a row."""
+    changes = np.flatnonzero(np.diff(np.pad(marked.astype(np.int8), 1))).tolist()
+    return [*zip(changes[::2], changes[1::2], strict=True)]
 
 
-def _from_border(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those of some cells that reach the border over their neighbours."""
+def _reaching_border(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep the marked cells that reach the border over marked neighbours; `(rows, columns)`."""
     reached = cells.copy()
     reached[1:-1, 1:-1] = False
     while True:
-        wider = np.pad(reached, 1)
-        grown = cells & (wider[1:-1, 1:-1] | wider[:-2, 1:-1] | wider[2:, 1:-1] | wider[1:-1, :-2] | wider[1:-1, 2:])
+        padded = np.pad(reached, 1)
+        neighbours = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+        grown = cells & (reached | neighbours)
         if (grown == reached).all():
             return reached
         reached = grown

@@ -31,8 +31,8 @@ SPREAD = 0.3  # the spread of a certainty (`Certainty`) for which none was fitte
 
 SEVERAL = 5  # the number of likely or clear objects from which on a detector reacts
 
-_SURE, _PART = 0.5, 0.6
-"""Probability and share of the objects to which a detector reacts (`reacts`)."""
+_LIKELY = 0.5  # probability from which on an object is likely
+_LIKELY_SHARE = 0.6  # share of the sum of all probabilities that likely objects have where a detector reacts
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,14 @@ class Certainty:
     .. math:: R = R_1 + w R_2, \qquad E[c] = \frac{k c_0 + F}{k + u W}, \qquad
               E[n] = E[c] R, \qquad \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
 
-    The `spread` is the standard deviation of the share by which the model is off in a picture.
+    Attributes:
+        offset: constant of the regression.
+        weights: its weights, one for each of `FACTS`.
+        scale: :math:`c_0`, share of the expected objects that looks show.
+        strength: k, how little discoveries change the scale; infinite where they do not.
+        faint: w, weight of objects that are expected in cells which do not clearly promise one.
+        promise: u, weight of what was promised.
+        spread: standard deviation of the share by which the model is off in a picture.
     """
 
     offset: float
@@ -58,6 +65,17 @@ class Certainty:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
+        """Make a certainty from the numbers of a file.
+
+        Args:
+            numbers: as `numbers` lists them; two are an offset and the weight of the score.
+
+        Returns:
+            The certainty.
+
+        Raises:
+            InputError: there are too few or too many.
+        """
         if len(numbers) == 2:
             return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
         count = len(FACTS) + 6
@@ -72,11 +90,27 @@ class Certainty:
         return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise, self.spread]
 
     def probability(self, facts: Tensor) -> Tensor:
-        """The probabilities of objects; facts `(M, 14)` → `(M,)`."""
+        """Compute the probabilities of objects.
+
+        Args:
+            facts: `(M, 14)`, `FACTS` about each object.
+
+        Returns:
+            `(M,)`.
+        """
         return (self.offset + facts @ facts.new_tensor(self.weights)).sigmoid()
 
     def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[float, float]:
-        """How many objects further looks would show."""
+        """Estimate how many objects further looks would show, n.
+
+        Args:
+            expected: objects that the evidence still expects, in cells that clearly promise one and in others.
+            promised: W, objects that the looks so far promised.
+            discoveries: F, objects that they have shown for the first time.
+
+        Returns:
+            Mean and variance of n.
+        """
         clear, faint = expected
         number = clear + self.faint * faint
         if math.isinf(self.strength):
@@ -87,29 +121,50 @@ class Certainty:
 
 
 def reacts(chances: Tensor) -> bool:
-    """Whether a detector reacts to objects of these probabilities `(M,)`: several are likely, or most of their sum."""
-    sure = chances[chances >= _SURE]
-    return len(sure) >= SEVERAL or float(sure.sum()) >= _PART * float(chances.sum())
+    """Tell whether a detector reacts to objects: several are likely, or the likely ones have most of the sum.
+
+    Args:
+        chances: `(M,)`, probabilities of the objects.
+
+    Returns:
+        Whether it does.
+    """
+    likely = chances[chances >= _LIKELY]
+    return len(likely) >= SEVERAL or float(likely.sum()) >= _LIKELY_SHARE * float(chances.sum())
 
 
 def number_of_faint(chances: Tensor) -> tuple[float, float]:
-    r"""Mean and variance of the number of objects of a class to which the detector hardly reacts.
+    r"""Estimate the number of objects of a class to which the detector hardly reacts.
 
     It misses as many as it shows: in 71 photographs of the fit in which it hardly reacts to people, the probabilities
     have a sum of 150, and there are 279 people. In 68 of them the true number is within two of the errors:
 
     .. math:: E = 2 \sum_i p_i, \qquad \sigma^2 = \sum_i p_i (1 - p_i) + (1 + E)^2
+
+    Args:
+        chances: `(M,)`, probabilities of the objects.
+
+    Returns:
+        Mean and variance.
     """
-    each = chances.double()
-    mean = 2 * float(each.sum())
-    return mean, float((each * (1 - each)).sum()) + (1 + mean) ** 2
+    p = chances.double()
+    mean = 2 * float(p.sum())
+    return mean, float((p * (1 - p)).sum()) + (1 + mean) ** 2
 
 
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
-    r"""Mean and variance of the number of objects with probabilities `(M,)`, and of those that no look has shown.
+    r"""Estimate the number of objects, with those that no look has shown.
 
     .. math:: E = \sum_i p_i + E[n], \qquad \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+
+    Args:
+        chances: `(M,)`, probabilities of the objects.
+        unseen: mean and variance of the number n of objects that no look has shown (`Certainty.unseen`).
+        spread: τ, standard deviation of the share by which the model is off in a picture.
+
+    Returns:
+        Mean and variance.
     """
-    each = chances.double()
-    mean = float(each.sum()) + unseen[0]
-    return mean, float((each * (1 - each)).sum()) + unseen[1] + (spread * mean) ** 2
+    p = chances.double()
+    mean = float(p.sum()) + unseen[0]
+    return mean, float((p * (1 - p)).sum()) + unseen[1] + (spread * mean) ** 2

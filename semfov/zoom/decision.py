@@ -16,7 +16,8 @@ from semfov.motion import Motion
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
 from semfov.zoom.episode import WindowStep
-from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence, features
+from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
+from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import WindowLook
@@ -73,7 +74,7 @@ class SearchFacts:
         # Number of looks of the last level that are expected to show the target. Windows start at every cell: this is
         # the mean over all ways to lay them side by side.
         showing = float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
-        share = float(self.belief.left.sum() / self.belief.there.sum().clamp(1))
+        share = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
         left = [math.log(showing + 1e-3) / 4, share]
         counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
         return torch.cat([hints, torch.tensor([*left, *counts])])

@@ -1,4 +1,13 @@
-"""The windows of a picture that an eye can look at: a grid of cells, and windows of cells one octave apart."""
+"""The windows of a picture that an eye can look at: a grid of cells, and windows of cells one octave apart.
+
+level 0                 level 1                 level 2, the last
+┌───────────────┐       ┌───────┬───────┐       ┌───┬───────────┐
+│               │       │ 16×16 │       │       │8×8│           │
+│    32 × 32    │       │ cells │       │       ├───┘           │     A window starts at any cell,
+│     cells     │       ├───────┘       │       │               │     so that windows overlap.
+│               │       │               │       │               │
+└───────────────┘       └───────────────┘       └───────────────┘
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +19,7 @@ from torch import Tensor
 from semfov.errors import check
 
 CELLS = 8  # cells along a side of the closest window
-MOST = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte in all
+MOST_CELLS = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte in all
 
 
 @dataclass(frozen=True)
@@ -59,13 +68,13 @@ class Lattice:
         check(min(size) >= 1, "picture", "a width and a height in pixels", size)
         check(finest > 0, "finest", "a positive magnification", finest)
         # Magnifications one octave apart, from the one that shows the whole picture up to the finest one.
-        steps = [min(canvas[0] / size[0], canvas[1] / size[1])]
-        while steps[-1] * 2 <= finest * (1 + 1e-9):
-            steps.append(steps[-1] * 2)
-        lattice = cls(size, canvas, tuple(steps))
+        magnifications = [min(canvas[0] / size[0], canvas[1] / size[1])]
+        while magnifications[-1] * 2 <= finest * (1 + 1e-9):
+            magnifications.append(magnifications[-1] * 2)
+        lattice = cls(size, canvas, tuple(magnifications))
         cells = lattice.columns * lattice.rows
         got = f"{cells:,} in {size[0]} × {size[1]} px; divide the picture, or look less closely, finest={finest / 2:g}"
-        check(cells <= MOST, "picture", f"at most {MOST:,} cells of a belief", got)
+        check(cells <= MOST_CELLS, "picture", f"at most {MOST_CELLS:,} cells of a belief", got)
         return lattice
 
     def __post_init__(self) -> None:
@@ -88,21 +97,21 @@ class Lattice:
     @cached_property
     def pitch(self) -> tuple[float, float]:
         """`(width, height)` of a cell in picture pixels."""
-        wide, high = self.window(self.levels - 1)
-        return wide / CELLS, high / CELLS
+        width, height = self.window(self.levels - 1)
+        return width / CELLS, height / CELLS
 
     @cached_property
     def columns(self) -> int:
         """Number of cells in a row."""
-        return _up(self.size[0] / self.pitch[0])
+        return _rounded_up(self.size[0] / self.pitch[0])
 
     @cached_property
     def rows(self) -> int:
         """Number of cells in a column."""
-        return _up(self.size[1] / self.pitch[1])
+        return _rounded_up(self.size[1] / self.pitch[1])
 
     def window(self, level: int) -> tuple[float, float]:
-        """Size of a window.
+        """Compute the size of a window.
 
         Args:
             level: its level, from 0.
@@ -114,7 +123,7 @@ class Lattice:
         return self.canvas[0] / magnification, self.canvas[1] / magnification
 
     def span(self, level: int) -> int:
-        """Number of cells along a side of a window.
+        """Count the cells along a side of a window.
 
         Args:
             level: its level, from 0.
@@ -125,7 +134,7 @@ class Lattice:
         return CELLS << (self.levels - 1 - level)
 
     def places(self, level: int) -> tuple[int, int]:
-        """Number of places at which a window can start.
+        """Count the places at which a window can start.
 
         Args:
             level: its level, from 0.
@@ -151,7 +160,7 @@ class Lattice:
         return sum(across * down for across, down in map(self.places, range(self.levels)))
 
     def boxes(self, actions: Tensor) -> Tensor:
-        """Windows of actions, which may reach beyond the picture.
+        """Compute the windows of actions, which may reach beyond the picture.
 
         Args:
             actions: `(..., 3)`: level, column and row of the first cell.
@@ -161,11 +170,11 @@ class Lattice:
         """
         pitch = torch.tensor(self.pitch, dtype=torch.float64)
         low = actions[..., 1:] * pitch
-        wide = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
-        return torch.cat([low, low + wide[actions[..., 0]]], -1).float()
+        sizes = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
+        return torch.cat([low, low + sizes[actions[..., 0]]], -1).float()
 
     def fixations(self, actions: Tensor) -> Tensor:
-        """Centres and magnifications of actions.
+        """Compute the centres and magnifications of actions.
 
         Args:
             actions: `(..., 3)`: level, column and row of the first cell.
@@ -178,7 +187,7 @@ class Lattice:
         return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5, magnification[..., None]], -1).float()
 
     def fixation(self, level: int, column: int, row: int) -> tuple[float, float, float]:
-        """Centre and magnification of one window: a row of `fixations`, computed without tensors.
+        """Compute centre and magnification of one window: a row of `fixations`, without tensors.
 
         Args:
             level: of the window.
@@ -188,15 +197,14 @@ class Lattice:
         Returns:
             `(x, y, m)`.
         """
-        x, y = (
-            (float(np.float32(first * pitch)) + float(np.float32(first * pitch + side))) / 2 - 0.5
-            for first, pitch, side in zip((column, row), self.pitch, self.window(level), strict=True)
-        )
-        x, y, magnification = np.array([x, y, self.magnifications[level]], np.float32).tolist()
+        width, height = self.window(level)
+        centre_x = _middle(column * self.pitch[0], width)
+        centre_y = _middle(row * self.pitch[1], height)
+        x, y, magnification = np.array([centre_x, centre_y, self.magnifications[level]], np.float32).tolist()
         return x, y, magnification
 
     def number(self, level: int, column: int, row: int) -> int:
-        """Index of a window in `actions`.
+        """Find the index of a window in `actions`.
 
         Args:
             level: of the window.
@@ -210,6 +218,11 @@ class Lattice:
         return before + row * self.places(level)[0] + column
 
 
-def _up(ratio: float) -> int:
-    """The ratio rounded up, except where only rounding has put it above a whole number."""
+def _middle(start: float, length: float) -> float:
+    """Find the middle of a side, whose ends are single-precision as those of `boxes`; pixel centres are at integers."""
+    return (float(np.float32(start)) + float(np.float32(start + length))) / 2 - 0.5
+
+
+def _rounded_up(ratio: float) -> int:
+    """Round a ratio up, except where only rounding has put it above a whole number."""
     return max(1, -int(-(ratio - 1e-6) // 1))

@@ -4,10 +4,12 @@ from collections.abc import Callable, Mapping
 from functools import reduce
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semfov.zoom.belief import Cells, ZoomBelief
+from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window
+from semfov.zoom.window_sums import Cells
 
 WindowChoice = tuple[Window, float]  # a window and the value of a look at it
 
@@ -17,64 +19,97 @@ def best_find(
 ) -> WindowChoice | None:
     r"""Choose the window in which a look is expected to find most objects, :math:`E[n_k(w)] + \kappa \, E[n_{k+1}(w)]`.
 
-    The second term counts only cells that were not looked at from level k yet. A window counts for the share of it that
-    does not lie `beside` one which is being looked at: an estimate of the best one afterwards.
+    The second term counts only cells that were not looked at from level k yet.
+
+    Args:
+        belief: the belief about the picture.
+        done: windows that were looked at.
+        foresight: κ.
+        beside: a window that is being looked at. Other windows count for the share that does not lie in it: an estimate
+            of the best one afterwards.
+
+    Returns:
+        The window and its value; None if no window has a value above 0.
     """
     lattice = belief.lattice
     best: WindowChoice | None = None
     for level in range(1, lattice.levels):
-        best = _better(best, belief.value(level, foresight), level, lattice, done, beside)
+        values = belief.value(level, foresight)
+        best = _better(best, values, level, lattice, done, beside)
     return best
 
 
 def best_hit(
     belief: ZoomBelief, done: set[Window], *, closest: bool = False, beside: Window | None = None
 ) -> WindowChoice | None:
-    """Choose the window that most probably shows the target, or of closer ones that do, divided by `patience`."""
-    lattice, patience = belief.lattice, belief.evidence.patience
+    """Choose the window that most probably shows the target.
+
+    A coarse window is also worth the hits that the closer windows in it promise together, divided by `patience`.
+
+    Args:
+        belief: the belief about the picture.
+        done: windows that were looked at.
+        closest: whether only windows of the last level can show the target.
+        beside: a window that is being looked at, as for `best_find`.
+
+    Returns:
+        The window and its value; None if no window has a value above 0.
+    """
+    lattice = belief.lattice
+    patience = np.float32(belief.evidence.patience)
+    last = lattice.levels - 1
     chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
     best: WindowChoice | None = None
     for level, values in chances.items():
-        last = level == lattice.levels - 1
-        if closest and not last:
-            values = np.zeros_like(values)
-        if not last:
-            values = np.maximum(values, _sums(belief, chances, level) / np.float32(patience))
+        if level < last:
+            own_hits = np.zeros_like(values) if closest else values
+            values = np.maximum(own_hits, _closer_hits(belief, chances, level) / patience)
         best = _better(best, values, level, lattice, done, beside)
     return best
 
 
-def _sums(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
-    """Sum the chances of closer windows, side by side, in each window of a level; → `(down, across)`."""
-    lattice, source = belief.lattice, belief.source.numpy()
-    down, across = lattice.places(level)[::-1]
-    total = np.zeros((down, across), np.float32)
+def _closer_hits(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
+    """Sum the chances of closer windows, side by side, in each window of a level, and take the level that has most.
+
+    Args:
+        belief: the belief about the picture.
+        chances: by level, the chance of each window `(down, across)`.
+        level: of the windows whose parts are summed.
+
+    Returns:
+        `(down, across)`.
+    """
+    lattice = belief.lattice
+    closest_level = belief.closest_level.numpy()
+    across, down = lattice.places(level)
+    most = np.zeros((down, across), np.float32)
     for deeper in range(level + 1, lattice.levels):
         closer = chances[deeper]
-        span, times = lattice.span(deeper), 1 << (deeper - level)
+        span = lattice.span(deeper)
+        count = 1 << (deeper - level)  # closer windows along a side
+        # A closer window counts if no look of this level has shown its middle.
         half = span // 2
-        middle = source[half : half + closer.shape[0], half : half + closer.shape[1]]
+        middle = closest_level[half : half + closer.shape[0], half : half + closer.shape[1]]
         rows, columns = middle.shape
         # Windows of the level can reach beyond the picture, where there are no closer windows: zeros.
-        table = np.zeros([max((times - 1) * span + n, m) for n, m in ((down, rows), (across, columns))], np.float32)
-        np.multiply(closer[:rows, :columns], middle < level, out=table[:rows, :columns])
-        lines = reduce(np.add, (table[span * n : span * n + down] for n in range(times)))
-        total = np.maximum(total, reduce(np.add, (lines[:, span * n : span * n + across] for n in range(times))))
-    return total
+        height = max((count - 1) * span + down, rows)
+        width = max((count - 1) * span + across, columns)
+        hits = np.zeros([height, width], np.float32)
+        np.multiply(closer[:rows, :columns], middle < level, out=hits[:rows, :columns])
+        lines = reduce(np.add, (hits[span * n : span * n + down] for n in range(count)))
+        sums = reduce(np.add, (lines[:, span * n : span * n + across] for n in range(count)))
+        most = np.maximum(most, sums)
+    return most
 
 
 def _better(
     best: WindowChoice | None, values: Cells, level: int, lattice: Lattice, done: set[Window], beside: Window | None
 ) -> WindowChoice | None:
-    """The better of a choice and the best window of a level that was not looked at."""
+    """Choose the better of a choice and the best window of a level that was not looked at; values `(down, across)`."""
     if beside is not None:
-        (x1, y1, x2, y2), span = beside.cells, lattice.span(level)
-        shares = [
-            (np.minimum(np.arange(n) + span, end) - np.maximum(np.arange(n), first)).clip(0) / span
-            for n, first, end in zip(values.shape, (y1, x1), (y2, x2), strict=True)
-        ]
-        values = values * (1 - np.outer(*shares)).astype(np.float32)
-    flat, across = values.ravel(), values.shape[1]
+        values = values * _share_outside(beside, lattice.span(level), values.shape)
+    flat = values.ravel()
+    across = values.shape[1]
     for _ in range(len(done) + 1):
         place = int(flat.argmax())
         value = float(flat[place])
@@ -88,20 +123,47 @@ def _better(
     return best
 
 
+def _share_outside(window: Window, span: int, shape: tuple[int, ...]) -> Cells:
+    """Compute the share of each window of `span` cells that lies outside one window; → `shape`, `(down, across)`."""
+    x1, y1, x2, y2 = window.cells
+    down, across = shape
+    inside = np.outer(_shares_inside(y1, y2, span, down), _shares_inside(x1, x2, span, across))
+    return (1 - inside).astype(np.float32)
+
+
+def _shares_inside(first: int, end: int, span: int, count: int) -> NDArray[np.float64]:
+    """Compute the shares `(count,)` of spans, which start at 0, 1, …, that lie between two cells."""
+    start = np.arange(count)
+    return (np.minimum(start + span, end) - np.maximum(start, first)).clip(0) / span
+
+
 def jointly(
     choose: Callable[[set[Window]], WindowChoice | None], belief: ZoomBelief, done: set[Window], count: int
 ) -> list[WindowChoice]:
-    """Choose several windows to look at together, each as if the windows before it had been looked at."""
+    """Choose several windows to look at together, each as if the windows before it had been looked at.
+
+    Args:
+        choose: chooses one window by the belief, given those that were looked at.
+        belief: the belief; it is unchanged afterwards.
+        done: windows that were looked at.
+        count: largest number of windows.
+
+    Returns:
+        The windows and their values, the best first; fewer where no other promises anything.
+    """
     if count == 1:
         choice = choose(done)
         return [] if choice is None else [choice]
-    left, visited, chosen = belief.left.clone(), set(done), []
+    unexplored = belief.unexplored.clone()
+    visited = set(done)
+    chosen: list[WindowChoice] = []
     for _ in range(count):
         choice = choose(visited)
         if choice is None:
             break
         chosen.append(choice)
-        visited.add(choice[0])
-        belief.discount(choice[0])
-    belief.restore(left)
+        window = choice[0]
+        visited.add(window)
+        belief.discount(window)
+    belief.restore(unexplored)
     return chosen

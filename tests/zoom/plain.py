@@ -6,9 +6,10 @@ import numpy as np
 import torch
 
 from semfov.zoom import GlimpseEvidence, Lattice
-from semfov.zoom.evidence import STEPS, pool
 from semfov.zoom.hints import Gist
 from semfov.zoom.looks import WindowLook
+from semfov.zoom.pooling import pool
+from semfov.zoom.survey import STEPS
 
 
 def cells_shown(lattice: Lattice, look: Gist) -> tuple[slice, slice]:

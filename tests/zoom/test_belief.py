@@ -6,12 +6,13 @@ import torch
 
 from semfov.agents import ZoomAgent
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.belief import ZoomBelief, _WindowSums
+from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import look_for
-from semfov.zoom.evidence import pool, pool_spans
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.policy import best_find, best_hit, jointly
+from semfov.zoom.pooling import pool, pool_spans
+from semfov.zoom.window_sums import WindowSums
 from tests.zoom import plain
 from train.zoom_slices import odds_of
 
@@ -39,7 +40,7 @@ def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
-        kept = _WindowSums(weight, shape, cells.__getitem__)
+        kept = WindowSums(weight, shape, cells.__getitem__)
         for _ in range(6):
             padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
             windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
@@ -90,8 +91,8 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
         jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + step % 2)
         left, closest = plain.left(lattice, seen), plain.closest(lattice, seen)
         expected = plain.expected(lattice, evidence, target, seen)
-        np.testing.assert_array_equal(belief.left, left)
-        np.testing.assert_array_equal(belief.source, closest)
+        np.testing.assert_array_equal(belief.unexplored, left)
+        np.testing.assert_array_equal(belief.closest_level, closest)
         for level in range(1, lattice.levels):
             np.testing.assert_allclose(belief.expected(level), expected[level], rtol=1e-4, atol=1e-7)
             taper, ones = evidence.taper(lattice.span(level)).numpy(), np.ones(lattice.span(level))
@@ -169,10 +170,10 @@ def test_no_window_is_chosen_twice(belief):
 
 
 def test_batches_are_chosen_jointly(belief):
-    left = belief.left.clone()
+    left = belief.unexplored.clone()
     chosen = jointly(lambda taken: best_find(belief, taken), belief, set(), 4)
     assert len({window for window, _ in chosen}) == 4
-    assert torch.equal(belief.left, left)
+    assert torch.equal(belief.unexplored, left)
     first, _ = best_find(belief, set())
     assert chosen[0][0] == first
     values = [value for _, value in chosen]

@@ -29,7 +29,8 @@ from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
-from semfov.zoom.evidence import CASE, features
+from semfov.zoom.evidence import CASE
+from semfov.zoom.hint_maps import features
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.objects import _object_facts, merge, merge_with_facts
@@ -86,7 +87,7 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     chances = belief.chances(belief.lattice.levels - 1)
     laid = [chances[row::CELLS, column::CELLS].sum() for row in range(CELLS) for column in range(CELLS)]
     assert case[6] == pytest.approx(math.log(sum(laid) / len(laid) + 1e-3) / 4)
-    assert case[7] == pytest.approx(float(belief.left.mean()))
+    assert case[7] == pytest.approx(float(belief.unexplored.mean()))
     assert case[8] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
     assert case[9] == pytest.approx(math.log(len(seen)) / 2)
     assert case.shape == (CASE,)

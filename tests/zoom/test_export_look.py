@@ -13,8 +13,8 @@ from semfov import InputError, Selection, WindowEye
 from semfov.detection.onnx import load_onnx
 from semfov.observation.matching import box_iou
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import pool_spans
 from semfov.zoom.looks import LiveWindowLooks, Window
+from semfov.zoom.pooling import pool_spans
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript", reason="torch exports ONNX with it")

@@ -477,7 +477,7 @@ def test_what_is_left_to_see_of_a_window_is_of_what_is_not_blank():
     lattice = Lattice.over((900, 600), CANVAS)
     cells = blank_cells(open_large(array), lattice)
     belief = ZoomBelief(lattice, GlimpseEvidence(3, 8), 1, lambda: cells)
-    assert torch.equal(belief.left, belief.there)
+    assert torch.equal(belief.unexplored, belief.visible)
     for level in range(1, lattice.levels):
         span = lattice.span(level)
         unseen = belief.unseen(level)

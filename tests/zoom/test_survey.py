@@ -11,9 +11,10 @@ from semfov.errors import InputError
 from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.evidence import Survey, _neighbourhood_mean, _through, features
+from semfov.zoom.hint_maps import features, neighbourhood_mean, through
 from semfov.zoom.hints import Gist
 from semfov.zoom.looks import Window, half_steps
+from semfov.zoom.survey import Survey
 from train.fit_zoom import judge_survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
@@ -141,14 +142,14 @@ def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     torch.manual_seed(0)
     network, values = small_network(5, 16, 3).to(device), torch.randn(shape, device=device)
     expected = network(values)
-    torch.testing.assert_close(_through(network, values), expected)
-    torch.testing.assert_close(_through(network, values, slice(1, 2)), expected[..., 1:2])
+    torch.testing.assert_close(through(network, values), expected)
+    torch.testing.assert_close(through(network, values, slice(1, 2)), expected[..., 1:2])
 
 
 def test_a_network_called_layer_by_layer_has_the_gradient_of_the_module():
     torch.manual_seed(0)
     network, values = small_network(5, 16, 3), torch.randn(40, 5)
-    (gradient,) = torch.autograd.grad(_through(network, values).sum(), network[0].weight)
+    (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)
 
@@ -182,6 +183,6 @@ def test_means_and_peaks_of_neighbourhoods_equal_pooling(side, shape, device):
     values = torch.randn(shape, device=device)
     settings = {"kernel_size": side, "stride": 1, "padding": side // 2}
     expected = functional.avg_pool2d(values[:, None], **settings)[:, 0]
-    torch.testing.assert_close(_neighbourhood_mean(values, side), expected)
+    torch.testing.assert_close(neighbourhood_mean(values, side), expected)
     expected = functional.max_pool2d(values[:, None], **settings)[:, 0]
     torch.testing.assert_close(neighbourhood_peak(values, side), expected, rtol=0, atol=0)
