@@ -10,9 +10,10 @@ from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
 from semfov.cli.trial import try_detector
 from semfov.detection.load import check_detector, load_detector
-from semfov.detection.weights import WEIGHTS, cache_folder, weights_path
+from semfov.detection.weights import WEIGHTS, weights_path
 from semfov.errors import check
 from semfov.gaze.saliency import FixationDensity
+from semfov.io.files import cache_folder
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
 from semfov.zoom import GlimpseEvidence

@@ -18,9 +18,8 @@ from torch.autograd import forward_ad
 from semfov.detection.darknet import Convolution, Darknet, Head, MaxPool, Route, Shortcut
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.scores import Candidates
-from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, values_known
-from semfov.io.files import sha256, write_bytes
+from semfov.io.files import cache_folder, sha256, write_bytes
 
 if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, TensorProto

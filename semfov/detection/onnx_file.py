@@ -14,9 +14,8 @@ import yaml
 from semfov.detection.onnx_cells import STRIDES, Canvas, cells
 from semfov.detection.onnx_check import check_file
 from semfov.detection.scores import BackgroundPolicy
-from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, check, check_data
-from semfov.io.files import read_text, sha256, write_bytes
+from semfov.io.files import cache_folder, read_text, sha256, write_bytes
 from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, check_content, is_plain
 
 if TYPE_CHECKING:

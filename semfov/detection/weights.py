@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from semfov.errors import DataError, check_data, lookup
-from semfov.io.files import replacing, sha256
+from semfov.io.files import cache_folder, replacing, sha256
 
 # pip prepares the metadata of a download: it installs build tools into an environment and runs the package's setup.py
 # there. This replacement of setuptools returns the metadata, so that neither happens.
@@ -204,27 +204,6 @@ WEIGHTS: dict[str, _Weights] = {
         "https://github.com/RangiLyu/nanodet/releases/tag/v1.0.0-alpha-1",
     ),
 }
-
-
-def cache_folder() -> Path:
-    """Find the folder of downloads: `$SEMFOV_CACHE`, else the platform's cache folder for semfov.
-
-    Returns:
-        The folder, which may be missing.
-
-    Raises:
-        DataError: it is a file, or no path.
-    """
-    import pooch
-
-    variable = os.environ.get("SEMFOV_CACHE")
-    try:
-        folder = Path(variable or pooch.os_cache("semfov")).expanduser()
-        is_file = folder.exists() and not folder.is_dir()
-    except (OSError, RuntimeError, ValueError) as error:  # a name that is too long, or the home of nobody
-        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {variable!r} ({error})") from None
-    check_data(not is_file, "SEMFOV_CACHE", "a folder for downloads", f"the file {folder}")
-    return folder
 
 
 def weights_path(name: str) -> Path:

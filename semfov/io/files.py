@@ -27,6 +27,27 @@ MADE_HERE = "made by semfov"
 """Comment in the first bytes of the pictures that semfov writes, by which they are told from photographs."""
 
 
+def cache_folder() -> Path:
+    """Name the folder of downloads, stores and digests: `$SEMFOV_CACHE`, else the platform's cache folder for semfov.
+
+    Returns:
+        The folder, which need not exist.
+
+    Raises:
+        DataError: `$SEMFOV_CACHE` is no name of a folder.
+    """
+    from platformdirs import user_cache_dir
+
+    chosen = os.environ.get("SEMFOV_CACHE")
+    try:
+        folder = Path(chosen or user_cache_dir("semfov")).expanduser()
+        is_usable = folder.is_dir() or not folder.exists()
+    except (OSError, RuntimeError, ValueError) as error:  # a name that is too long, or the home of nobody
+        raise DataError(f"SEMFOV_CACHE: expected a folder for downloads, got {chosen!r} ({error})") from None
+    check_data(is_usable, "SEMFOV_CACHE", "a folder for downloads", f"the file {folder}")
+    return folder
+
+
 def discard_unfinished() -> None:
     """Remove temporary files of unfinished writes, for a process that is about to exit without cleaning up."""
     for path in list(_unfinished):

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from semfov.data.scene import Scenes
-from semfov.detection.weights import cache_folder
 from semfov.io.code import class_digest, package_digest
+from semfov.io.files import cache_folder
 from semfov.io.pretrained import Pretrained
 from semfov.runs.results import ResultRecord, SceneResults
 from semfov.runs.store import versions

@@ -14,10 +14,10 @@ import semfov
 from semfov import ActivePerception, HeadAgent, ZoomAgent
 from semfov.cli.options import AgentOptions, GazeOptions
 from semfov.detection import weights
-from semfov.detection.weights import _Address, _SourceDistribution, _Weights, cache_folder, fetch
+from semfov.detection.weights import _Address, _SourceDistribution, _Weights, fetch
 from semfov.envs.scenery import open_scenery
 from semfov.errors import DataError
-from semfov.io.files import write_text
+from semfov.io.files import cache_folder, write_text
 from semfov.runs.config import DetectorConfig
 from tests.refusals import refused, unusable
 

@@ -7,7 +7,7 @@ from importlib.util import LazyLoader, find_spec, module_from_spec
 
 import pytest
 
-from semfov.io import code
+from semfov.io import code, modules
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def user_files(tmp_path, monkeypatch):
     """Names of the files of a user's module that imports the library; it is found, and not imported."""
     (tmp_path / "own_user.py").write_text(USER)
     monkeypatch.syspath_prepend(str(tmp_path))
-    files = code._closure(["own_user"], lambda name: name == "own_user" or not code._of_others(name))
+    files = code._closure(["own_user"], lambda name: name == "own_user" or not modules.belongs_to_others(name))
     assert not {"own_library", "own_library.part", "own_user"} & sys.modules.keys()
     return sorted(file.relative_to(tmp_path).as_posix() for file in files if file.is_relative_to(tmp_path))
 
@@ -174,10 +174,10 @@ def test_strange_entries_among_the_loaded_modules_raise_nothing(tmp_path, monkey
     for strange in (None, 5, Raising("own_strange"), types.SimpleNamespace(__file__=3, __path__=7)):
         monkeypatch.setitem(sys.modules, "own_strange", strange)
         for name in ("own_strange", "own_strange.part", "", ".part"):
-            assert code._file(name) is None
-            assert not code._of_others(name)
+            assert modules.source_file(name) is None
+            assert not modules.belongs_to_others(name)
     monkeypatch.setattr(sys, "meta_path", [Finder()])
-    assert code._file("own_missing.part") is None
+    assert modules.source_file("own_missing.part") is None
 
 
 def test_a_module_that_loads_lazily_is_not_loaded(tmp_path, monkeypatch):
@@ -187,13 +187,13 @@ def test_a_module_that_loads_lazily_is_not_loaded(tmp_path, monkeypatch):
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setitem(sys.modules, "own_library", module)
-    assert code._file("own_library") == tmp_path / "own_library" / "__init__.py"
-    assert code._file("own_library.part") == tmp_path / "own_library" / "part.py"
+    assert modules.source_file("own_library") == tmp_path / "own_library" / "__init__.py"
+    assert modules.source_file("own_library.part") == tmp_path / "own_library" / "part.py"
 
 
 def test_modules_of_nested_namespaces_are_found(tmp_path, monkeypatch):
     (tmp_path / "own_space" / "inner").mkdir(parents=True)
     (tmp_path / "own_space" / "inner" / "a.py").write_text("")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert code._file("own_space.inner.a") == tmp_path / "own_space" / "inner" / "a.py"
+    assert modules.source_file("own_space.inner.a") == tmp_path / "own_space" / "inner" / "a.py"
     assert "own_space" not in sys.modules
