@@ -33,7 +33,8 @@ from semfov.zoom.evidence import CASE
 from semfov.zoom.hint_maps import features
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
-from semfov.zoom.objects import _object_facts, merge, merge_with_facts
+from semfov.zoom.object_facts import DetectedBoxes, object_facts
+from semfov.zoom.objects import merge, merge_with_facts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
 
@@ -252,7 +253,7 @@ def test_facts_equal_a_plain_loop(latest, dtype):
     kept = unlike(boxes, scores, labels, looks, cut, SCALES[looks])
     assert 5 < len(kept) < count - 5
     every = boxes, scores, labels, looks, cut
-    facts = _object_facts(kept, every, WINDOWS, SCALES, SIZE, 1.0, latest=latest)
+    facts = object_facts(kept, DetectedBoxes(*every, SCALES[looks]), WINDOWS, SCALES, SIZE, 1.0, latest=latest)
     plain = plain_facts(kept.tolist(), *(each.tolist() for each in every), latest)
     assert facts.shape == (len(kept), len(FACTS))
     torch.testing.assert_close(facts, torch.tensor(plain), rtol=1e-4, atol=1e-4)
