@@ -16,7 +16,7 @@ from semfov.detection.detections import Detections
 from semfov.motion import Motion
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.looks import Window, WindowLook
+from semfov.zoom.looks import Window, WindowLook, nearest_cells
 
 
 def carried(look: WindowLook, motion: Motion, lattice: Lattice) -> WindowLook:
@@ -39,33 +39,48 @@ def carried(look: WindowLook, motion: Motion, lattice: Lattice) -> WindowLook:
 
 
 def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:
-    """Which boxes `(..., 4)` have their centre inside a frame of `(width, height)`; → `(...)` boolean."""
+    """Find boxes whose centre lies inside a frame.
+
+    Args:
+        boxes: `(..., 4)`.
+        size: `(width, height)` of the frame.
+
+    Returns:
+        `(...)` boolean.
+    """
     centre = (boxes[..., :2] + boxes[..., 2:]) / 2
     return ((centre >= 0) & (centre < boxes.new_tensor(size))).all(-1)
 
 
 def share_shown(window: Window, lattice: Lattice) -> float:
-    """Share of the frame that a window shows."""
-    (x1, y1, x2, y2), (width, height) = window.region(lattice), lattice.size
+    """Compute the share of the frame that a window shows.
+
+    Args:
+        window: the window, which may lie beyond the frame.
+        lattice: lattice of the frame.
+
+    Returns:
+        From 0 to 1.
+    """
+    x1, y1, x2, y2 = window.region(lattice)
+    width, height = lattice.size
     across = max(min(x2, width) - max(x1, 0.0), 0.0)
     down = max(min(y2, height) - max(y1, 0.0), 0.0)
     return across * down / (width * height)
 
 
 def _carried_window(window: Window, motion: Motion, lattice: Lattice) -> Window:
-    """The window in another frame: an upright box about its moved centre."""
+    """Carry a window to another frame: an upright box about its moved centre."""
     region = torch.tensor(window.region(lattice), dtype=torch.float64)
     centre = (region[:2] + region[2:]) / 2
     scale = float(motion.scale_at(centre))
-    x1, y1, x2, y2 = motion.boxes(region).tolist()
-    wide, high = lattice.pitch
-    cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
+    x1, y1, x2, y2 = box = motion.boxes(region).tolist()
     fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, window.fixation[2] / scale
-    return Window(fixation, window.level, cells, (x1, y1, x2, y2))
+    return Window(fixation, window.level, nearest_cells(lattice, box), (x1, y1, x2, y2))
 
 
 def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
-    """The hints of a look in the cells of another frame, each from the nearest cell of the look; None for no cell.
+    """Carry hints to the cells of another frame, each from the nearest cell of the look; None for no cell.
 
     Hints of a look at the whole frame fill the lattice: what enters at a border is expected to be like that border.
     """
@@ -73,23 +88,30 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     first = np.array(gist.first)
     pitch = np.array(lattice.pitch)
     if gist.level == 0:
-        low, high = first, np.array([columns, rows])
+        low = first
+        counts = np.array([columns, rows])
     else:
         corner = motion.points(torch.from_numpy(first * pitch)[None])[0].numpy()
         moved = np.rint(corner / pitch).astype(int)
         low = moved.clip(0)
         high = np.minimum(moved + gist.scale * np.array([columns, rows]), (lattice.columns, lattice.rows))
-        high = (high - low) // gist.scale
-        if high.min() <= 0:
+        counts = (high - low) // gist.scale
+        if counts.min() <= 0:
             return None
-    cells = np.stack(np.meshgrid(*(np.arange(count) for count in high)), -1)
+    cells = np.stack(np.meshgrid(*(np.arange(count) for count in counts)), -1)
     centres = (low + (cells + 0.5) * gist.scale) * pitch
-    there = motion.inverse().points(torch.from_numpy(centres)).numpy()
-    place = np.floor((there / pitch - first) / gist.scale).astype(np.intp)
+    # Where the centres of the new cells were in the frame of the look.
+    origins = motion.inverse().points(torch.from_numpy(centres)).numpy()
+    place = np.floor((origins / pitch - first) / gist.scale).astype(np.intp)
     nearest = place.clip(0, (columns - 1, rows - 1))
-    column, row = nearest[..., 0], nearest[..., 1]
-    scores, size, found = gist.scores[row, column], gist.size[row, column], gist.found[row, column]
+    column = nearest[..., 0]
+    row = nearest[..., 1]
+    scores = gist.scores[row, column]
+    size = gist.size[row, column]
+    found = gist.found[row, column]
     if gist.level > 0:
         shown = torch.from_numpy((place == nearest).all(-1))
-        scores, size, found = scores * shown[..., None], size * shown, found & shown[..., None]
+        scores = scores * shown[..., None]
+        size = size * shown
+        found = found & shown[..., None]
     return Gist(gist.level, (int(low[0]), int(low[1])), gist.scale, scores, size, found)

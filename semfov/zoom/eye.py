@@ -28,7 +28,9 @@ _Frame = tuple[int, int, int, int, int, int, int, int]
 Resampled = tuple[Tensor, list[_Frame]]
 
 BORDER = 2.0  # a box this near to the border of its window, in canvas pixels, counts as cut by it
-_WIDE_BORDER = 16.0  # the same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)
+_PHOTOGRAPH_BORDER = (
+    16.0  # the same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,13 @@ class WindowView:
 
 
 class WindowDetections(NamedTuple):
-    """The result of several looks; cut `(F, L)`."""
+    """The result of several looks.
+
+    Attributes:
+        detections: a batch of F, boxes in picture pixels.
+        cut: `(F, L)`, whether the border of a window cuts a box.
+        hints: hints of each look; None where none were wanted.
+    """
 
     detections: Detections
     cut: Tensor
@@ -141,29 +149,36 @@ class WindowEye(nn.Module):
             Detections and hints of each look.
         """
         canvas, frames = self.resample(view, fixations, within) if resampled is None else resampled
-        exact, here = canvas.dtype == torch.uint8, canvas.device
-        canvas = canvas.to(next(self.detector.parameters(), canvas).device)
-        with beside(meanwhile, idle=canvas.device.type != "cpu"):
-            unit = canvas if exact else canvas.to(torch.get_default_dtype()).contiguous() / 255
-            proposals = self.detector.propose_bytes(canvas) if exact else self.detector.propose(unit)
-            candidates = proposals.precise().to(here)
+        device = canvas.device
+        candidates = self._propose(canvas, meanwhile)
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
-        border = _WIDE_BORDER if view.lattice.levels == 1 else BORDER
+        border = _PHOTOGRAPH_BORDER if view.lattice.levels == 1 else BORDER
         place = _Placement(frames, view.picture.size, selected.boxes, border)
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
-        detections = replace(selected, boxes=boxes).to(here)
-        detections, cut = self._treat(detections, place.cut(selected).to(here))
+        detections = replace(selected, boxes=boxes).to(device)
+        detections, cut = self._treat(detections, place.cut(selected).to(device))
         if not hints:
             return WindowDetections(detections, cut, None)
-        faint = [_hints_of(candidates, number, policy, self.detector.faint) for number in range(len(frames))]
-        placed = [
-            Hints(place.to_picture(each.boxes, number).to(here), each.scores.to(here))
-            for number, each in enumerate(faint)
-        ]
-        return WindowDetections(detections, cut, tuple(placed))
+        by_look = []
+        for number in range(len(frames)):
+            canvas_hints = _hints_of(candidates, number, policy, self.detector.faint)
+            hint_boxes = place.to_picture(canvas_hints.boxes, number)
+            by_look.append(Hints(hint_boxes.to(device), canvas_hints.scores.to(device)))
+        return WindowDetections(detections, cut, tuple(by_look))
+
+    def _propose(self, canvas: Tensor, meanwhile: Callable[[], object] | None) -> Candidates:
+        """Pass canvases `(F, 3, h, w)` through the detector, on its device, while a second thread works."""
+        device = canvas.device
+        canvas = canvas.to(next(self.detector.parameters(), canvas).device)
+        with beside(meanwhile, idle=canvas.device.type != "cpu"):
+            if canvas.dtype == torch.uint8:
+                proposals = self.detector.propose_bytes(canvas)
+            else:
+                proposals = self.detector.propose(canvas.to(torch.get_default_dtype()).contiguous() / 255)
+            return proposals.precise().to(device)
 
     def glimpse(
         self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None
@@ -206,36 +221,42 @@ class WindowEye(nn.Module):
         check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
         limits = [None] * len(rows) if within is None else within
         fill = 255 * float(self.detector.fill)
-        exact = abs(fill - round(fill)) < 1e-6
-        blank = torch.tensor(round(fill), dtype=torch.uint8) if exact else torch.tensor(fill)
-        pairs = [self._show(blank, view.picture, row, limit) for row, limit in zip(rows, limits, strict=True)]
-        canvases = [canvas for canvas, _ in pairs]
-        return canvases[0] if len(canvases) == 1 else torch.cat(canvases), [frame for _, frame in pairs]
+        is_byte = abs(fill - round(fill)) < 1e-6
+        padding = torch.tensor(round(fill), dtype=torch.uint8) if is_byte else torch.tensor(fill)
+        canvases = []
+        frames = []
+        for row, limit in zip(rows, limits, strict=True):
+            canvas, frame = self._show(padding, view.picture, row, limit)
+            canvases.append(canvas)
+            frames.append(frame)
+        return canvases[0] if len(canvases) == 1 else torch.cat(canvases), frames
 
     def _show(
-        self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: _Limit | None
+        self, padding: Tensor, picture: LargePicture, fixation: list[float], limit: _Limit | None
     ) -> tuple[Tensor, _Frame]:
-        """One canvas `(1, 3, h, w)` of the dtype of `blank`, a pixel of padding, and its frame."""
-        wide, high = self.detector.input_size
+        """Show one window on a canvas `(1, 3, h, w)` of the dtype of `padding`, a pixel of it; also give its frame."""
+        width, height = self.detector.input_size
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
         x, y, magnification = fixation
         reduction = picture.reduction(1 / magnification)
-        x1, x2, u1, u2 = _window_pixels(x, magnification, wide, picture.size[0], left, right, reduction)
-        y1, y2, v1, v2 = _window_pixels(y, magnification, high, picture.size[1], top, bottom, reduction)
-        canvas = resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(blank.dtype)
-        if (u1, v1, u2, v2) != (0, 0, wide, high):
-            pixels, canvas = canvas, blank.expand(1, 3, high, wide).contiguous(memory_format=torch.channels_last)
-            canvas[..., v1:v2, u1:u2] = pixels
-        return canvas, (x1, y1, x2, y2, u1, v1, u2, v2)
+        x1, x2, u1, u2 = _window_pixels(x, magnification, width, picture.size[0], left, right, reduction)
+        y1, y2, v1, v2 = _window_pixels(y, magnification, height, picture.size[1], top, bottom, reduction)
+        frame = x1, y1, x2, y2, u1, v1, u2, v2
+        pixels = resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(padding.dtype)
+        if (u1, v1, u2, v2) == (0, 0, width, height):
+            return pixels, frame
+        canvas = padding.expand(1, 3, height, width).contiguous(memory_format=torch.channels_last)
+        canvas[..., v1:v2, u1:u2] = pixels
+        return canvas, frame
 
     def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
         """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
         if self.cut == "keep" or not bool(cut.any()):
             return detections, cut
         if self.cut == "drop":
-            whole = detections.mask & ~cut
-            left = Detections.stack([detections[n : n + 1].take(rows) for n, rows in enumerate(whole)])
-            return left, torch.zeros_like(left.mask)
+            uncut = detections.mask & ~cut
+            remaining = Detections.stack([detections[n : n + 1].take(rows) for n, rows in enumerate(uncut)])
+            return remaining, torch.zeros_like(remaining.mask)
         nothing = torch.zeros_like(detections.scores[..., :1, :])
         nothing[..., 0] = 1
         scores = torch.where(cut[..., None], nothing, detections.scores)
@@ -254,7 +275,7 @@ class WindowEye(nn.Module):
         return self.look(self.open(picture), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """Settings on which the detections depend, for the keys of caches and the metadata of fitted models.
+        """List the settings on which the detections depend, for keys of caches and metadata of fitted models.
 
         Returns:
             JSON values.
@@ -277,36 +298,69 @@ def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, fain
 def _window_pixels(
     point: float, magnification: float, count: int, length: int, low: float, high: float, step: int
 ) -> tuple[int, int, int, int]:
-    """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas."""
-    start, stop = edges_at(point, magnification, float(count))
-    start, stop = step * round(start / step), step * round(stop / step)
-    low, high = round(max(low, 0.0)), round(min(high, length))
-    first = min(max(start, low), high - 1)
-    end = min(max(stop, first + 1), high)
-    begin = min(max(round((first - start) * magnification), 0), count - 1)
-    return first, end, begin, min(max(begin + round((end - first) * magnification), begin + 1), count)
+    """Find the pixels that a window shows along one axis.
+
+    Args:
+        point: centre of the window in picture pixels.
+        magnification: canvas pixels per picture pixel.
+        count: pixels of the canvas.
+        length: pixels of the picture.
+        low: first edge of what is shown of the picture.
+        high: its last edge.
+        step: edges are rounded to multiples of it.
+
+    Returns:
+        First and end in the picture, and first and end on the canvas; at least one pixel each.
+    """
+    edge, last_edge = edges_at(point, magnification, float(count))
+    start = step * round(edge / step)
+    stop = step * round(last_edge / step)
+    least = round(max(low, 0.0))
+    most = round(min(high, length))
+    first = min(max(start, least), most - 1)
+    end = min(max(stop, first + 1), most)
+    canvas_first = min(max(round((first - start) * magnification), 0), count - 1)
+    canvas_end = canvas_first + round((end - first) * magnification)
+    return first, end, canvas_first, min(max(canvas_end, canvas_first + 1), count)
 
 
 class _Placement:
-    """Maps boxes from the canvases of several looks to the picture; size `(width, height)`."""
+    """Maps boxes from the canvases of several looks to the picture.
+
+    For each look it holds six rows of four numbers, one for each edge of a box: the window's low and high edges in the
+    picture, its low edges on the canvas, picture pixels per canvas pixel, and by which number an edge of a box, times
+    the sign that points inwards, is at the border of the window.
+    """
 
     def __init__(self, frames: Sequence[_Frame], size: tuple[int, int], like: Tensor, border: float) -> None:
-        wide, high = size
+        """Compute the numbers of all looks.
+
+        Args:
+            frames: of the looks.
+            size: `(width, height)` of the picture.
+            like: gives dtype and device.
+            border: canvas pixels from the border of a window at which it cuts a box.
+        """
+        width, height = size
         rows = []
         # Python's numbers: tensors this small spend their time in calls.
         for x1, y1, x2, y2, u1, v1, u2, v2 in frames:
-            scale = (x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)
+            scale = [(x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)]
             # The border of the picture cuts no object.
-            near = u1 + border if x1 > 0 else -math.inf, v1 + border if y1 > 0 else -math.inf
-            far = border - u2 if x2 < wide else -math.inf, border - v2 if y2 < high else -math.inf
-            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, [*near, *far], [1, 1, -1, -1]])
+            borders = [
+                u1 + border if x1 > 0 else -math.inf,
+                v1 + border if y1 > 0 else -math.inf,
+                border - u2 if x2 < width else -math.inf,
+                border - v2 if y2 < height else -math.inf,
+            ]
+            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, scale * 2, borders, [1, 1, -1, -1]])
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
-        self._numbers = [numbers[number].unbind() for number in range(len(frames))]
+        self._by_look = [numbers[number].unbind() for number in range(len(frames))]
         self._all = numbers.unbind(1)
 
     def to_picture(self, boxes: Tensor, look: int | None = None) -> Tensor:
         """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture, cut to the window."""
-        low, high, first, scale, _, _ = self._all if look is None else self._numbers[look]
+        low, high, first, scale, _, _ = self._all if look is None else self._by_look[look]
         return ((boxes - first) * scale + low).clamp(low, high)
 
     def cut(self, detections: Detections) -> Tensor:

@@ -16,9 +16,31 @@ from semfov.zoom.hints import Gist, Hints
 from semfov.zoom.lattice import Lattice
 
 
+def nearest_cells(lattice: Lattice, box: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
+    """Round the edges of a box in picture pixels to those of cells.
+
+    Args:
+        lattice: the cells.
+        box: `(x1, y1, x2, y2)` in picture pixels.
+
+    Returns:
+        Cells `(x1, y1, x2, y2)`.
+    """
+    x1, y1, x2, y2 = box
+    width, height = lattice.pitch
+    return round(x1 / width), round(y1 / height), round(x2 / width), round(y2 / height)
+
+
 @dataclass(frozen=True)
 class Window:
-    """A window of a picture: where to look, and how closely."""
+    """A window of a picture: where to look, and how closely.
+
+    Attributes:
+        fixation: `(x, y, magnification)`, its centre in picture pixels, and canvas pixels per picture pixel.
+        level: level of the lattice with that magnification, or the nearest one.
+        cells: cells `(x1, y1, x2, y2)` that it shows, rounded.
+        within: box of the picture that it shows and nothing beyond; None for a window of the lattice.
+    """
 
     fixation: tuple[float, float, float]
     level: int
@@ -28,7 +50,7 @@ class Window:
     @staticmethod
     @lru_cache(4096)
     def on(lattice: Lattice, action: tuple[int, int, int]) -> "Window":
-        """The window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
+        """Make the window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
         level, column, row = action
         x, y, magnification = lattice.fixation(level, column, row)
         span = lattice.span(level)
@@ -40,21 +62,24 @@ class Window:
 
     @staticmethod
     def around(lattice: Lattice, box: tuple[float, float, float, float]) -> "Window":
-        """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
+        """Make the window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
         x1, y1, x2, y2 = box
         magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
         level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
-        wide, high = lattice.pitch
-        cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
-        return Window(((x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification), level, cells, box)
+        fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification
+        return Window(fixation, level, nearest_cells(lattice, box), box)
 
     def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
         """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels."""
         if self.within is not None:
             return self.within
-        (x, y, magnification), (wide, high), (width, height) = self.fixation, lattice.canvas, lattice.size
-        across, down = wide / magnification / 2, high / magnification / 2
-        x, y = x + 0.5, y + 0.5
+        x, y, magnification = self.fixation
+        width, height = lattice.size
+        # Half of the window, about its centre in edges of pixels.
+        across = lattice.canvas[0] / magnification / 2
+        down = lattice.canvas[1] / magnification / 2
+        x += 0.5
+        y += 0.5
         return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
 
     def centre(self, lattice: Lattice) -> tuple[float, float]:
@@ -69,7 +94,16 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowLook:
-    """The result of a look at a window; cut `(L,)`, show `(K,)`; all hints, in a photograph alone."""
+    """The result of a look at a window.
+
+    Attributes:
+        window: where it looked.
+        detections: a batch of one, boxes in picture pixels.
+        cut: `(L,)`, whether the border of the window cuts a box.
+        show: `(K,)`, highest score of each class in any hint, or in the detections where no hints were wanted.
+        gist: the hints by cell; None where it does not point to closer looks.
+        hints: all hints, in a photograph alone.
+    """
 
     window: Window
     detections: Detections
@@ -126,13 +160,16 @@ class LiveWindowLooks(WindowLooks):
     """Looks of an eye at a picture."""
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
-        self.eye, self.view, self.lattice = eye, view, view.lattice
+        self.eye = eye
+        self.view = view
+        self.lattice = view.lattice
         self._prepared: dict[Window, Resampled] = {}
         self._camera: CameraStep | None = None  # the motion of frames whose looks were closer ones
 
     def show(self, view: WindowView, passed: float, camera: CameraStep | None = None) -> None:
         """Take the next frame of a stream, the seconds that passed, and how the camera moved since the frame before."""
-        self.view, self.passed = view, passed
+        self.view = view
+        self.passed = passed
         self.time += passed
         self._prepared.clear()
         if camera is not None:
@@ -140,7 +177,8 @@ class LiveWindowLooks(WindowLooks):
 
     def camera_step(self) -> CameraStep | None:
         """Take how the camera moved since this was last asked."""
-        camera, self._camera = self._camera, None
+        camera = self._camera
+        self._camera = None
         return camera
 
     def prepare(self, window: Window) -> None:
@@ -151,7 +189,8 @@ class LiveWindowLooks(WindowLooks):
         hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
-        meanwhile, self.meanwhile = self.meanwhile, None
+        meanwhile = self.meanwhile
+        self.meanwhile = None
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         within = [window.within for window in windows]
         looks = self.eye.glance(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
@@ -159,18 +198,26 @@ class LiveWindowLooks(WindowLooks):
 
 
 def _look_at(looks: WindowDetections, number: int, window: Window, lattice: Lattice) -> WindowLook:
+    """Take one of several looks: a batch of one, without padding."""
     detections = looks.detections
-    if len(detections.mask) > 1:  # a batch of one, without padding
-        count, one = int(detections.mask[number].sum()), slice(number, number + 1)
-        detections = detections[one].take(slice(count))
-    look_gist, faint = None, None
-    if looks.hints is None:
+    if len(detections.mask) > 1:
+        count = int(detections.mask[number].sum())
+        detections = detections[number : number + 1].take(slice(count))
+    hints = None if looks.hints is None else looks.hints[number]
+    gist = None
+    if hints is None:
         scores = detections.scores[0, :, 1:]
     elif window.points_closer(lattice):
-        look_gist = Gist.of(looks.hints[number], detections, lattice, (window.level, *window.cells[:2]))
-        scores = look_gist.scores.flatten(0, 1)
+        gist = Gist.of(hints, detections, lattice, (window.level, *window.cells[:2]))
+        scores = gist.scores.flatten(0, 1)
     else:
-        scores = looks.hints[number].scores
-        faint = looks.hints[number] if lattice.levels == 1 else None
-    show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
-    return WindowLook(window, detections, looks.cut[number, : detections.mask.shape[1]], show, look_gist, faint)
+        scores = hints.scores
+    is_photograph = lattice.levels == 1
+    return WindowLook(
+        window,
+        detections,
+        cut=looks.cut[number, : detections.mask.shape[1]],
+        show=scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1]),
+        gist=gist,
+        hints=hints if is_photograph and gist is None else None,
+    )
