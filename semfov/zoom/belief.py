@@ -244,7 +244,7 @@ class ZoomBelief:
         return self._rate[level, *place] * self.unexplored.numpy()[place]
 
     def _expected_closer(self, level: int, place: Place) -> Cells:
-        """What looks one level closer are expected to find, in cells that no look of this level has shown."""
+        """Compute what looks one level closer are expected to find, in cells that no look of this level has shown."""
         return self.expected(level + 1, place) * (self.closest_level.numpy()[place] < level)
 
     def _unseen_cells(self, level: int, place: Place) -> Cells:

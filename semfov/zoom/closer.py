@@ -34,21 +34,49 @@ _SMALLEST = 1e-4
 
 
 def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Window:
-    """The window around a box `(4,)`, three times its longer side; in a photograph `window` says its size."""
+    """Choose the window of a closer look around a box.
+
+    Args:
+        lattice: windows of the picture.
+        box: `(4,)` in picture pixels.
+        window: least side and context of the window in a photograph (`USUAL_WINDOW`). In a larger picture it has three
+            times the longer side of the box, and at least half of the closest window.
+
+    Returns:
+        The window.
+    """
     least, context = window
     if lattice.levels > 1:
-        context, least = _CONTEXT, min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
+        context = _CONTEXT
+        least = min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
     x1, y1, x2, y2 = window_around(box.double(), lattice.size, context=context, least=least).tolist()
     return Window.around(lattice, (x1, y1, x2, y2))
 
 
 def look_closely(source: WindowLooks, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> WindowLook:
-    """Look at the window that shows a box `(4,)` closely (`closer_window`)."""
+    """Look at the window that shows a box closely (`closer_window`).
+
+    Args:
+        source: looks at the picture.
+        box: `(4,)` in picture pixels.
+        window: size of the window in a photograph.
+
+    Returns:
+        The look.
+    """
     return source.see([closer_window(source.lattice, box, window)], hints=source.lattice.levels == 1)[0]
 
 
 class SearchLook(NamedTuple):
-    """One look of a search, and what is known of the target after it, by the prior of the fit."""
+    """One look of a search, and what is known of the target after it, by the prior of the fit.
+
+    Attributes:
+        detections: what may hold the target (`WindowLook.candidates`).
+        number: number of the next look of the path.
+        presence: probability that the picture holds the target.
+        best: highest score of the target in any look.
+        left: value of the best look that is left.
+    """
 
     detections: Detections
     number: int
@@ -81,16 +109,18 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
     def see(self, look: SearchLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
-        self._look, self._next = look, look.number
+        self._look = look
+        self._next = look.number
         self._left = self.prior.place(look.left, look.presence)
-        self.detections, self.presence = look.detections, self.prior(look.presence)
+        self.detections = look.detections
+        self.presence = self.prior(look.presence)
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
             self._looks.append((self._now, (look.detections.boxes[0][of_target], scores[of_target])))
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """The most evident box, if it is likely enough, or at the end probable enough."""
+        """Take the most evident box, if it is likely enough, or at the end probable enough."""
         boxes, scores = self._boxes()
         if self._examined:
             scores = scores.masked_fill(self._again(boxes), 0)
@@ -105,7 +135,8 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the path."""
-        self._number, self._next = self._next, self._next + 1
+        self._number = self._next
+        self._next += 1
         return super().look_at(candidate, close_up)
 
     def follow(self, motion: Motion | None) -> None:
@@ -115,11 +146,19 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
             self._looks = [(time, (motion.boxes(boxes), scores)) for time, (boxes, scores) in self._looks]
 
     def probability(self, look: CloseUp) -> float:
-        """Present probability that the target is at the place of a closer look, by the detections that overlap it."""
+        """Compute the present probability that the target is at the place of a closer look.
+
+        Args:
+            look: the closer look.
+
+        Returns:
+            The probability, by the detections that overlap the place.
+        """
         boxes, scores = self._boxes()
         if not len(scores):
             return self._chance(0.0)
-        return self._chance(float((scores * (box_iou(boxes, look.box[None])[:, 0] >= SAME)).max()))
+        overlaps = box_iou(boxes, look.box[None])[:, 0] >= SAME
+        return self._chance(float((scores * overlaps).max()))
 
     def _boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target that count, and their scores `(M,)`, faded."""
@@ -150,8 +189,9 @@ class PhotographPlaces(CandidateBoxes):
         prior: Prior | None = None,
     ) -> None:
         super().__init__(target, 0.0, forgetting, prior)
-        self._lattice, self._window = lattice, window
-        self._shown = dict[Window, tuple[int, Detections]]()  # by window, the number of the look and what it shows
+        self._lattice = lattice
+        self._window = window
+        self._shown: dict[Window, tuple[int, Detections]] = {}  # by window, the number of the look and what it shows
 
     def see(self, look: SearchLook) -> None:
         """Take in a look at the whole photograph."""
@@ -165,7 +205,7 @@ class PhotographPlaces(CandidateBoxes):
         return -1.0 if place is None else self._worth(place)
 
     def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """The most evident place, if a look at it is worth a pass."""
+        """Take the most evident place, if a look at it is worth a pass."""
         place = super().due(0.0, last=True)
         return None if place is None or self._worth(place) < least else place
 
@@ -188,11 +228,12 @@ class PhotographPlaces(CandidateBoxes):
             self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
 
     def _showing(self, candidate: CandidatePlace) -> Window:
-        """The window of a closer look at a place, or the whole photograph where it shows no more."""
+        """Choose the window of a closer look at a place, or the whole photograph where it shows no more."""
         window = closer_window(self._lattice, candidate.box, self._window)
         x1, y1, x2, y2 = window.region(self._lattice)
-        whole = (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size)
-        return Window.overview(self._lattice) if whole else window
+        if (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size):
+            return Window.overview(self._lattice)
+        return window
 
     def _worth(self, place: CandidatePlace) -> float:
         return place.probability * (1 - max((known for _, known in self._known), default=0.0))

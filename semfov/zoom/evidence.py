@@ -105,7 +105,7 @@ _VERIFICATION_SHAPES: dict[str, tuple[int | str, ...]] = {
 
 
 def _optional_fields(shapes: Mapping[str, tuple[int | str, ...]], prefix: str = "") -> dict[str, Field]:
-    """Requirements of tensors that are there where their part was fitted."""
+    """List the requirements of tensors that are there where their part was fitted."""
     return {f"{prefix}{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in shapes.items()}
 
 

@@ -156,7 +156,7 @@ class Lattice:
         return torch.cat(by_level)
 
     def __len__(self) -> int:
-        """Number of windows of all levels."""
+        """Count the windows of all levels."""
         return sum(across * down for across, down in map(self.places, range(self.levels)))
 
     def boxes(self, actions: Tensor) -> Tensor:

@@ -189,7 +189,7 @@ def object_facts(
 
 
 def object_of_box(chosen: _Indices, boxes: int) -> _Indices:
-    """Number the objects by their boxes.
+    """Find the object that each box was chosen for.
 
     Args:
         chosen: `(M,)`, the box of each object.

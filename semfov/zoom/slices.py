@@ -6,68 +6,139 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.episode import Order
+from semfov.zoom.hints import Gist, Hints
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.policy import WindowChoice
 
+_OVERLAP = 0.2  # share of a slice that the next one repeats
+
 
 def slices(lattice: Lattice, side: int, step: int) -> list[Window]:
-    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
-    (width, height), lasts = lattice.size, (max(length - side, 0) for length in lattice.size)
-    columns, rows = (sorted({*range(0, last, step), last}) for last in lasts)
-    boxes = [(x, y, min(x + side, width), min(y + side, height)) for y in rows for x in columns]
-    return [Window.around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+    """List square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them.
+
+    Args:
+        lattice: windows of the picture.
+        side: of a slice in pixels.
+        step: pixels from one slice to the next.
+
+    Returns:
+        The slices.
+    """
+    width, height = lattice.size
+    windows = []
+    for y in _starts(height, side, step):
+        for x in _starts(width, side, step):
+            box = float(x), float(y), float(min(x + side, width)), float(min(y + side, height))
+            windows.append(Window.around(lattice, box))
+    return windows
+
+
+def _starts(length: int, side: int, step: int) -> list[int]:
+    """List the first pixels of slices along a side of a picture; the last one ends with it."""
+    last = max(length - side, 0)
+    return sorted({*range(0, last, step), last})
 
 
 def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
-    """Slices as people cut them, which overlap by a fifth, without those of `blank` cells alone."""
+    """List slices as people cut them, which overlap by a fifth.
+
+    Args:
+        lattice: windows of the picture.
+        blank: `(rows, columns)`, cells where there is nothing to see; None for none.
+
+    Returns:
+        The slices, without those of blank cells alone; all of them if none other is left.
+    """
     if lattice.levels == 1:
         side = max(1, round(0.6 * max(lattice.size)))
     else:
-        side = round((1.5 if lattice.levels > 2 else 1.0) * min(lattice.canvas) / lattice.magnifications[-1])
-    windows = slices(lattice, side, max(1, int(side * (1 - 0.2))))
+        # Of pictures with many levels the slices are reduced by half an octave: they are fewer.
+        enlargement = 1.5 if lattice.levels > 2 else 1.0
+        side = round(enlargement * min(lattice.canvas) / lattice.magnifications[-1])
+    windows = slices(lattice, side, max(1, int(side * (1 - _OVERLAP))))
     if blank is None:
         return windows
-    shown = [blank[y1:y2, x1:x2] for x1, y1, x2, y2 in (each.cells for each in windows)]
-    return [each for each, part in zip(windows, shown, strict=True) if not part.all()] or windows
+    visible = []
+    for window in windows:
+        x1, y1, x2, y2 = window.cells
+        if not blank[y1:y2, x1:x2].all():
+            visible.append(window)
+    return visible or windows
 
 
 def ranked(windows: Sequence[Window], targets: Sequence[int] = (), *, most: bool = False) -> Order:
-    """The windows in descending order of the overview's raw scores in them."""
+    """Order windows by the overview's raw scores in them, the highest first.
+
+    Args:
+        windows: the windows.
+        targets: classes whose scores count; none for all.
+        most: whether a window counts for its highest score, and not for their sum.
+
+    Returns:
+        The order of an episode; it is made anew where the overview is.
+    """
     ranking: list[WindowChoice] = []
     ranked_by: WindowLook | None = None
 
     def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
         nonlocal ranked_by
-        if looks[0] is not ranked_by:
-            ranked_by = looks[0]
-            values = torch.tensor([raw(ranked_by, window, targets, most=most) for window in windows])
+        overview = looks[0]
+        if overview is not ranked_by:
+            ranked_by = overview
+            values = torch.tensor([raw(overview, window, targets, most=most) for window in windows])
             places = values.argsort(descending=True, stable=True).tolist()
             ranking[:] = [(windows[place], float(values[place])) for place in places]
-        return next(([choice] for choice in ranking if choice[0] not in done), [])
+        for choice in ranking:
+            if choice[0] not in done:
+                return [choice]
+        return []
 
     return order
 
 
-def raw(window_look: WindowLook, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
-    """Value of a window by the raw scores of a coarser look: their sum, or the highest, over its cells."""
-    if window_look.hints is not None:
-        boxes, within = (
-            window_look.hints.boxes,
-            window_look.hints.boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9)),
-        )
-        centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-        part = window_look.hints.scores[((within[:2] <= centre) & (centre < within[2:])).all(-1)]
+def raw(look: WindowLook, window: Window, targets: Sequence[int] = (), *, most: bool = False) -> float:
+    """Value a window by the raw scores of a coarser look: their sum, or the highest, over its cells.
+
+    Args:
+        look: the coarser look.
+        window: the window.
+        targets: classes whose scores count; none for all.
+        most: whether the highest score counts, and not the sum.
+
+    Returns:
+        The value.
+    """
+    if look.hints is not None:
+        scores = _hints_inside(look.hints, window)
     else:
-        look = window_look.gist
-        assert look is not None
-        x1, y1, x2, y2 = window.cells
-        left, top = look.first
-        box = [(n - first) / look.scale for n, first in zip((x1, y1, x2, y2), (left, top) * 2, strict=True)]
-        columns = slice(max(int(box[0]), 0), max(-int(-box[2] // 1), 0))
-        rows = slice(max(int(box[1]), 0), max(-int(-box[3] // 1), 0))
-        part = look.scores[rows, columns]
-    scores = (part[..., [target - 1 for target in targets]] if len(targets) else part).amax(-1)
-    if not scores.numel():
+        assert look.gist is not None
+        scores = _cells_inside(look.gist, window)
+    if len(targets):
+        scores = scores[..., [target - 1 for target in targets]]
+    best = scores.amax(-1)
+    if not best.numel():
         return 0.0
-    return float(scores.max() if most else scores.sum())
+    return float(best.max() if most else best.sum())
+
+
+def _hints_inside(hints: Hints, window: Window) -> Tensor:
+    """Select the scores `(n, K)` of hints whose centre lies in a window."""
+    boxes = hints.boxes
+    region = boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    return hints.scores[((region[:2] <= centre) & (centre < region[2:])).all(-1)]
+
+
+def _cells_inside(gist: Gist, window: Window) -> Tensor:
+    """Select the scores `(rows, columns, K)` of the cells of a gist that a window shows in part at least."""
+    x1, y1, x2, y2 = window.cells
+    first_column, first_row = gist.first
+    columns = _covered(x1 - first_column, x2 - first_column, gist.scale)
+    rows = _covered(y1 - first_row, y2 - first_row, gist.scale)
+    return gist.scores[rows, columns]
+
+
+def _covered(start: int, stop: int, scale: int) -> slice:
+    """Find the squares of `scale` cells that cells from `start` to `stop` touch."""
+    return slice(max(int(start / scale), 0), max(-int(-(stop / scale) // 1), 0))

@@ -46,7 +46,7 @@ class Survey(nn.Module):
 
     @staticmethod
     def fields() -> dict[str, Field]:
-        """Requirements of its tensors in the file of a model, by name."""
+        """List the requirements of its tensors in the file of a model, by name."""
         return {
             "mix.weight": Field((_CHANNELS, "K"), low=-1e6, high=1e6),
             **perceptron("rate", _INPUTS, _WIDTH, STEPS),
