@@ -15,7 +15,16 @@ _ROUNDING = 1e-3
 
 @dataclass(frozen=True)
 class Calibration:
-    """Scoring rules and calibration errors of a set of predictions."""
+    """Scoring rules and calibration errors of a set of predictions.
+
+    Attributes:
+        count: number of predictions.
+        nll: mean negative log likelihood, in nats.
+        brier: mean Brier score, over all classes.
+        ece: expected calibration error of the most probable class (`calibration_error`).
+        classwise_ece: mean over classes of the expected calibration error of each.
+        accuracy: share of predictions whose most probable class is right.
+    """
 
     count: int
     nll: float
@@ -26,101 +35,169 @@ class Calibration:
 
 
 def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Calibration:
-    """Compute all measures of `Calibration` for predictions `(M, K+1)` of labels `(M,)`."""
+    """Compute all measures of `Calibration`.
+
+    Args:
+        probabilities: `(M, K+1)`, of all classes.
+        labels: `(M,)`, numbers of classes from 0.
+        bins: number of equally wide bins of confidence.
+
+    Returns:
+        The measures; NaN where there are no predictions.
+
+    Raises:
+        InputError: a row is no distribution, a label is no class, or the shapes do not fit together.
+    """
     p = _probabilities(probabilities, "probabilities")
     check_shape(p, "probabilities", None, None)
-    numbers = as_numbers(labels, "labels")
-    labels = numbers.to(p.device, torch.int64)
-    broken = numbers[numbers != numbers.floor()].tolist()
-    check(not broken, "labels", "whole numbers", broken[0] if broken else "")
-    check(labels.shape == p.shape[:1], "labels", f"{len(p)} numbers, one for each row", f"shape {(*labels.shape,)}")
     check(bins >= 1, "bins", "at least 1", bins)
-    if not len(labels):
+    classes = _class_numbers(labels, p)
+    if not len(classes):
         return Calibration(0, *[float("nan")] * 5)
-    total, last = p.detach().sum(1), p.shape[1] - 1
-    least, most = float(total.min()), float(total.max())
-    sums = least >= 1 - _ROUNDING and most <= 1 + _ROUNDING
-    check(sums, "probabilities", "rows that sum to 1", f"sums from {least:g} to {most:g}; give logits.softmax(-1)")
-    low, high = int(labels.min()), int(labels.max())
+    _check_distributions(p)
+    last = p.shape[1] - 1
+    low = int(classes.min())
+    high = int(classes.max())
     check(low >= 0 and high <= last, "labels", f"numbers of classes from 0 to {last}", f"{low} to {high}")
-    true = p.gather(1, labels[:, None])[:, 0]
+    true = p.gather(1, classes[:, None])[:, 0]
     confidence, predicted = p.max(1)
+    by_class = [calibration_error(p[:, k], classes == k, bins) for k in range(p.shape[1])]
     return Calibration(
-        count=len(labels),
+        count=len(classes),
         nll=float(surprisal(true).mean()),
         brier=float((p.square().sum(1) - 2 * true + 1).mean()),
-        ece=float(calibration_error(confidence, predicted == labels, bins)),
-        classwise_ece=float(
-            torch.stack([calibration_error(p[:, k], labels == k, bins) for k in range(p.shape[1])]).mean()
-        ),
-        accuracy=float((predicted == labels).double().mean()),
+        ece=float(calibration_error(confidence, predicted == classes, bins)),
+        classwise_ece=float(torch.stack(by_class).mean()),
+        accuracy=float((predicted == classes).double().mean()),
     )
 
 
+def _class_numbers(labels: Tensor, probabilities: Tensor) -> Tensor:
+    """Take labels as whole numbers `(M,)`, one for each row of probabilities, on their device."""
+    numbers = as_numbers(labels, "labels")
+    broken = numbers[numbers != numbers.floor()].tolist()
+    check(not broken, "labels", "whole numbers", broken[0] if broken else "")
+    expected = f"{len(probabilities)} numbers, one for each row"
+    check(numbers.shape == probabilities.shape[:1], "labels", expected, f"shape {(*numbers.shape,)}")
+    return numbers.to(probabilities.device, torch.int64)
+
+
+def _check_distributions(p: Tensor) -> None:
+    """Check that the rows of probabilities sum to 1, up to rounding."""
+    total = p.detach().sum(1)
+    least = float(total.min())
+    most = float(total.max())
+    got = f"sums from {least:g} to {most:g}; give logits.softmax(-1)"
+    check(least >= 1 - _ROUNDING and most <= 1 + _ROUNDING, "probabilities", "rows that sum to 1", got)
+
+
 def _probabilities(values: Tensor, argument: str) -> Tensor:
-    """Probabilities as float64; refuses numbers outside [0, 1] and NaN."""
+    """Take probabilities as float64; refuse numbers outside [0, 1] and NaN."""
     p = as_numbers(values, argument).double()
-    least, most = (float(p.detach().min()), float(p.detach().max())) if p.numel() else (0.0, 0.0)
-    inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
-    got = f"{least:g} to {most:g}; give logits.sigmoid() or .softmax(-1)"
-    check(inside, argument, "probabilities from 0 to 1", got)
+    if p.numel():
+        least = float(p.detach().min())
+        most = float(p.detach().max())
+        got = f"{least:g} to {most:g}; give logits.sigmoid() or .softmax(-1)"
+        check(least >= -_ROUNDING and most <= 1 + _ROUNDING, argument, "probabilities from 0 to 1", got)
     return p
 
 
 def surprisal(probability: Tensor) -> Tensor:
-    """Negative logarithm of probabilities in nats; one that has underflowed counts as the smallest positive float32."""
+    """Compute the negative logarithm of probabilities.
+
+    Args:
+        probability: `(...)`; one that has underflowed counts as the smallest positive float32.
+
+    Returns:
+        `(...)`, in nats.
+    """
     return -probability.clamp(min=torch.finfo(torch.float32).tiny).log()
 
 
 def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Tensor:
-    """Calibration error in bins (Naeini, Cooper and Hauskrecht, 2015), Σ_b n_b / n |acc_b - conf_b|; inputs `(M,)`."""
+    r"""Compute the calibration error in bins (Naeini, Cooper and Hauskrecht, 2015).
+
+    .. math:: \sum_b \frac{n_b}{n} |\mathrm{acc}_b - \mathrm{conf}_b|
+
+    Args:
+        confidence: `(M,)`, predicted probabilities.
+        correct: `(M,)`, whether they came true.
+        bins: number of equally wide bins.
+
+    Returns:
+        The error, a scalar.
+    """
     return _error_of(reliability(confidence, correct, bins))
 
 
 def _error_of(bins: Tensor) -> Tensor:
-    """Expected calibration error from the sums of `reliability`; bins `(3, bins)`."""
-    count, confident, right = bins
-    return (confident - right).abs().sum() / count.sum().clamp(min=1)
+    """Compute the calibration error from the sums of `reliability`; bins `(3, bins)`."""
+    count, predicted, came_true = bins
+    return (predicted - came_true).abs().sum() / count.sum().clamp(min=1)
 
 
 def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
-    """Sums `(3, bins)` for a reliability diagram: what was predicted and came true, by bin of confidence `(M,)`."""
+    """Sum up predictions and outcomes by bins of confidence, for a reliability diagram.
+
+    Args:
+        confidence: `(M,)`, predicted probabilities.
+        correct: `(M,)`, whether they came true.
+        bins: number of equally wide bins, or their inner edges `(bins - 1,)`.
+
+    Returns:
+        `(3, bins)`: numbers of predictions, sums of their probabilities, and numbers that came true.
+    """
     edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
     p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
-    right = as_outcomes(correct, "correct")
-    check_shape(right, "correct", len(p))
-    values = torch.stack([torch.ones_like(p), p, right.to(p)])
+    came_true = as_outcomes(correct, "correct")
+    check_shape(came_true, "correct", len(p))
+    values = torch.stack([torch.ones_like(p), p, came_true.to(p)])
     return torch.zeros(3, len(edges) + 1, dtype=torch.float64).index_add_(1, torch.bucketize(p, edges), values)
 
 
-_WIDE = torch.arange(1, 15, dtype=torch.float64) / 15
-_RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
+_EQUAL_EDGES = torch.arange(1, 15, dtype=torch.float64) / 15  # of the bins of `calibration_error`
+_RARE_EDGES = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)  # within the first of them
 
 
 @dataclass(frozen=True)
 class BinarySums:
-    """Sums over binary predictions, for their log likelihood and Brier score (1950); bins `(3, 21)`, the first in 7."""
+    """Sums over binary predictions, for their log likelihood and Brier score (1950).
+
+    Attributes:
+        bins: `(3, 21)`, sums by bins of probability (`reliability`), of which seven divide the first of 15 equal ones.
+        surprisal: sum of the negative log likelihoods, in nats.
+        square: sum of the squared errors.
+    """
 
     bins: Tensor
     surprisal: float
     square: float
 
-    EDGES: ClassVar[Tensor] = torch.cat([_RARE, _WIDE])
+    EDGES: ClassVar[Tensor] = torch.cat([_RARE_EDGES, _EQUAL_EDGES])
     """Edges between the bins."""
 
     @classmethod
     def of(cls, probability: Tensor, outcome: Tensor) -> Self:
-        """Sum over predictions; probability `(M,)`, outcome `(M,)`."""
+        """Sum up predictions.
+
+        Args:
+            probability: `(M,)`.
+            outcome: `(M,)`, whether it came true.
+
+        Returns:
+            The sums.
+        """
         p = _probabilities(probability, "probability").detach()
-        came = as_outcomes(outcome, "outcome").to(p.device)
+        came_true = as_outcomes(outcome, "outcome").to(p.device)
         check_shape(p, "probability", None)
-        check_shape(came, "outcome", len(p))
-        cost = surprisal(torch.where(came, p, 1 - p))
-        square = (p - came.double()).square()
-        return cls(reliability(p, came, cls.EDGES), float(cost.sum()), float(square.sum()))
+        check_shape(came_true, "outcome", len(p))
+        cost = surprisal(torch.where(came_true, p, 1 - p))
+        square = (p - came_true.double()).square()
+        return cls(reliability(p, came_true, cls.EDGES), float(cost.sum()), float(square.sum()))
 
     @property
     def count(self) -> int:
+        """Number of predictions."""
         return int(self.bins[0].sum())
 
     @property
@@ -136,6 +213,8 @@ class BinarySums:
     @property
     def ece(self) -> float:
         """Expected calibration error over 15 equally wide bins (`calibration_error`)."""
-        first = self.bins[:, : len(_RARE) + 1].sum(1, keepdim=True)
-        error = float(_error_of(torch.cat([first, self.bins[:, len(_RARE) + 1 :]], 1)))
-        return error if self.count else float("nan")
+        if not self.count:
+            return float("nan")
+        parts = len(_RARE_EDGES) + 1  # bins that divide the first of the equally wide ones
+        first = self.bins[:, :parts].sum(1, keepdim=True)
+        return float(_error_of(torch.cat([first, self.bins[:, parts:]], 1)))

@@ -15,46 +15,102 @@ FloatArray = NDArray[np.float64]
 
 
 def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArray:
-    """Fraction of searches, `(..., episodes)`, that have found their target after 0..`shifts` gaze shifts."""
+    """Compute the fraction of searches that have found their target after each gaze shift.
+
+    Args:
+        found_at: `(..., episodes)`, gaze shift at which each search found its target; -1 where it did not.
+        shifts: last gaze shift.
+
+    Returns:
+        `(..., shifts + 1)`, after 0, 1, … gaze shifts.
+    """
     steps = np.arange(shifts + 1)
-    when = np.asarray(found_at)[..., None]
-    found = (when >= 0) & (when <= steps)
+    shift = np.asarray(found_at)[..., None]
+    found = (shift >= 0) & (shift <= steps)
     return np.asarray(found.mean(-2), dtype=np.float64)
 
 
 def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Scores of the cases with the target, and of those without; there is at least one of each."""
+    """Divide scores into those of the cases with the target, and of those without.
+
+    Args:
+        score: `(M,)`.
+        present: `(M,)`, whether the target is there.
+
+    Returns:
+        Both, at least one of each.
+
+    Raises:
+        InputError: the shapes differ, or one of the two is missing.
+    """
     scores = as_numbers(score, "score")
-    there = as_outcomes(present, "present").to(scores.device)
-    check(there.shape == scores.shape, "present", f"one outcome for each score {(*scores.shape,)}", (*there.shape,))
-    check(bool(there.any() and not there.all()), "present", "both true and false values", "only one of the two")
-    return scores[there].double(), scores[~there].double()
+    is_present = as_outcomes(present, "present").to(scores.device)
+    expected = f"one outcome for each score {(*scores.shape,)}"
+    check(is_present.shape == scores.shape, "present", expected, (*is_present.shape,))
+    has_both = bool(is_present.any() and not is_present.all())
+    check(has_both, "present", "both true and false values", "only one of the two")
+    return scores[is_present].double(), scores[~is_present].double()
 
 
 def area_under_roc(score: Tensor, present: Tensor) -> float:
-    """Area under the ROC (Hanley and McNeil, 1982), P(s₊ > s₋) + P(s₊ = s₋) / 2; score and present `(M,)`."""
-    hit, miss = scores_by_presence(score, present)
-    miss = miss.sort().values
-    below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
-    return float(below.double().mean() / (2 * len(miss)))
+    """Compute the area under the ROC (Hanley and McNeil, 1982), P(s₊ > s₋) + P(s₊ = s₋) / 2.
+
+    Args:
+        score: `(M,)`, s.
+        present: `(M,)`, whether the target is there.
+
+    Returns:
+        The area, from 0 to 1.
+
+    Raises:
+        InputError: the shapes differ, or cases with or without the target are missing.
+    """
+    positive, negative = scores_by_presence(score, present)
+    negative = negative.sort().values
+    twice_below = torch.searchsorted(negative, positive) + torch.searchsorted(negative, positive, right=True)
+    return float(twice_below.double().mean() / (2 * len(negative)))
 
 
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
-    """The classes that are correct for each cell: those of the objects whose boxes overlap it; → `(X·Y, K+1)`."""
+    """Find the classes that are correct for each cell: those of the objects whose boxes overlap it.
+
+    Args:
+        annotation: the objects.
+        grid: the cells.
+        components: number of classes with background, K+1.
+
+    Returns:
+        `(X·Y, K+1)` boolean.
+    """
     overlap = grid.footprint(annotation.boxes)
     classes = F.one_hot(annotation.labels, components)
     return overlap.T.float() @ classes.float() > 0
 
 
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
-    """Cells `(B, X·Y)` whose most probable class is one of the answers; beta `(B, X·Y, C)`, answers `(X·Y, C)`."""
+    """Find the cells whose most probable class, a single one, is right.
+
+    Args:
+        beta: `(B, X·Y, C)`, the belief.
+        answers: `(X·Y, C)`, correct classes (`answers_of`).
+
+    Returns:
+        `(B, X·Y)` boolean.
+    """
     best = beta == beta.amax(-1, keepdim=True)
     # Sums of a short dimension take a seventh of the time of `any`.
     return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
 
 
 def standard_error(values: FloatArray) -> FloatArray:
-    """Standard error of the mean along the first axis, the root of Σ (x - x̄)² / (n (n - 1))."""
+    """Compute the standard error of the mean along the first axis, the root of Σ (x - x̄)² / (n (n - 1)).
+
+    Args:
+        values: `(n, ...)`.
+
+    Returns:
+        `(...)`; NaN for fewer than two values.
+    """
     values = np.asarray(values, dtype=np.float64)
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)

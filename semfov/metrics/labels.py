@@ -12,52 +12,92 @@ from semfov.errors import InputError, check, values_known
 
 
 def as_numbers(values: Any, argument: str) -> Tensor:
-    """Numbers of any common type as a tensor of floats; NaN is refused, because it compares with nothing."""
+    """Take numbers of any common type as a tensor of floats.
+
+    Args:
+        values: a tensor, an array or a list.
+        argument: name of the argument, for the message.
+
+    Returns:
+        Floats in the shape of the values.
+
+    Raises:
+        InputError: they are no real numbers, or have NaN, which compares with nothing.
+    """
     tensor = _as_tensor(values, argument)
     check(not tensor.is_complex(), argument, "real numbers", "complex ones")
     floats = tensor if tensor.is_floating_point() else tensor.double()
     if values_known(floats):
         missing = int(floats.isnan().sum())
-        check(not missing, argument, "numbers", f"NaN in {missing} of {floats.numel()}; leave these cases out")
+        check(missing == 0, argument, "numbers", f"NaN in {missing} of {floats.numel()}; leave these cases out")
     return floats
 
 
 def as_outcomes(values: Any, argument: str) -> Tensor:
-    """Outcomes of any common type as booleans; other numbers than 0 and 1 are refused."""
+    """Take outcomes of any common type as booleans.
+
+    Args:
+        values: a tensor, an array or a list.
+        argument: name of the argument, for the message.
+
+    Returns:
+        Booleans in the shape of the values.
+
+    Raises:
+        InputError: there are other numbers than 0 and 1.
+    """
     tensor = _as_tensor(values, argument)
     if tensor.dtype == torch.bool:
         return tensor
     if values_known(tensor):
         others = tensor[(tensor != 0) & (tensor != 1)]
-        got = f"{others.flatten()[0].item()}" if others.numel() else ""
+        got = others.flatten()[0].item() if others.numel() else ""
         check(not others.numel(), argument, "true and false, or 1 and 0", got)
     return tensor == 1
 
 
 def as_labels(labels: Any, argument: str, *, least: int = 0) -> list[Hashable]:
-    """At least `least` labels, as values that are equal where they are; a tensor's elements equal themselves alone."""
+    """Take labels as values that are equal where they are; the elements of a tensor equal themselves alone.
+
+    Args:
+        labels: names or numbers, in a list, an array or a tensor.
+        argument: name of the argument, for the message.
+        least: least number of labels, 0 or 1.
+
+    Returns:
+        The labels.
+
+    Raises:
+        InputError: they are in no row, too few, NaN, or nothing that can be compared.
+    """
     check(hasattr(labels, "__iter__"), argument, "labels in a row", f"a {type(labels).__name__}")
-    given = labels if isinstance(labels, Tensor | np.ndarray) else [*labels]
-    check(not hasattr(given, "ndim") or given.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(given))}")
-    values = given.tolist() if isinstance(given, Tensor | np.ndarray) else [_plain(each) for each in given]
-    check(not any(isinstance(each, float) and math.isnan(each) for each in values), argument, "labels", "NaN")
+    if isinstance(labels, Tensor | np.ndarray):
+        check(labels.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(labels))}")
+        values = labels.tolist()
+    else:
+        values = [_plain(label) for label in labels]
+    has_nan = any(isinstance(value, float) and math.isnan(value) for value in values)
+    check(not has_nan, argument, "labels", "NaN")
     check(len(values) >= least, argument, "at least one label", "none")
     return values
 
 
-def _plain(label: Any) -> Any:
-    scalar = isinstance(label, np.generic) or (isinstance(label, Tensor | np.ndarray) and label.ndim == 0)
-    value = label.item() if scalar else label
+def _plain(label: Any) -> Hashable:
+    """Take a scalar of NumPy or torch as a number of Python; refuse what cannot be compared."""
+    is_scalar = isinstance(label, np.generic) or (isinstance(label, Tensor | np.ndarray) and label.ndim == 0)
+    value = label.item() if is_scalar else label
     try:
         hash(value)
     except TypeError:
         value = None
-    named = value is not None and not isinstance(value, Tensor)
-    check(named, "labels", "names or numbers", f"a {type(label).__name__} of shape {tuple(np.shape(label))}")
+    is_comparable = value is not None and not isinstance(value, Tensor)
+    got = f"a {type(label).__name__} of shape {tuple(np.shape(label))}"
+    check(is_comparable, "labels", "names or numbers", got)
     return value
 
 
 def _as_tensor(values: Any, argument: str) -> Tensor:
+    """Take values of any common type as a dense tensor."""
     if isinstance(values, Tensor):
         return values.to_dense() if values.layout != torch.strided else values
     try:

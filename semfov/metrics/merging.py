@@ -65,7 +65,7 @@ class AreaUnderRoc(Metric):
         super().sync(*arguments, **options)
 
     def compute(self) -> Tensor:
-        """The area over all cases; both kinds are needed."""
+        """Compute the area over all cases; both kinds are needed."""
         # After a synchronisation the cases of all updates are one tensor already.
         states = (self.score, self.present)
         cases = [state if isinstance(state, Tensor) else torch.cat(state) for state in states if len(state)]
@@ -112,6 +112,6 @@ class Reliability(Metric):
         self.sums += torch.tensor([added.surprisal, added.square], dtype=torch.float64, device=self.sums.device)
 
     def compute(self) -> dict[str, Tensor]:
-        """Number of predictions, mean negative log likelihood in nats, Brier score and expected calibration error."""
+        """Compute number of predictions, mean negative log likelihood in nats, Brier score and calibration error."""
         sums = BinarySums(self.bins.cpu(), *self.sums.tolist())
         return {name: torch.tensor(float(getattr(sums, name))) for name in ("count", "nll", "brier", "ece")}

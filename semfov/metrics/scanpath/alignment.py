@@ -49,7 +49,7 @@ def multimatch(
     size: tuple[float, float],
     durations: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> MultiMatch:
-    r"""MultiMatch (Jarodzka, Holmqvist and Nyström, 2010; Dewhurst et al., 2012), without simplification.
+    r"""Compute MultiMatch (Jarodzka, Holmqvist and Nyström, 2010; Dewhurst et al., 2012), without simplification.
 
     Saccades :math:`u_i` and :math:`v_j` are aligned along the cheapest path through the matrix
     :math:`M_{ij} = \|u_i - v_j\|` from its first to its last corner (steps right, down and diagonal). With D the
@@ -83,7 +83,8 @@ def multimatch(
     >>> multimatch(path, path, (300, 400)).mean
     1.0
     """
-    a, b = as_path(ours, "ours"), as_path(theirs, "theirs")
+    a = as_path(ours, "ours")
+    b = as_path(theirs, "theirs")
     check(all(np.isfinite(side) and side > 0 for side in size), "size", "(width, height), positive numbers", size)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
@@ -91,31 +92,50 @@ def multimatch(
     spread = float(np.hypot(*np.ptp(np.concatenate([a, b]), axis=0)))
     got = f"fixations over {spread:g}, {spread / diagonal:.0f} of its diagonals"
     check(spread <= _MOST_SCREENS * diagonal, "size", "the screen in the unit of the fixations", got)
-    u, v = np.diff(a, axis=0), np.diff(b, axis=0)
-    i, j = _aligned(np.linalg.norm(u[:, None] - v[None], axis=-1))
-    u, v = u[i], v[j]
+    u = np.diff(a, axis=0)
+    v = np.diff(b, axis=0)
+    i, j = _aligned(_distances(u, v))
+    u = u[i]
+    v = v[j]
     turn = np.abs(np.arctan2(u[:, 1], u[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))
+    angle = np.minimum(turn, 2 * np.pi - turn)
     lengths = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
     duration = float("nan")
     if durations is not None:
-        s, t = (as_array(each, "durations") for each in durations)
-        expected = f"{len(a)} and {len(b)} numbers, one for each fixation"
-        check(len(s) == len(a) and len(t) == len(b), "durations", expected, (len(s), len(t)))
-        lasting = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
-        check(lasting, "durations", "finite numbers of 0 or more", "others")
-        longer = np.maximum(s[i], t[j])
-        duration = 1 - float(np.median(np.abs(s[i] - t[j]) / np.where(longer > 0, longer, 1)))
+        s, t = _checked_durations(durations, len(a), len(b))
+        duration = _duration_similarity(s[i], t[j])
     return MultiMatch(
         shape=max(0.0, 1 - float(np.median(np.linalg.norm(u - v, axis=1))) / (2 * diagonal)),
-        direction=1 - float(np.median(np.minimum(turn, 2 * np.pi - turn))) / np.pi,
+        direction=1 - float(np.median(angle)) / np.pi,
         length=max(0.0, 1 - float(np.median(lengths)) / diagonal),
         position=max(0.0, 1 - float(np.median(np.linalg.norm(a[i] - b[j], axis=1))) / diagonal),
         duration=duration,
     )
 
 
+def _distances(first: _Array, second: _Array) -> _Array:
+    """Compute the distances of all pairs of vectors; first `(n, d)`, second `(m, d)` → `(n, m)`."""
+    return np.asarray(np.linalg.norm(first[:, None] - second[None], axis=-1))
+
+
+def _checked_durations(durations: tuple[ArrayLike, ArrayLike], first: int, second: int) -> tuple[_Array, _Array]:
+    """Take the durations of two scanpaths of some numbers of fixations, and check them."""
+    s, t = (as_array(values, "durations") for values in durations)
+    expected = f"{first} and {second} numbers, one for each fixation"
+    check(len(s) == first and len(t) == second, "durations", expected, (len(s), len(t)))
+    is_usable = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
+    check(is_usable, "durations", "finite numbers of 0 or more", "others")
+    return s, t
+
+
+def _duration_similarity(s: _Array, t: _Array) -> float:
+    """Compare the durations `(n,)` of aligned fixations; two of 0 are equal."""
+    longer = np.maximum(s, t)
+    return 1 - float(np.median(np.abs(s - t) / np.where(longer > 0, longer, 1)))
+
+
 def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the cheapest path through a matrix, from its end to its start."""
+    """Find the rows and columns of the cheapest path through a matrix, from its end to its start."""
     rows, columns = cost.shape
     total = np.full((rows + 1, columns + 1), np.inf)
     total[0, 0] = 0
@@ -143,7 +163,7 @@ def scanmatch(
     durations: tuple[ArrayLike, ArrayLike] | None = None,
     bin_ms: float = 50.0,
 ) -> float:
-    r"""ScanMatch (Cristino, Mathôt, Theeuwes and Gilchrist, 2010), with a substitution matrix by distance.
+    r"""Compute ScanMatch (Cristino, Mathôt, Theeuwes and Gilchrist, 2010), with a substitution matrix by distance.
 
     Fixations become letters, the cells of a grid. Needleman and Wunsch's alignment of the two words has the largest
     sum S, of :math:`\theta - \|c - c'\|` for every pair of letters whose cells c and c' are aligned, in widths of a
@@ -182,24 +202,46 @@ def scanmatch(
     for number, path in enumerate((as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1))):
         word = cell_labels(path, *cells, size)
         if durations is not None:
-            lasting = as_array(durations[number], "durations")
-            check(lasting.shape == word.shape, "durations", f"{len(word)} numbers", lasting.shape)
-            fits = bool((lasting >= 0).all()) and lasting.sum() <= _MOST_LETTERS * bin_ms
-            check(fits, "durations", f"numbers from 0, of at most {_MOST_LETTERS:,} letters in all", lasting.tolist())
-            word = word.repeat(np.maximum(1, np.round(lasting / bin_ms)).astype(np.int64))
+            word = _repeated(word, durations[number], bin_ms)
         words.append(np.stack([word % cells[0], word // cells[0]], 1))
     a, b = words
-    gain = threshold - np.linalg.norm(a[:, None] - b[None], axis=-1)
-    best = np.zeros((len(a) + 1, len(b) + 1))
-    best[:, 0], best[0] = gap * np.arange(len(a) + 1), gap * np.arange(len(b) + 1)
-    for i in range(len(a)):
-        for j in range(len(b)):
+    best = _best_alignment(threshold - _distances(a, b), gap)
+    return float(best / (threshold * max(len(a), len(b))))
+
+
+def _repeated(word: NDArray[np.int64], durations: ArrayLike, bin_ms: float) -> NDArray[np.int64]:
+    """Repeat each letter `(n,)` for every `bin_ms` of its fixation, at least once."""
+    milliseconds = as_array(durations, "durations")
+    check(milliseconds.shape == word.shape, "durations", f"{len(word)} numbers", milliseconds.shape)
+    is_usable = bool((milliseconds >= 0).all()) and milliseconds.sum() <= _MOST_LETTERS * bin_ms
+    expected = f"numbers from 0, of at most {_MOST_LETTERS:,} letters in all"
+    check(is_usable, "durations", expected, milliseconds.tolist())
+    return word.repeat(np.maximum(1, np.round(milliseconds / bin_ms)).astype(np.int64))
+
+
+def _best_alignment(gain: _Array, gap: float) -> float:
+    """Find the largest sum of an alignment of two words (Needleman and Wunsch, 1970).
+
+    Args:
+        gain: `(n, m)`, what a pair of aligned letters adds.
+        gap: what a letter without a partner adds.
+
+    Returns:
+        The sum.
+    """
+    rows, columns = gain.shape
+    # best[i, j] is the largest sum of the first i letters of one word and the first j of the other.
+    best = np.zeros((rows + 1, columns + 1))
+    best[:, 0] = gap * np.arange(rows + 1)
+    best[0] = gap * np.arange(columns + 1)
+    for i in range(rows):
+        for j in range(columns):
             best[i + 1, j + 1] = max(best[i, j] + gain[i, j], best[i, j + 1] + gap, best[i + 1, j] + gap)
-    return float(best[-1, -1] / (threshold * max(len(a), len(b))))
+    return float(best[-1, -1])
 
 
 def dynamic_time_warping(ours: ArrayLike, theirs: ArrayLike) -> float:
-    r"""Dynamic time warping of two scanpaths (Berndt and Clifford, 1994): the sum along the cheapest alignment.
+    r"""Compute dynamic time warping of scanpaths (Berndt and Clifford, 1994): the sum along the cheapest alignment.
 
     .. math:: \min_{A} \sum_{(i, j) \in A} \|p_i - q_j\|
 
@@ -219,13 +261,12 @@ def dynamic_time_warping(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> dynamic_time_warping([[0, 0], [3, 0]], [[0, 0], [0, 0], [3, 4]])
     4.0
     """
-    a, b = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
-    cost = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    cost = _distances(as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1))
     return float(cost[_aligned(cost)].sum())
 
 
 def time_delay_embedding(ours: ArrayLike, theirs: ArrayLike, *, length: int = 3) -> float:
-    r"""Distance of scanpaths by time delay embedding (Wang, Chen, Wang, Jiang, Fang and Yao, 2011).
+    r"""Compute the distance of scanpaths by time delay embedding (Wang, Chen, Wang, Jiang, Fang and Yao, 2011).
 
     Every run of k successive fixations of ours is compared with the run of theirs that is closest to it.
 
@@ -246,8 +287,14 @@ def time_delay_embedding(ours: ArrayLike, theirs: ArrayLike, *, length: int = 3)
     1.0
     """
     check_whole(length, "length", 1, 1000)
-    a, b = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
+    a = as_path(ours, "ours", least=1)
+    b = as_path(theirs, "theirs", least=1)
     if min(len(a), len(b)) < length:
         return float("nan")
-    one, other = (np.stack([path[i : i + length].ravel() for i in range(len(path) - length + 1)]) for path in (a, b))
-    return float((np.linalg.norm(one[:, None] - other[None], axis=-1).min(1) / length).mean())
+    distances = _distances(_runs(a, length), _runs(b, length))
+    return float((distances.min(1) / length).mean())
+
+
+def _runs(path: _Array, length: int) -> _Array:
+    """List every run of successive fixations as one vector, `(n - length + 1, 2 length)`."""
+    return np.stack([path[start : start + length].ravel() for start in range(len(path) - length + 1)])

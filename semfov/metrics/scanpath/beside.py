@@ -1,9 +1,9 @@
 """One scanpath beside those of people in the same picture, by the measures of this folder."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,15 @@ from semfov.metrics.scanpath.saccades import direction_distance, length_distance
 from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
 from semfov.paths import GazePrediction, Record
 
-_CELLS = 8
-_LONGEST = 64
+_CELLS = 8  # rows and columns of the grid whose cells are the words of a scanpath
+_LONGEST = 64  # pixels along the longer side of a map of fixations
+_BLUR = 0.03  # standard deviation of the Gaussian around a fixation, in longer sides of the picture
 
 _Points = NDArray[np.float64]
 _Measure = Callable[[_Points, Sequence[_Points]], float]
+"""Compares the fixations of one scanpath with those of others."""
+
+_Words = TypeVar("_Words", bound=Sized)  # what a scanpath is compared as
 
 
 class BesidePeople(NamedTuple):
@@ -48,12 +52,14 @@ class ScanpathComparison(dict[str, BesidePeople]):
     """
 
     def __str__(self) -> str:
-        """The measures as a table, and why some are missing."""
-        wide = max(map(len, ["measure", *self]))
-        lines = [f"{name:{wide}}  {each.scanpath:8.2f}  {each.people:6.2f}" for name, each in self.items()]
+        """Print the measures as a table, and why some are missing."""
+        width = max(map(len, ["measure", *self]))
+        lines = [f"{'measure':{width}}  scanpath  people"]
+        for name, (scanpath, people) in self.items():
+            lines.append(f"{name:{width}}  {scanpath:8.2f}  {people:6.2f}")
         if np.isnan([*self.values()]).any():
             lines.append("nan: too few people (two for the last column), or too few fixations inside the picture")
-        return "\n".join([f"{'measure':{wide}}  scanpath  people", *lines])
+        return "\n".join(lines)
 
 
 _People = Fixations | Record | Sequence[Fixations | Record] | str | PathLike[str]
@@ -96,45 +102,92 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
     """
     picture = scanpath.picture if isinstance(scanpath, Fixations) else scanpath.source
     viewed = _viewers(people, picture, scanpath.size)
-    ours = scanpath if isinstance(scanpath, Fixations) else scanpath.as_fixations(viewed[0].picture)
-    if ours is scanpath:
+    if isinstance(scanpath, Fixations):
+        ours = scanpath
         warn_of_frames("scanpath", [ours])
-    targets = sorted({each.target for each in (ours, *viewed) if each.target is not None})
+    else:
+        ours = scanpath.as_fixations(viewed[0].picture)
+    targets = sorted({fixations.target for fixations in (ours, *viewed) if fixations.target is not None})
     check(len(targets) <= 1, "people", "searches for one target", f"for {', '.join(map(repr, targets))}")
     size = viewed[0].size
-    mine, *theirs = [each.resized(size).points for each in (ours, *viewed)]
+    our_points = ours.resized(size).points
+    their_points = [fixations.resized(size).points for fixations in viewed]
     comparison = ScanpathComparison()
     for name, measure in _measures(size).items():
-        among = [measure(each, theirs[:n] + theirs[n + 1 :]) for n, each in enumerate(theirs)] if theirs[1:] else []
-        comparison[name] = BesidePeople(measure(mine, theirs), _mean(among))
+        people = _among_people(measure, their_points)
+        comparison[name] = BesidePeople(measure(our_points, their_points), people)
     return comparison
 
 
-def _viewers(people: _People, picture: str | None, size: tuple[int, int]) -> list[Fixations]:
-    """The fixations of people in a picture of `(width, height)`, checked; None is a picture without a name.
+def _among_people(measure: _Measure, people: Sequence[_Points]) -> float:
+    """Compare each person with all others, on average; NaN for a single one."""
+    if len(people) < 2:
+        return float("nan")
+    values = []
+    for number, points in enumerate(people):
+        others = [*people[:number], *people[number + 1 :]]
+        values.append(measure(points, others))
+    return _mean(values)
 
-    Of a file those in the picture are taken. Coordinates that do not look like those of their frame give a warning.
+
+def _viewers(people: _People, picture: str | None, size: tuple[int, int]) -> list[Fixations]:
+    """Take the fixations of people in a picture, and check them.
+
+    Coordinates that do not look like those of their frame give a warning.
+
+    Args:
+        people: fixations, records, or a file of fixations, of which those in the picture are taken.
+        picture: name of the picture; None for one without a name.
+        size: `(width, height)` of the picture.
+
+    Returns:
+        The fixations of each person, in one picture.
+
+    Raises:
+        InputError: there are none, or some are of other pictures or of a frame with other proportions.
+        DataError: the file cannot be read.
     """
     if isinstance(people, str | PathLike):
-        table = read_fixations(people)
-        name = None if picture is None else Path(picture).stem
-        people = [each for each in table if name is None or Path(each.picture).stem == name]
-        check(len(people) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
-    people = [people] if isinstance(people, Fixations | Record) or not isinstance(people, Iterable) else [*people]
-    named = picture or next((each.picture for each in people if isinstance(each, Fixations)), "")
-    viewed = [each.as_fixations(each.source or named) if isinstance(each, Record) else each for each in people]
-    others = [type(each).__name__ for each in viewed if not isinstance(each, Fixations)]
-    check(not others, "people", "fixations, records of an agent, or a file", f"a {others[0]}" if others else "")
+        viewed: list[Fixations] = _fixations_in_file(people, picture)
+    else:
+        viewed = _as_fixations(people, picture)
     check(len(viewed) > 0, "people", "fixations of at least one person", "none")
-    pictures = sorted({each.picture for each in viewed})
+    pictures = sorted({fixations.picture for fixations in viewed})
     check(len(pictures) == 1, "people", "fixations in one picture (by_picture)", f"in {len(pictures)}")
-    for each in viewed:
-        check_viewed(each, "people", size, picture)
+    for fixations in viewed:
+        check_viewed(fixations, "people", size, picture)
     return warn_of_frames("people", viewed, stacklevel=5)
 
 
+def _fixations_in_file(path: str | PathLike[str], picture: str | None) -> list[Fixations]:
+    """Read the fixations of a file that are in a picture, whose name counts without folder and suffix."""
+    table = read_fixations(path)
+    if picture is None:
+        return [*table]
+    name = Path(picture).stem
+    viewed = [fixations for fixations in table if Path(fixations.picture).stem == name]
+    check(len(viewed) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
+    return viewed
+
+
+def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], picture: str | None) -> list[Fixations]:
+    """Take fixations and records as fixations; a record without a source is of the same picture as the others."""
+    is_one = isinstance(people, Fixations | Record) or not isinstance(people, Iterable)
+    entries = [people] if is_one else [*people]
+    recorded = (entry.picture for entry in entries if isinstance(entry, Fixations))
+    name = picture or next(recorded, "")
+    viewed = []
+    for entry in entries:
+        fixations = entry.as_fixations(entry.source or name) if isinstance(entry, Record) else entry
+        got = f"a {type(fixations).__name__}"
+        check(isinstance(fixations, Fixations), "people", "fixations, records of an agent, or a file", got)
+        viewed.append(fixations)
+    return viewed
+
+
 def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
-    """Measures of points against those of several others, by name."""
+    """List the measures of points against those of several others, in a picture of `(width, height)`, by name."""
+    longer = max(size)
 
     def inside(points: _Points) -> _Points:
         return points[Fixations("", "", points, size).inside]
@@ -142,79 +195,128 @@ def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
     def words(points: _Points) -> list[int]:
         return [int(cell) for cell in cell_labels(inside(points), _CELLS, _CELLS, size)]
 
-    def paired(score: Callable[[_Points, _Points], float]) -> _Measure:
-        return lambda points, others: _mean([score(points, other) for other in others])
+    def multimatch_of(dimension: str) -> _Measure:
+        def similarity(one: _Points, other: _Points) -> float:
+            return float(getattr(multimatch(one, other, size), dimension))
 
-    def matched(dimension: str) -> _Measure:
-        return paired(lambda one, other: float(getattr(multimatch(one, other, size), dimension)))
+        return _averaged(similarity)
 
-    def placed(score: Callable[[Any, Any], float], of: Callable[[_Points], Any] = inside) -> _Measure:
-        def pair(one: _Points, other: _Points) -> float:
-            a, b = of(one), of(other)
-            return score(a, b) if len(a) and len(b) else float("nan")
+    def edits(one: list[int], other: list[int]) -> float:
+        return edit_distance(one, other) / max(len(one), len(other))
 
-        return paired(pair)
+    def scanmatch_in(one: _Points, other: _Points) -> float:
+        return scanmatch(one, other, size)
 
-    def moved(score: Callable[[_Points, _Points], float], number: int, unit: float) -> _Measure:
-        return lambda points, others: score(saccades([points])[number], saccades(others)[number]) / unit
+    def warping(one: _Points, other: _Points) -> float:
+        return dynamic_time_warping(one, other) / longer
 
-    def mapped(score: Callable[..., NDArray[np.float64]]) -> _Measure:
-        def whole(points: _Points, others: Sequence[_Points]) -> float:
-            columns, rows = (max(1, round(side * _LONGEST / max(size))) for side in size)
+    def embedding(one: _Points, other: _Points) -> float:
+        return time_delay_embedding(one, other) / longer
+
+    def lengths(points: _Points, others: Sequence[_Points]) -> float:
+        return length_distance(saccades([points])[0], saccades(others)[0]) / longer
+
+    def directions(points: _Points, others: Sequence[_Points]) -> float:
+        return direction_distance(saccades([points])[1], saccades(others)[1])
+
+    def in_density(score: Callable[[_Points, _Points, _Points], NDArray[np.float64]]) -> _Measure:
+        """Score fixations in the density of the others."""
+
+        def measure(points: _Points, others: Sequence[_Points]) -> float:
+            columns, rows = (max(1, round(side * _LONGEST / longer)) for side in size)
             density = _people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
-            x, y = ((inside(points) + 0.5) * (np.array([columns, rows]) / np.array(size)) - 0.5).T
+            x, y = _map_points(inside(points), size, (rows, columns)).T
             return _mean(score(density, x, y).tolist())
 
-        return whole
+        return measure
 
     return {
-        **{f"MultiMatch {name}": matched(name) for name in ("shape", "direction", "length", "position")},
-        "sequence score": placed(sequence_score, words),
-        "edit distance": placed(lambda a, b: edit_distance(a, b) / max(len(a), len(b)), words),
-        "ScanMatch": placed(lambda a, b: scanmatch(a, b, size)),
-        "time warping": placed(lambda a, b: dynamic_time_warping(a, b) / max(size)),
-        "time delay embedding": placed(lambda a, b: time_delay_embedding(a, b) / max(size)),
-        "saccade lengths": moved(length_distance, 0, max(size)),
-        "saccade directions": moved(direction_distance, 1, 1),
-        "NSS": mapped(nss),
-        "AUC": mapped(auc),
+        **{f"MultiMatch {name}": multimatch_of(name) for name in ("shape", "direction", "length", "position")},
+        "sequence score": _averaged(_unless_empty(sequence_score, words)),
+        "edit distance": _averaged(_unless_empty(edits, words)),
+        "ScanMatch": _averaged(_unless_empty(scanmatch_in, inside)),
+        "time warping": _averaged(_unless_empty(warping, inside)),
+        "time delay embedding": _averaged(_unless_empty(embedding, inside)),
+        "saccade lengths": lengths,
+        "saccade directions": directions,
+        "NSS": in_density(nss),
+        "AUC": in_density(auc),
     }
 
 
+def _averaged(score: Callable[[_Points, _Points], float]) -> _Measure:
+    """Make a measure of the mean of a score of pairs of scanpaths."""
+
+    def measure(points: _Points, others: Sequence[_Points]) -> float:
+        return _mean([score(points, other) for other in others])
+
+    return measure
+
+
+def _unless_empty(
+    score: Callable[[_Words, _Words], float], convert: Callable[[_Points], _Words]
+) -> Callable[[_Points, _Points], float]:
+    """Make a score of points from one of what they are converted to; NaN where nothing is left of one scanpath."""
+
+    def of_points(one: _Points, other: _Points) -> float:
+        a = convert(one)
+        b = convert(other)
+        return score(a, b) if len(a) and len(b) else float("nan")
+
+    return of_points
+
+
 def _mean(values: Sequence[float]) -> float:
+    """Average the finite ones of some values; NaN where there are none."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else float("nan")
 
 
-_BLUR = 0.03
+def _map_points(points: _Points, size: tuple[int, int], shape: tuple[int, ...]) -> _Points:
+    """Convert points `(n, 2)` of a picture of `(width, height)` to pixels of a map of `(rows, columns)`."""
+    return (points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5
 
 
-def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """A map of `(rows, columns)`, a Gaussian of 3 % of its longer side around each point; points `(n, 2)`."""
+def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Add up a Gaussian around each point in a map of `(rows, columns)`; points `(n, 2)` of the picture."""
     rows, columns = (np.arange(side) for side in shape)
-    x, y = ((points + 0.5) * (np.array(shape[::-1]) / np.array(size)) - 0.5).T
-    width = 2 * (_BLUR * max(shape)) ** 2
+    x, y = _map_points(points, size, shape).T
+    width = 2 * (_BLUR * max(shape)) ** 2  # twice the variance
     across = np.exp(-((columns[:, None] - x) ** 2) / width)
     down = np.exp(-((rows[:, None] - y) ** 2) / width)
     return np.asarray(down @ across.T)
 
 
 def compare_density(prediction: GazePrediction, people: _People) -> dict[str, float]:
-    """Measures of a density against all fixations of people but their first ones, and against their blurred density."""
+    """Compare a density with all fixations of people but their first ones, and with their blurred density.
+
+    Args:
+        prediction: the density.
+        people: fixations of people in the same picture, as for `compare_scanpath`.
+
+    Returns:
+        The measures by name.
+
+    Raises:
+        InputError: there are no people, or none of their later fixations lies inside the picture.
+        DataError: the file cannot be read.
+    """
     viewed = _viewers(people, prediction.source, prediction.size)
-    records = [each.resized(prediction.size) for each in viewed]
-    points = np.concatenate([each.points[1:][each.inside[1:]] for each in records])
+    later = []
+    for fixations in viewed:
+        resized = fixations.resized(prediction.size)
+        later.append(resized.points[1:][resized.inside[1:]])
+    points = np.concatenate(later)
     check(len(points) > 0, "people", "fixations inside the picture after the first of each person", "none")
     cells = prediction.cells.double().numpy()
-    ratio = np.array(cells.shape[::-1]) / np.array(prediction.size)
-    x, y = ((points + 0.5) * ratio - 0.5).T
-    theirs = _people_density(points, prediction.size, cells.shape)
+    x, y = _map_points(points, prediction.size, cells.shape).T
+    people_density = _people_density(points, prediction.size, cells.shape)
     return {
         "NSS": float(nss(cells, x, y).mean()),
         "AUC": float(auc(cells, x, y).mean()),
         "AUC Judd": auc_judd(cells, x, y),
         "log likelihood": float(log_likelihood(np.log(cells), x, y).mean()),
-        "CC": float(correlation(cells, theirs)),
-        "SIM": float(similarity(cells, theirs)),
-        "KL": float(kullback_leibler(theirs, cells)),
+        "CC": float(correlation(cells, people_density)),
+        "SIM": float(similarity(cells, people_density)),
+        "KL": float(kullback_leibler(people_density, cells)),
     }

@@ -12,7 +12,7 @@ _ROUNDING = 0.01  # what rounding may do to the sum of a density
 
 
 def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
-    """Area under the ROC of Judd et al. (2009) as the MIT benchmark computes it (Bylinskii et al., 2019).
+    """Compute the area under the ROC of Judd et al. (2009), as the MIT benchmark does (Bylinskii et al., 2019).
 
     Thresholds are the values at the fixations. Hits are counted over fixations, and false alarms over the pixels that
     nobody fixated. The corners (0, 0) and (1, 1) are added, and the curve is joined by straight lines. The benchmark's
@@ -32,21 +32,22 @@ def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
     >>> auc_judd([[0.0, 0.1], [0.2, 0.9]], [1], [1])
     1.0
     """
-    values, at = _looked_up(saliency, x, y)
-    check(values.ndim == 2 and at.size > 0, "saliency", "one map and at least one fixation", (values.shape, at.shape))
-    free = np.ones(values.shape, dtype=bool)
-    column, row = (np.floor(as_array(each, "x, y") + 0.5).astype(int) for each in (x, y))
-    free[row, column] = False
-    others = np.sort(values[free])
+    values, fixated = _looked_up(saliency, x, y)
+    got = values.shape, fixated.shape
+    check(values.ndim == 2 and fixated.size > 0, "saliency", "one map and at least one fixation", got)
+    is_free = np.ones(values.shape, dtype=bool)
+    is_free[_pixels(y).astype(int), _pixels(x).astype(int)] = False
+    others = np.sort(values[is_free])
     check(len(others) > 0, "saliency", "at least one pixel that nobody fixated", "none")
-    thresholds = np.sort(at)[::-1]
-    hits = 1 - np.searchsorted(np.sort(at), thresholds) / len(at)
+    ascending = np.sort(fixated)
+    thresholds = ascending[::-1]
+    hits = 1 - np.searchsorted(ascending, thresholds) / len(fixated)
     alarms = 1 - np.searchsorted(others, thresholds) / len(others)
     return float(np.trapezoid([0, *hits, 1], [0, *alarms, 1]))
 
 
 def auc_shuffled(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, other_x: ArrayLike, other_y: ArrayLike) -> float:
-    """Shuffled area under the ROC (Tatler, Baddeley and Gilchrist, 2005; Zhang et al., 2008).
+    """Compute the shuffled area under the ROC (Tatler, Baddeley and Gilchrist, 2005; Zhang et al., 2008).
 
     The negatives are fixations of other pictures, so a centre bias gains nothing. Over all pairs, as in pysaliency:
 
@@ -75,7 +76,7 @@ def auc_shuffled(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, other_x: Array
 
 
 def auc_borji(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, *, draws: int = 100, seed: int = 0) -> float:
-    """Area under the ROC of fixations against as many pixels drawn uniformly (Borji, Tavakoli, Sihite and Itti, 2013).
+    """Compute the area under the ROC against as many pixels drawn uniformly (Borji, Tavakoli, Sihite and Itti, 2013).
 
     The mean of several draws; its expectation is the mean of `auc`.
 
@@ -95,14 +96,15 @@ def auc_borji(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, *, draws: int = 1
     >>> auc_borji([[0.0, 1.0], [2.0, 3.0]], [1], [1], draws=2000).__round__(1)
     0.9
     """
-    values, own = _looked_up(saliency, x, y)
-    check(own.size > 0 and draws > 0, "x, draws", "at least one", (own.size, draws))
-    drawn = np.random.default_rng(seed).choice(values.reshape(-1), (draws, own.size))
-    return float(np.mean([_share_below(np.sort(each), own.reshape(-1)).mean() for each in drawn]))
+    values, fixated = _looked_up(saliency, x, y)
+    check(fixated.size > 0 and draws > 0, "x, draws", "at least one", (fixated.size, draws))
+    samples = np.random.default_rng(seed).choice(values.reshape(-1), (draws, fixated.size))
+    areas = [_share_below(np.sort(sample), fixated.reshape(-1)).mean() for sample in samples]
+    return float(np.mean(areas))
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
-    """Linear correlation coefficient of two maps over their pixels, CC (Le Meur et al., 2007; Bylinskii et al., 2019).
+    """Compute the linear correlation of two maps over pixels, CC (Le Meur et al., 2007; Bylinskii et al., 2019).
 
     Args:
         first: `(..., H, W)`.
@@ -117,18 +119,22 @@ def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
     >>> correlation([[0.0, 1.0]], [[2.0, 4.0]])
     array(1.)
     """
-    pair = _pair(first, second)
-    for each in pair:
-        missing = int((~np.isfinite(each)).sum())
-        got = f"NaN or infinity in {missing} of {each.size} pixels; replace them (numpy.nan_to_num)"
-        check(not missing, "maps", "finite numbers", got)
-    one, other = (each - each.mean(-1, keepdims=True) for each in pair)
+    one, other = _pair(first, second)
+    for values in (one, other):
+        missing = int((~np.isfinite(values)).sum())
+        got = f"NaN or infinity in {missing} of {values.size} pixels; replace them (numpy.nan_to_num)"
+        check(missing == 0, "maps", "finite numbers", got)
+    one = one - one.mean(-1, keepdims=True)
+    other = other - other.mean(-1, keepdims=True)
     spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
-    return np.asarray(np.where(spread > 0, (one * other).sum(-1) / np.where(spread > 0, spread, 1), 0.0))
+    covariance = (one * other).sum(-1)
+    return np.asarray(np.where(spread > 0, covariance / np.where(spread > 0, spread, 1), 0.0))
 
 
 def similarity(first: ArrayLike, second: ArrayLike) -> _Array:
-    r"""Intersection of two densities, SIM (Judd, Durand and Torralba, 2012): :math:`\sum_u \min(p(u), q(u))`.
+    r"""Compute the intersection of two densities, SIM (Judd, Durand and Torralba, 2012).
+
+    .. math:: \sum_u \min(p(u), q(u))
 
     Args:
         first: `(..., H, W)`, not negative; it is normalised.
@@ -147,7 +153,9 @@ def similarity(first: ArrayLike, second: ArrayLike) -> _Array:
 
 
 def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
-    r"""Kullback-Leibler divergence of a model's density from that of people: :math:`\sum_u q(u) \ln (q(u) / p(u))`.
+    r"""Compute the Kullback-Leibler divergence of a model's density from that of people.
+
+    .. math:: \sum_u q(u) \ln (q(u) / p(u))
 
     Without the small constants that some programs add (Bylinskii et al., 2019, section 3.2).
 
@@ -170,24 +178,26 @@ def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
 
 
 def _pair(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
-    """Two maps of one shape, flat."""
-    one, other = (as_array(each, "maps") for each in (first, second))
-    check(one.shape == other.shape and one.ndim >= 2 and one.size > 0, "maps", "two of one shape (..., H, W)",
-          (one.shape, other.shape))  # fmt: skip
+    """Take two maps of one shape, with their pixels along the last axis."""
+    one = as_array(first, "maps")
+    other = as_array(second, "maps")
+    is_pair = one.shape == other.shape and one.ndim >= 2 and one.size > 0
+    check(is_pair, "maps", "two of one shape (..., H, W)", (one.shape, other.shape))
     return one.reshape(*one.shape[:-2], -1), other.reshape(*other.shape[:-2], -1)
 
 
 def _densities(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
-    pair = _pair(first, second)
-    for each in pair:
-        good = bool((each >= 0).all() and np.isfinite(each).all() and (each.sum(-1) > 0).all())
-        check(good, "maps", "finite numbers of 0 or more, not all 0", f"from {each.min():g} to {each.max():g}")
-    one, other = (each / each.sum(-1, keepdims=True) for each in pair)
-    return one, other
+    """Normalise two maps of one shape to densities, with their pixels along the last axis."""
+    one, other = _pair(first, second)
+    for values in (one, other):
+        is_usable = bool((values >= 0).all() and np.isfinite(values).all() and (values.sum(-1) > 0).all())
+        got = f"from {values.min():g} to {values.max():g}"
+        check(is_usable, "maps", "finite numbers of 0 or more, not all 0", got)
+    return one / one.sum(-1, keepdims=True), other / other.sum(-1, keepdims=True)
 
 
 def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
-    r"""Normalised scanpath saliency (Peters et al., 2005): z-score of the map at each fixation, over its pixels.
+    r"""Compute the normalised scanpath saliency (Peters et al., 2005): the map's z-score at each fixation.
 
     .. math:: \frac{s(x, y) - \bar s}{\sigma_s}
 
@@ -207,17 +217,19 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     >>> nss([[0.0, 0.0], [0.0, 1.0]], [1], [1])
     array([1.73205081])
     """
-    values, at = _looked_up(maps, x, y)
+    values, fixated = _looked_up(maps, x, y)
     check(bool(np.isfinite(values).all()), "maps", "finite numbers", "infinity; give densities, not their logarithms")
     flat = values.reshape(*values.shape[:-2], -1)
     # By rounding the mean of equal values may differ from them, and their deviation from 0.
-    even = (np.ptp(flat, axis=-1) == 0)[..., None]
-    deviation = np.where(even, 1, flat.std(-1)[..., None])
-    return np.where(even, 0, (at - flat.mean(-1)[..., None]) / deviation)
+    is_constant = (np.ptp(flat, axis=-1) == 0)[..., None]
+    deviation = np.where(is_constant, 1, flat.std(-1)[..., None])
+    return np.where(is_constant, 0, (fixated - flat.mean(-1)[..., None]) / deviation)
 
 
 def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
-    r"""Area under the ROC for single fixations: the fraction of pixels with a lower value; ties count half.
+    r"""Compute the area under the ROC for single fixations: the fraction of pixels with a lower value.
+
+    Ties count half:
 
     .. math:: P(s(u) < s(x, y)) + \tfrac12 P(s(u) = s(x, y)), \quad u \text{ uniform over the pixels}
 
@@ -238,20 +250,21 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     >>> auc([[0.0, 1.0], [2.0, 3.0]], [1], [1])
     array([0.875])
     """
-    values, at = _looked_up(maps, x, y)
-    flat = np.sort(values.reshape(-1, values.shape[-1] * values.shape[-2]), axis=-1)
-    scores = at.reshape(len(flat), -1)
-    return np.reshape([_share_below(row, each) for row, each in zip(flat, scores, strict=True)], at.shape)
+    values, fixated = _looked_up(maps, x, y)
+    ascending = np.sort(values.reshape(-1, values.shape[-1] * values.shape[-2]), axis=-1)
+    by_map = fixated.reshape(len(ascending), -1)
+    areas = [_share_below(pixels, scores) for pixels, scores in zip(ascending, by_map, strict=True)]
+    return np.reshape(areas, fixated.shape)
 
 
 def _share_below(ordered: _Array, values: _Array) -> _Array:
-    """Fraction of ascending numbers that are lower than each of `values` `(n,)`; ties count half."""
+    """Compute the fraction of ascending numbers that are lower than each of `values` `(n,)`; ties count half."""
     twice = np.searchsorted(ordered, values) + np.searchsorted(ordered, values, side="right")
     return np.asarray(twice / (2 * len(ordered)))
 
 
 def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
-    r"""Natural logarithm of maps that are normalised to densities over their pixels.
+    r"""Compute the natural logarithm of maps that are normalised to densities over their pixels.
 
     .. math:: \ln\left( (1 - \epsilon) \frac{s}{\sum s} + \frac{\epsilon}{HW} \right)
 
@@ -272,15 +285,16 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     check_number(floor, "floor", 0, 1)
     values = _as_maps(maps)
     total = values.sum((-1, -2), keepdims=True)
-    usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
+    is_usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
-    check(usable, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
+    check(is_usable, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
+    uniform = floor / (values.shape[-1] * values.shape[-2])
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log((1 - floor) * values / total + floor / (values.shape[-1] * values.shape[-2])))
+        return np.asarray(np.log((1 - floor) * values / total + uniform))
 
 
 def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
-    r"""Log likelihood of fixations in bits, above that of a uniform density (Kümmerer, Wallis and Bethge, 2015).
+    r"""Compute the log likelihood of fixations in bits, above a uniform density's (Kümmerer, Wallis and Bethge, 2015).
 
     .. math:: \log_2 p(x, y) + \log_2 HW
 
@@ -299,18 +313,18 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     >>> log_likelihood(log_density([[1.0, 1.0], [1.0, 5.0]]), [1], [1]).round(3)
     array([1.322])
     """
-    values, at = _looked_up(density, x, y)
-    most = values.max((-1, -2))
+    values, fixated = _looked_up(density, x, y)
     with np.errstate(over="ignore", invalid="ignore"):
         totals = np.exp(values).sum((-1, -2))
-    normal = bool((np.isfinite(most) & (np.abs(totals - 1) <= _ROUNDING)).all())
-    got = f"exponentials with sum {totals.flat[np.abs(totals - 1).argmax()]:g}; log_density makes them of maps"
-    check(normal, "density", "natural logarithms of densities, whose exponentials have sum 1", got)
-    return np.asarray((at + np.log(values.shape[-1] * values.shape[-2])) / np.log(2))
+    error = np.abs(totals - 1)
+    is_normal = bool((np.isfinite(values.max((-1, -2))) & (error <= _ROUNDING)).all())
+    got = f"exponentials with sum {totals.flat[error.argmax()]:g}; log_density makes them of maps"
+    check(is_normal, "density", "natural logarithms of densities, whose exponentials have sum 1", got)
+    return np.asarray((fixated + np.log(values.shape[-1] * values.shape[-2])) / np.log(2))
 
 
 def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
-    r"""Information gain over a baseline density, in bits for each fixation (Kümmerer, Wallis and Bethge, 2015).
+    r"""Compute the information gain over a baseline density, in bits (Kümmerer, Wallis and Bethge, 2015).
 
     .. math:: \log_2 p(x, y) - \log_2 p_b(x, y)
 
@@ -329,26 +343,33 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     >>> information_gain(log_density([[1.0, 3.0]]), log_density([[1.0, 1.0]]), [1], [0]).round(3)
     array([0.585])
     """
-    density, baseline = as_array(density, "density"), as_array(baseline, "baseline")
-    ours, theirs = density.shape[-2:], baseline.shape[-2:]
-    check(ours == theirs, "baseline", f"densities over {ours} pixels, as `density`", theirs)
+    density = as_array(density, "density")
+    baseline = as_array(baseline, "baseline")
+    size = density.shape[-2:]
+    check(size == baseline.shape[-2:], "baseline", f"densities over {size} pixels, as `density`", baseline.shape[-2:])
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
 
 def _as_maps(maps: ArrayLike) -> _Array:
-    """Maps `(..., H, W)` as an array."""
+    """Take maps `(..., H, W)` as an array."""
     values = as_array(maps, "maps")
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
     return values
 
 
+def _pixels(coordinate: ArrayLike) -> _Array:
+    """Round coordinates of fixations to those of pixels, whose centres are at integers."""
+    return np.asarray(np.floor(as_array(coordinate, "x, y") + 0.5))
+
+
 def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
     """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`."""
     values = _as_maps(maps)
-    column, row = (np.floor(as_array(each, "x, y") + 0.5) for each in (x, y))
+    column = _pixels(x)
+    row = _pixels(y)
     leading = values.shape[:-2]
-    fits = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
-    check(fits, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))
+    is_row = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
+    check(is_row, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))
     missing = int(np.isnan(values).sum())
     check(not missing, "maps", "numbers", f"NaN in {missing} of {values.size} pixels; replace them (numpy.nan_to_num)")
     height, width = values.shape[-2:]

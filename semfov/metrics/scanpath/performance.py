@@ -14,7 +14,7 @@ _Array = NDArray[np.float64]
 
 
 def found_at(points: ArrayLike, box: ArrayLike) -> int:
-    """Gaze shift after which the gaze is on the target for the first time.
+    """Find the gaze shift after which the gaze is on the target for the first time.
 
     Args:
         points: `(n, 2)`, fixations in order.
@@ -31,12 +31,12 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     """
     x, y = as_path(points, "points", least=1).T
     x1, y1, x2, y2 = _corners(box)
-    on = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
-    return int(on.argmax()) if on.any() else -1
+    on_target = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
+    return int(on_target.argmax()) if on_target.any() else -1
 
 
 def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: int) -> _Array:
-    r"""Fraction of searches that have found their target after each gaze shift, averaged over groups of searches.
+    r"""Compute the fraction of searches that have found their target after each gaze shift, averaged over groups.
 
     .. math:: P(n) = \frac1{|G|} \sum_{g \in G} \frac{|\{i \in g : 0 \le f_i \le n\}|}{|g|}
 
@@ -56,17 +56,21 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     >>> mean_performance([1, -1, 0], ["ann", "ann", "bob"], 1)
     array([0.5 , 0.75])
     """
-    when, names = as_numbers(found, "found").tolist(), as_labels(groups, "groups")
-    check(len(when) == len(names) > 0, "groups", f"one for each of {len(when)} searches, at least one", len(names))
-    members: dict[Hashable, list[float]] = {}
-    for each, group in zip(when, names, strict=True):
-        members.setdefault(group, []).append(each)
-    curves = [cumulative_performance(np.array(each), shifts) for each in members.values()]
+    shifts_found = as_numbers(found, "found").tolist()
+    names = as_labels(groups, "groups")
+    expected = f"one for each of {len(shifts_found)} searches, at least one"
+    check(len(shifts_found) == len(names) > 0, "groups", expected, len(names))
+    by_group: dict[Hashable, list[float]] = {}
+    for shift, group in zip(shifts_found, names, strict=True):
+        by_group.setdefault(group, []).append(shift)
+    curves = [cumulative_performance(np.array(searches), shifts) for searches in by_group.values()]
     return np.asarray(np.mean(curves, axis=0))
 
 
 def performance_area(curve: ArrayLike) -> float:
-    r"""Area under a curve of cumulative performance by the trapezoidal rule, with its fixations spread over [0, 1].
+    r"""Compute the area under a curve of cumulative performance, with its fixations spread over [0, 1].
+
+    The trapezoidal rule:
 
     .. math:: A = \frac1{N-1} \left( \tfrac12 P_1 + P_2 + \dots + P_{N-1} + \tfrac12 P_N \right)
 
@@ -90,7 +94,7 @@ def performance_area(curve: ArrayLike) -> float:
 
 
 def tfp_auc(found: Sequence[int], categories: Sequence[Hashable], shifts: int = 6) -> float:
-    r"""Area under the target fixation probability: a plain sum over fixations of the mean over target categories.
+    r"""Compute the area under the target fixation probability: a sum over fixations of the mean over categories.
 
     .. math:: \sum_{n=0}^{N} P(n), \quad P \text{ averaged over categories}
 
@@ -114,7 +118,7 @@ def tfp_auc(found: Sequence[int], categories: Sequence[Hashable], shifts: int = 
 
 
 def probability_mismatch(curve: ArrayLike, reference: ArrayLike) -> float:
-    r"""Distance between a curve of target fixation probability and that of people (Yang et al., 2020).
+    r"""Compute the distance between a curve of target fixation probability and that of people (Yang et al., 2020).
 
     .. math:: \sum_n | P(n) - P_{\text{people}}(n) |
 
@@ -131,13 +135,14 @@ def probability_mismatch(curve: ArrayLike, reference: ArrayLike) -> float:
     >>> probability_mismatch([0.0, 0.5, 0.5], [0.0, 0.25, 1.0])
     0.75
     """
-    ours, theirs = as_array(curve, "curve", finite=True), as_array(reference, "reference", finite=True)
+    ours = as_array(curve, "curve", finite=True)
+    theirs = as_array(reference, "reference", finite=True)
     check(ours.shape == theirs.shape, "reference", f"a curve of shape {ours.shape}, as `curve`", theirs.shape)
     return float(np.abs(ours - theirs).sum())
 
 
 def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
-    r"""Scanpath ratio (Yang et al., 2020): direct distance to the target over the length of the scanpath, at most 1.
+    r"""Compute the scanpath ratio (Yang et al., 2020): direct distance to the target over the length of the scanpath.
 
     .. math:: \min\left(1, \frac{\|c - p_0\|}{\sum_{i=1}^{m} \|p_i - p_{i-1}\|}\right)
 
@@ -156,16 +161,18 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
     >>> scanpath_ratio([[0, 0], [0, 6], [8, 6]], [7, 5, 9, 7])
     0.7142857142857143
     """
-    path, edges = as_path(points, "points", least=1), _corners(box)
+    path = as_path(points, "points", least=1)
+    edges = _corners(box)
     last = found_at(path, edges)
     if last < 1:
         return float("nan")
-    way = np.linalg.norm(np.diff(path[: last + 1], axis=0), axis=1).sum()
-    straight = np.linalg.norm((edges[:2] + edges[2:]) / 2 - path[0])
-    return float(min(straight / way, 1.0))
+    length = np.linalg.norm(np.diff(path[: last + 1], axis=0), axis=1).sum()
+    direct = np.linalg.norm((edges[:2] + edges[2:]) / 2 - path[0])
+    return float(min(direct / length, 1.0))
 
 
 def _corners(box: ArrayLike) -> _Array:
+    """Take a box as an array `(4,)`, and check it."""
     corners = as_array(box, "box")
     check(corners.shape == (4,), "box", "(x1, y1, x2, y2)", f"shape {corners.shape}")
     check(bool((corners[:2] <= corners[2:]).all()), "box", "x1 <= x2 and y1 <= y2", corners.tolist())

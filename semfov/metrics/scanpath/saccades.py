@@ -11,7 +11,7 @@ _Array = NDArray[np.float64]
 
 
 def saccades(paths: Sequence[ArrayLike]) -> tuple[_Array, _Array]:
-    """Lengths and directions of the saccades of scanpaths.
+    """Compute lengths and directions of the saccades of scanpaths.
 
     Args:
         paths: fixations of each scanpath, `(n, 2)`.
@@ -29,12 +29,13 @@ def saccades(paths: Sequence[ArrayLike]) -> tuple[_Array, _Array]:
     """
     steps = [np.diff(as_path(path, "paths"), axis=0) for path in paths]
     x, y = np.concatenate([np.zeros((0, 2)), *steps]).T
-    moved = np.hypot(x, y) > 0
-    return np.hypot(x, y)[moved], np.arctan2(y, x)[moved]
+    lengths = np.hypot(x, y)
+    moves = lengths > 0
+    return lengths[moves], np.arctan2(y, x)[moves]
 
 
 def length_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
-    r"""Wasserstein distance of two samples of saccade lengths: the area between their distribution functions.
+    r"""Compute the Wasserstein distance of two samples of saccade lengths: the area between their distributions.
 
     .. math:: \int |F(r) - G(r)| \, dr
 
@@ -48,16 +49,22 @@ def length_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> length_distance([1.0, 2.0], [2.0, 3.0])
     1.0
     """
-    a, b = (np.sort(as_array(each, name, finite=True)) for each, name in ((ours, "ours"), (theirs, "theirs")))
+    a = np.sort(as_array(ours, "ours", finite=True))
+    b = np.sort(as_array(theirs, "theirs", finite=True))
     if not (len(a) and len(b)):
         return float("nan")
-    every = np.sort(np.concatenate([a, b]))
-    gap = np.searchsorted(a, every, "right") / len(a) - np.searchsorted(b, every, "right") / len(b)
-    return float((np.abs(gap[:-1]) * np.diff(every)).sum())
+    lengths = np.sort(np.concatenate([a, b]))
+    gap = _distribution(a, lengths) - _distribution(b, lengths)
+    return float((np.abs(gap[:-1]) * np.diff(lengths)).sum())
+
+
+def _distribution(sample: _Array, values: _Array) -> _Array:
+    """Share of a sorted sample that is at most each value; values and result `(n,)`."""
+    return np.asarray(np.searchsorted(sample, values, "right") / len(sample))
 
 
 def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
-    r"""Wasserstein distance of two samples of saccade directions on the circle (Rabin, Delon and Gousseau, 2011).
+    r"""Compute the Wasserstein distance of saccade directions on the circle (Rabin, Delon and Gousseau, 2011).
 
     .. math:: \min_c \int_{-\pi}^{\pi} |F(\theta) - G(\theta) - c| \, d\theta
 
@@ -71,15 +78,14 @@ def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> direction_distance([3.0], [-3.0]).__round__(3)
     0.283
     """
-    samples = (as_array(each, name, finite=True) for each, name in ((ours, "ours"), (theirs, "theirs")))
-    a, b = (np.sort((each + np.pi) % (2 * np.pi)) for each in samples)
+    a = np.sort((as_array(ours, "ours", finite=True) + np.pi) % (2 * np.pi))
+    b = np.sort((as_array(theirs, "theirs", finite=True) + np.pi) % (2 * np.pi))
     if not (len(a) and len(b)):
         return float("nan")
-    every = np.concatenate([[0.0], np.sort(np.concatenate([a, b])), [2 * np.pi]])
-    spans = np.diff(every)
-    at = every[:-1]
-    gap = np.searchsorted(a, at, "right") / len(a) - np.searchsorted(b, at, "right") / len(b)
+    angles = np.concatenate([[0.0], np.sort(np.concatenate([a, b])), [2 * np.pi]])
+    spans = np.diff(angles)
+    gap = _distribution(a, angles[:-1]) - _distribution(b, angles[:-1])
     # The best c is the median of the gap, weighted by the spans.
     order = np.argsort(gap)
-    middle = gap[order][np.searchsorted(spans[order].cumsum(), np.pi)]
-    return float((np.abs(gap - middle) * spans).sum())
+    median = gap[order][np.searchsorted(spans[order].cumsum(), np.pi)]
+    return float((np.abs(gap - median) * spans).sum())

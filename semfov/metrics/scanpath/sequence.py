@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Hashable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ _Labels = NDArray[np.int64]
 
 
 def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, float]) -> _Labels:
-    """The grid cell of each fixation: the letters of ScanMatch (Cristino et al., 2010).
+    """Find the grid cell of each fixation: the letters of ScanMatch (Cristino et al., 2010).
 
     Args:
         points: `(n, 2)`, in pixels of a picture, pixel centres at integers.
@@ -32,15 +32,16 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
-    inside = (as_path(points, "points") + 0.5) / as_array(size, "size")
-    outside = int((~((inside >= 0) & (inside <= 1))).any(-1).sum())
+    shares = (as_path(points, "points") + 0.5) / as_array(size, "size")  # of the picture's width and height
+    outside = int((~((shares >= 0) & (shares <= 1))).any(-1).sum())
     check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
-    column, row = np.minimum(inside * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
+    # A point on the last edge belongs to the last cell.
+    column, row = np.minimum(shares * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
     return np.asarray(row * columns + column)
 
 
 def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None = None) -> _Labels:
-    """The cluster of each fixation, where mean shift has clustered all fixations of a picture.
+    """Find the cluster of each fixation, where mean shift has clustered all fixations of a picture.
 
     These are the letters of Borji and Itti's sequence score (2013) as Yang et al. (2020) compute it: scikit-learn's
     `MeanShift` on the fixations of all people.
@@ -63,8 +64,25 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
     return np.asarray(fitted_clusters(others, bandwidth).predict(as_path(points, "points")), dtype=np.int64)
 
 
-def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
-    """The clusters of `cluster_labels` as a fitted `MeanShift`, to label fixations more than once; others `(m, 2)`."""
+class Clusters(Protocol):
+    """Clusters of fixations, such as a fitted `MeanShift`."""
+
+    def predict(self, points: NDArray[np.float64]) -> NDArray[np.int64]: ...
+
+
+def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Clusters:
+    """Cluster fixations as `cluster_labels` does, to label others more than once.
+
+    Args:
+        others: `(m, 2)`, fixations to cluster.
+        bandwidth: bandwidth of the mean shift; None takes scikit-learn's estimate.
+
+    Returns:
+        The fitted `MeanShift`.
+
+    Raises:
+        InputError: scikit-learn is not installed, or there is no fixation.
+    """
     try:
         from sklearn.cluster import MeanShift
     except ImportError:
@@ -75,11 +93,12 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
     with warnings.catch_warnings():
         # The warning says that no two fixations share a bin. All of them are seeds then, which does no harm.
         warnings.filterwarnings("ignore", message="Binning data failed")
-        return shift.fit(points)
+        fitted: Clusters = shift.fit(points)
+    return fitted
 
 
 def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> float:
-    r"""Similarity of two sequences of labels, from 0 to 1: Needleman and Wunsch's alignment without a gap penalty.
+    r"""Compute the similarity of two sequences of labels: Needleman and Wunsch's alignment without a gap penalty.
 
     .. math:: S(a, b) = \frac{\mathrm{LCS}(a, b)}{\max(|a|, |b|)}
 
@@ -100,12 +119,13 @@ def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> floa
     >>> sequence_score(["cup", "cup", "fork"], ["cup", "fork", "oven", "fork"])
     0.5
     """
-    a, b = as_labels(ours, "ours", least=1), as_labels(theirs, "theirs", least=1)
+    a = as_labels(ours, "ours", least=1)
+    b = as_labels(theirs, "theirs", least=1)
     return float(_rapidfuzz().LCSseq.normalized_similarity(a, b))
 
 
 def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
-    """Edit distance of two sequences of labels (Levenshtein).
+    """Compute the edit distance of two sequences of labels (Levenshtein).
 
     It is the least number of labels to insert, delete or replace that turns one sequence into the other. This is the
     fixation edit distance (Mondal et al., 2023) where labels are clusters or cells, and its semantic form where they
@@ -124,11 +144,13 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
     >>> edit_distance([3, 7, 7, 1], [3, 7, 1])
     1
     """
-    a, b = as_labels(ours, "ours", least=1), as_labels(theirs, "theirs", least=1)
+    a = as_labels(ours, "ours", least=1)
+    b = as_labels(theirs, "theirs", least=1)
     return int(_rapidfuzz().Levenshtein.distance(a, b))
 
 
 def _rapidfuzz() -> Any:
+    """Import the distances of rapidfuzz, which has no types."""
     try:
         from rapidfuzz import distance
     except ImportError:
