@@ -53,7 +53,7 @@ class Eye(StatedModule):
         detections = eye.look(view, [(320.0, 240.0), (100.0, 50.0)])  # a batch of two looks
     """
 
-    _told = ("reference",)  # the size that the settings of the sensor are for
+    _setting_names = ("reference",)  # the size that the settings of the sensor are for
 
     def __init__(self, sensor: Sensor, detector: Detector, *, reference: float = 640.0) -> None:
         super().__init__()

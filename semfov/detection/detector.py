@@ -57,7 +57,7 @@ class Detector(StatedModule, ABC):
     (tensor([[ 0.,  0., 40., 30.]]), tensor([[0.1000, 0.9000]]))
     """
 
-    _told = ("classes",)
+    _setting_names = ("classes",)
 
     def __init__(
         self,

@@ -21,84 +21,162 @@ NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 
 # Keys that other checks compare, and keys of how a network is computed, which changes its numbers only by rounding.
 # (Models that were fitted before the key `runtime` existed have `winograd`.)
-_ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
+_NOT_COMPARED = {"name", "digest", "background", "winograd", "runtime", "dtype"}
+
+Settings = Mapping[str, Any]
+"""Settings of a detector or a sensor as JSON values, by name."""
 
 
 def learned_for(detector: str, growth: float) -> str:
-    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth."""
+    """Name the learned evidence and maps that are shipped for a detector with a sensor.
+
+    Args:
+        detector: name of the detector.
+        growth: of the sensor's blur.
+
+    Returns:
+        The name.
+    """
     return f"{detector}-published" if growth == 1 else detector
 
 
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
-    """Raise `InputError` where classes are given and differ from those that the model was fitted for."""
-    if classes is not None:
-        check(
-            len(classes) == len(fitted), "classes", f"{len(fitted)} classes, as the {what} was fitted for", len(classes)
-        )
-        for place, (mine, theirs) in enumerate(zip(fitted, classes, strict=True), 1):
-            check(mine == theirs, "classes", f"{mine!r} as class {place}, as the {what} was fitted with", repr(theirs))
+    """Check that a model is used with the classes that it was fitted for.
+
+    Args:
+        fitted: classes of the fit.
+        classes: classes that are used; None if they are not known.
+        what: the model, in words.
+
+    Raises:
+        InputError: they differ.
+    """
+    if classes is None:
+        return
+    expected = f"{len(fitted)} classes, as the {what} was fitted for"
+    check(len(classes) == len(fitted), "classes", expected, len(classes))
+    for number, (ours, theirs) in enumerate(zip(fitted, classes, strict=True), 1):
+        expected = f"{ours!r} as class {number}, as the {what} was fitted with"
+        check(ours == theirs, "classes", expected, repr(theirs))
 
 
-def check_background(fitted: Mapping[str, Any], background: str | None, what: str) -> None:
-    """Raise `InputError` where the background policy is not the one that the model was fitted with."""
+def check_background(fitted: Settings, background: str | None, what: str) -> None:
+    """Check that the background policy is that of the scores that a model was fitted on.
+
+    Args:
+        fitted: settings of the detector of the fit.
+        background: policy that is used; None if it is not known.
+        what: the model, in words.
+
+    Raises:
+        InputError: it is another one.
+    """
     policy = fitted.get("background")
-    way = f"load the detector with background={policy!r}, or fit a model for {background!r}"
+    remedy = f"load the detector with background={policy!r}, or fit a model for {background!r}"
     expected = f"the background policy {policy!r} of the scores that the {what} was fitted on"
-    check(background is None or policy in (None, background), "background", expected, f"{background!r}; {way}")
+    check(background is None or policy in (None, background), "background", expected, f"{background!r}; {remedy}")
 
 
-def check_same_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
-    """Raise `InputError` where the weights or the background policy differ; warn where another setting differs."""
+def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None:
+    """Check that a model is used with the detector that it was fitted for; warn where another setting differs.
+
+    Args:
+        fitted: settings of the detector of the fit; empty if they are not known.
+        detector: settings of the detector that is used; likewise.
+        what: the model, in words.
+
+    Raises:
+        InputError: the weights or the background policy differ.
+    """
     if not detector or not fitted:
         return
-    mine, theirs = fitted.get("digest"), detector.get("digest")
-    same = fitted.get("name") == detector.get("name")
-    if mine and theirs:
-        same = mine == theirs or NETWORKS.get(mine, mine) == NETWORKS.get(theirs, theirs)
-    if not same:
-        own, got = (
-            f"{each.get('name')!r}" + (f" (sha256 {each['digest'][:12]}…)" if each.get("digest") else "")
-            for each in (fitted, detector)
-        )
+    if not _is_same_network(fitted, detector):
+        got = _described(detector)
         remedy = "fit a model for this detector, or use the one it was fitted for"
         if fitted.get("name") == detector.get("name"):
-            known = NETWORKS.get(str(theirs))
-            got = f"the file of {'another network' if known is None else repr(known)} under this name"
-            remedy = f"name the detector {known!r}, with this file as weights="
-            if known is None:
-                remedy = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
-        raise InputError(f"detector: the {what} was fitted for {own}, got {got}; {remedy}")
+            got, remedy = _other_file(detector)
+        raise InputError(f"detector: the {what} was fitted for {_described(fitted)}, got {got}; {remedy}")
     check_background(fitted, detector.get("background"), what)
-    others = _others(fitted, detector, _ALIKE)
+    others = _differences(fitted, detector, _NOT_COMPARED)
     if others:
         warnings.warn(f"the {what} was fitted for another detector: {'; '.join(others)}", stacklevel=3)
 
 
-def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str, *, strict: bool = False) -> None:
-    """Warn, or raise if it is strict, where the sensor has other settings than in the fit; empty ones are unknown."""
-    others = _others(fitted, sensor, set()) if sensor and fitted else []
-    way = "make the sensor with these settings, or fit a model for this one (semfov fit)"
-    same = not (others and strict)
-    check(same, "eye", f"the sensor that the {what} was fitted for", f"another: {'; '.join(others)}; {way}")
+def _is_same_network(fitted: Settings, detector: Settings) -> bool:
+    """Tell whether two detectors have the same network, by their files if both are known, else by their names."""
+    ours = fitted.get("digest")
+    theirs = detector.get("digest")
+    if ours and theirs:
+        return bool(ours == theirs or NETWORKS.get(ours, ours) == NETWORKS.get(theirs, theirs))
+    return bool(fitted.get("name") == detector.get("name"))
+
+
+def _described(detector: Settings) -> str:
+    """Describe a detector by its name and its file."""
+    digest = detector.get("digest")
+    file = f" (sha256 {digest[:12]}…)" if digest else ""
+    return f"{detector.get('name')!r}{file}"
+
+
+def _other_file(detector: Settings) -> tuple[str, str]:
+    """Describe a detector with the name of the fit and another file, and what to do."""
+    network = NETWORKS.get(str(detector.get("digest")))
+    if network is None:
+        remedy = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
+        return "the file of another network under this name", remedy
+    return f"the file of {network!r} under this name", f"name the detector {network!r}, with this file as weights="
+
+
+def check_sensor(fitted: Settings, sensor: Settings, what: str, *, strict: bool = False) -> None:
+    """Check that the sensor has the settings of the fit; warn where it has not.
+
+    Args:
+        fitted: settings of the sensor of the fit; empty if they are not known.
+        sensor: settings of the sensor that is used; likewise.
+        what: the model, in words.
+        strict: whether other settings are an error.
+
+    Raises:
+        InputError: settings differ, and the check is strict.
+    """
+    if not sensor or not fitted:
+        return
+    others = _differences(fitted, sensor, set())
+    remedy = "make the sensor with these settings, or fit a model for this one (semfov fit)"
+    got = f"another: {'; '.join(others)}; {remedy}"
+    check(not (others and strict), "eye", f"the sensor that the {what} was fitted for", got)
     if others:
         warnings.warn(f"the {what} was fitted for another sensor: {'; '.join(others)}", stacklevel=3)
 
 
-def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
-    """Check that a grid `(columns, rows)` has half to twice as many cells along each side as that of the training."""
+def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
+    """Check that a grid has half to twice as many cells along each side as that of the training.
+
+    Args:
+        fitted: settings of the training, with its `columns` and `rows` where they are known.
+        grid: columns and rows.
+        what: the model, in words.
+
+    Raises:
+        InputError: it has more or fewer.
+    """
     # Evidence has learned how often a cell of one size holds an object and how far the influence of its neighbours
     # reaches.
-    cells = fitted.get("columns"), fitted.get("rows")
-    if None not in cells and not all(n / 2 <= side <= 2 * n for n, side in zip(cells, grid, strict=True)):  # type: ignore[operator]
-        raise InputError(
-            f"grid: the {what} was fitted on {cells[0]} × {cells[1]} cells and is valid for half to twice as many "
-            f"along each side, got {grid[0]} × {grid[1]}; use grid={cells}, or fit models on such a grid (python -m "
-            f"train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
-        )
+    columns = fitted.get("columns")
+    rows = fitted.get("rows")
+    if columns is None or rows is None:
+        return
+    if columns / 2 <= grid[0] <= 2 * columns and rows / 2 <= grid[1] <= 2 * rows:
+        return
+    raise InputError(
+        f"grid: the {what} was fitted on {columns} × {rows} cells and is valid for half to twice as many "
+        f"along each side, got {grid[0]} × {grid[1]}; use grid={(columns, rows)}, or fit models on such a grid (python "
+        f"-m train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
+    )
 
 
-def _others(fitted: Mapping[str, Any], used: Mapping[str, Any], exempt: set[str]) -> list[str]:
-    """The settings that differ, in words."""
+def _differences(fitted: Settings, used: Settings, exempt: set[str]) -> list[str]:
+    """List the settings that differ, in words."""
     return [
         f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
         for key in sorted((fitted.keys() | used.keys()) - exempt)

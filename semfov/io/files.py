@@ -19,7 +19,7 @@ from filelock import FileLock, Timeout
 from semfov.errors import DataError, check_data
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
-_OLD = 24 * 3600.0  # seconds after which a part of a file is taken for one whose writer was killed
+_ABANDONED = 24 * 3600.0  # seconds after which a part of a file is taken for one whose writer was killed
 
 _unfinished: set[Path] = set()
 
@@ -57,7 +57,17 @@ def discard_unfinished() -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file atomically: a context manager that replaces `path` once its block has ended without an error."""
+    """Write a file atomically: a context manager that replaces `path` once its block has ended without an error.
+
+    Args:
+        path: the file.
+
+    Yields:
+        A temporary file beside it, to be written in the block.
+
+    Raises:
+        DataError: it cannot be written.
+    """
     path = Path(path)
     check_data(bool(path.name), f"cannot write {str(path)!r}", "the name of a file", "none")
     temporary = None
@@ -89,14 +99,29 @@ def _beside(path: Path, end: str) -> Path:
 
 
 def disk_is_full(error: BaseException) -> bool:
-    """Tell whether an error, or its cause, is that of a full disk, on which no other file can be written either."""
+    """Tell whether an error, or its cause, is that of a full disk, on which no other file can be written either.
+
+    Args:
+        error: the error.
+
+    Returns:
+        Whether it is.
+    """
     cause = error.__cause__ or error
     return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
 def written_alone(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> Iterator[None]:
-    """Hold files, and folders of files, in a block; `DataError` where another command holds one of them."""
+    """Hold files, and folders of files, in a block, so that no other command writes them.
+
+    Args:
+        files: the files.
+        folders: the folders.
+
+    Raises:
+        DataError: another command holds one of them, or it cannot be written.
+    """
     places = {_beside(path, f"{json_sha256(path.name)[:8]}.lock"): path for path in map(Path.resolve, files)}
     places |= {folder / ".lock": folder for folder in map(Path.resolve, folders)}
     with ExitStack() as held:
@@ -133,21 +158,33 @@ def _sweep(folder: Path) -> None:
         for entry in entries:
             if _PART.fullmatch(entry.name):
                 with suppress(OSError):
-                    if time.time() - entry.stat(follow_symlinks=False).st_mtime > _OLD:
+                    if time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
                         Path(entry.path).unlink()
 
 
 def inside(folder: str | os.PathLike[str], name: str, *, links: bool = False) -> Path:
-    """Join a folder and a name from elsewhere; refuses names that lead out of it, with `links` unless by a link."""
+    """Join a folder and a name from elsewhere.
+
+    Args:
+        folder: the folder.
+        name: name of a file in it.
+        links: whether a link in the folder may lead out of it.
+
+    Returns:
+        The path.
+
+    Raises:
+        DataError: the name leads out of the folder.
+    """
     folder = Path(folder)
-    try:
+    is_inside = False
+    with suppress(OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
         path = folder / name
-        resolved, within = path.resolve(), folder.resolve()
-        plain = not Path(name).anchor and ".." not in Path(name).parts
-        lies = (resolved.is_relative_to(within) or (links and plain)) and resolved != within
-    except (OSError, ValueError, RuntimeError):
-        lies = False
-    check_data(lies, folder, "the name of a file in this folder", f"{name!a}, which leads out of it")
+        target = path.resolve()
+        within = folder.resolve()
+        is_plain = not Path(name).anchor and ".." not in Path(name).parts
+        is_inside = target != within and (target.is_relative_to(within) or (links and is_plain))
+    check_data(is_inside, folder, "the name of a file in this folder", f"{name!a}, which leads out of it")
     return path
 
 
@@ -161,7 +198,15 @@ def plain_name(text: str) -> str:
 
 
 def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None:
-    """Check that a path that exists is a regular file, because reading a pipe or a device might never end."""
+    """Check that a path that exists is a regular file, because reading a pipe or a device might never end.
+
+    Args:
+        path: the path.
+        name: its name in messages; None for the path.
+
+    Raises:
+        DataError: it is none.
+    """
     name = ascii(str(path))[1:-1] if name is None else name
     try:
         mode = Path(path).stat().st_mode
@@ -174,8 +219,16 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
-    """Check that a file, or files of a folder, can be written later, without making anything now."""
-    place = next((each for each in (path, *path.parents) if each.exists()), Path())
+    """Check that a file can be written later, without making anything now.
+
+    Args:
+        path: the file, or with `folder` the folder of files.
+        folder: whether it is a folder.
+
+    Raises:
+        DataError: it cannot.
+    """
+    place = next((ancestor for ancestor in (path, *path.parents) if ancestor.exists()), Path())
     if place == path and not folder:
         check_regular(path)
         place = path.parent
@@ -187,7 +240,15 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 @contextmanager
 def reading(path: str | os.PathLike[str], name: str | None = None) -> Iterator[None]:
-    """Raise `DataError` for a file that is not there, no regular one, or cannot be read in the block."""
+    """Read a file in a block.
+
+    Args:
+        path: the file.
+        name: its name in messages; None for the path.
+
+    Raises:
+        DataError: it is not there, is no regular one, or cannot be read.
+    """
     check_regular(path, name)
     try:
         yield
@@ -198,7 +259,19 @@ def reading(path: str | os.PathLike[str], name: str | None = None) -> Iterator[N
 
 
 def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> bytes:
-    """The content of a file of at most `most` bytes."""
+    """Read the content of a file.
+
+    Args:
+        path: the file.
+        most: largest number of bytes; None for any.
+        name: its name in messages; None for the path.
+
+    Returns:
+        The content.
+
+    Raises:
+        DataError: it cannot be read, or is larger.
+    """
     with reading(path, name):
         size = Path(path).stat().st_size
         check_data(most is None or size <= most, name or path, f"at most {most or 0:,} bytes", f"{size:,}")
@@ -206,7 +279,19 @@ def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: s
 
 
 def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, most: int | None = None) -> str:
-    """The text of a file in UTF-8, UTF-16 or UTF-32, with a byte order mark or without; or in another encoding."""
+    """Read a text in UTF-8, UTF-16 or UTF-32, with a byte order mark or without.
+
+    Args:
+        path: the file.
+        otherwise: encoding of a file in none of these; None refuses it.
+        most: largest number of bytes; None for any.
+
+    Returns:
+        The text.
+
+    Raises:
+        DataError: it cannot be read, is larger, or is no text.
+    """
     content = read_bytes(path, most=most)
     try:
         return content.decode(_encoding(content))
@@ -217,7 +302,19 @@ def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, mos
 
 
 def read_json(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> Any:
-    """The content of a file of JSON (`read_bytes`)."""
+    """Read a file of JSON.
+
+    Args:
+        path: the file.
+        most: largest number of bytes; None for any.
+        name: its name in messages; None for the path.
+
+    Returns:
+        The value.
+
+    Raises:
+        DataError: it cannot be read, is larger, or is no JSON.
+    """
     try:
         return json.loads(read_bytes(path, most=most, name=name))
     except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
@@ -226,10 +323,10 @@ def read_json(path: str | os.PathLike[str], *, most: int | None = None, name: st
 
 
 def _encoding(content: bytes) -> str:
-    """The encoding of a text: its mark tells it or, of two or four bytes a character, zeros of digits and commas."""
-    told = json.detect_encoding(content)
-    if told in ("utf-8-sig", "utf-16", "utf-32") or content.count(0) <= len(content) / 16:
-        return told
+    """Guess the encoding of a text, by its mark or, of two or four bytes a character, zeros of digits and commas."""
+    marked = json.detect_encoding(content)
+    if marked in ("utf-8-sig", "utf-16", "utf-32") or content.count(0) <= len(content) / 16:
+        return marked
     first, second, third, fourth = (content[place::4].count(0) for place in range(4))
     all_but_few = 0.9 * (len(content) // 4)
     if min(first, second) > all_but_few:
@@ -240,22 +337,56 @@ def _encoding(content: bytes) -> str:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file atomically."""
+    """Write a text file atomically in UTF-8.
+
+    Args:
+        path: the file.
+        text: its content.
+
+    Raises:
+        DataError: it cannot be written.
+    """
     write_bytes(path, text.encode())
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file atomically."""
+    """Write a file atomically.
+
+    Args:
+        path: the file.
+        content: its content.
+
+    Raises:
+        DataError: it cannot be written.
+    """
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def sha256(path: str | os.PathLike[str], name: str | None = None) -> str:
-    """Compute the sha256 of a file's content, as hexadecimal digits."""
+    """Compute the sha256 of a file's content.
+
+    Args:
+        path: the file.
+        name: its name in messages; None for the path.
+
+    Returns:
+        Hexadecimal digits.
+
+    Raises:
+        DataError: it cannot be read.
+    """
     with reading(path, name), Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def json_sha256(value: object) -> str:
-    """Compute the sha256 of a value in JSON, as hexadecimal digits."""
+    """Compute the sha256 of a value in JSON.
+
+    Args:
+        value: the value.
+
+    Returns:
+        Hexadecimal digits.
+    """
     return hashlib.sha256(json.dumps(value).encode()).hexdigest()

@@ -52,7 +52,15 @@ _RECORD = {
 
 @dataclass(frozen=True)
 class Part:
-    """One fitted part of an agent."""
+    """One fitted part of an agent.
+
+    Attributes:
+        file: name of its file in the folder; None for a part that was not fitted.
+        sha256: of the file.
+        used: whether the agent uses it.
+        why: why it is used or not, in words.
+        settings: JSON values of the fit.
+    """
 
     file: str | None
     sha256: str | None
@@ -63,7 +71,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The record that a folder of fitted models keeps about itself; grid `(columns, rows)`."""
+    """The record that a folder of fitted models keeps about itself.
+
+    Attributes:
+        classes: names of the detector's classes.
+        detector: its name, file and options.
+        sensor: settings of the sensor.
+        grid: columns and rows.
+        parts: the parts by name (`PARTS`).
+        training: JSON values of the fit.
+    """
 
     classes: tuple[str, ...]
     detector: Mapping[str, Any]
@@ -84,10 +101,11 @@ class Manifest:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         path = Path(folder) / FILE
         if not path.exists():
-            gaze, what = path.with_name("gaze.safetensors"), "a folder of models that semfov fit wrote"
+            expected = "a folder of models that semfov fit wrote"
+            gaze = path.with_name("gaze.safetensors")
             if gaze.is_file():
-                what = f"{what} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
-            raise DataError(f"{path}: no such file; expected {what}")
+                expected += f" with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
+            raise DataError(f"{path}: no such file; expected {expected}")
         record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
         check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
         recorded = record.pop("sha256", None)

@@ -15,7 +15,8 @@ from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, read, write_file
 from semfov.version import __version__
 
-_COMMON = ("kind", "version", "metadata")
+_COMMON = ("kind", "version", "metadata")  # values of every record
+_STATED = ("classes", "edges", "epsilon", "layers")  # values that are compared where a state is loaded
 _METADATA = Object({"detector": Object(others=Json()), "sensor": Object(others=Json())}, Json())
 """Metadata of a model, which people and `semfov.io.compatibility` read."""
 
@@ -23,7 +24,15 @@ _ENVELOPE = Schema({}, {"version": Text(), "metadata": _METADATA})
 
 
 class Pretrained(StatedModule):
-    """Base of modules that are saved to a file: tensors, and JSON values that describe them."""
+    """Base of modules that are saved to a file: tensors, and JSON values that describe them.
+
+    Attributes:
+        kind: name of the kind of file.
+        title: what the module is, in words.
+        shipped: folder of the models that are shipped with the package.
+        schema: requirements of a file.
+        metadata: JSON values kept with the model.
+    """
 
     kind: ClassVar[str]
     title: ClassVar[str]
@@ -33,16 +42,15 @@ class Pretrained(StatedModule):
 
     @abstractmethod
     def _record(self) -> dict[str, Any]:
-        """JSON values that `_restore` needs in addition to tensors and metadata."""
+        """List the JSON values that `_restore` needs in addition to tensors and metadata."""
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Tensors that are saved."""
+        """List the tensors that are saved."""
         return without_settings(self.state_dict())
 
     def _stated(self) -> dict[str, Any]:
-        """The values of the record that tell what the numbers are of."""
-        told = self._record()
-        return {name: value for name, value in told.items() if name in ("classes", "edges", "epsilon", "layers")}
+        """Select the values of the record that tell what the numbers are of."""
+        return {name: value for name, value in self._record().items() if name in _STATED}
 
     @classmethod
     @abstractmethod
@@ -78,10 +86,10 @@ class Pretrained(StatedModule):
             path = cls.shipped / f"{lookup(str(name_or_path), names, cls.title)}.safetensors"
         tensors, record = read(path, cls.kind)
         try:
-            own = {name: value for name, value in record.items() if name not in _COMMON}
+            values = {name: value for name, value in record.items() if name not in _COMMON}
             _ENVELOPE.check({}, record)
-            cls.schema.check(tensors, own)
-            unknown = own.keys() - cls.schema.record.keys()
+            cls.schema.check(tensors, values)
+            unknown = values.keys() - cls.schema.record.keys()
             check(not unknown, "record", f"no other values than {', '.join(cls.schema.record)}", sorted(unknown))
             model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
@@ -107,12 +115,32 @@ class PretrainedForEye(Pretrained):
 
 
 def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
-    """Write the command that fits all models to a detector."""
+    """Write the command that fits all models to a detector.
+
+    Args:
+        model: the detector.
+        out: folder of the models.
+
+    Returns:
+        The command.
+    """
     return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
 
 
 def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
-    """Return the name under which a kind of model is shipped; if none is, the error has the command that fits one."""
+    """Find the name under which a kind of model is shipped.
+
+    Args:
+        kind: the kind.
+        name: name of the detector.
+        model: the detector as the command of a fit names it.
+
+    Returns:
+        The name.
+
+    Raises:
+        InputError: none is shipped; the message has the command that fits one.
+    """
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
     names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))

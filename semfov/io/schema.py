@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -21,7 +21,20 @@ _FLOATS = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class Field:
-    """Requirements of a tensor in a file."""
+    """Requirements of a tensor in a file.
+
+    Attributes:
+        shape: its sizes, as numbers or names.
+        dtype: its type; None for 32 or 64 bits of floating point.
+        low: least value.
+        high: largest value.
+        above: number that all values are above.
+        ascending: whether each value is above the one before.
+        simplex: whether values sum to 1 along the last dimension.
+        optional: whether it may be missing.
+        finite: whether all values are finite; False checks no values.
+        mixed: whether its floating-point type may differ from that of other tensors.
+    """
 
     shape: tuple[_Size, ...]
     dtype: torch.dtype | None = None
@@ -36,36 +49,52 @@ class Field:
 
     def check(self, name: str, tensor: Tensor, sizes: _Sizes) -> None:
         """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
-        fits = tensor.ndim == len(self.shape) and all(map(_fits, self.shape, tensor.shape, [sizes] * tensor.ndim))
-        shape = ", ".join(str(size) for size in self.shape)
-        equations = ", ".join(f"{key} = {value}" for key, value in sizes.items())
-        check(fits, name, f"shape ({shape})" + (f" with {equations}" if equations else ""), tuple(tensor.shape))
+        has_shape = tensor.ndim == len(self.shape) and all(
+            _agrees(size, number, sizes) for size, number in zip(self.shape, tensor.shape, strict=True)
+        )
+        shape = f"shape ({', '.join(str(size) for size in self.shape)})"
+        if sizes:
+            shape += " with " + ", ".join(f"{name} = {number}" for name, number in sizes.items())
+        check(has_shape, name, shape, tuple(tensor.shape))
         types = _FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
-        if not tensor.numel() or not self.finite:
-            return
-        values = tensor.to(torch.float64)
-        bad = int((~values.isfinite()).sum())
-        check(bad == 0, name, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
-        least, most = float(values.min()), float(values.max())
-        inside = self.low <= least and most <= self.high and least > self.above
-        check(inside, name, interval(self.low, self.high, self.above), least if most <= self.high else most)
-        check(not self.ascending or bool((values.diff() > 0).all()), name, "ascending numbers", "unsorted ones")
-        off = float((values.sum(-1) - 1).abs().max()) if self.simplex else 0.0
-        expected = "numbers that sum to 1 along the last dimension"
-        check(off <= 1e-2, name, expected, f"sums that differ from 1 by {off:.2g}")
+        if tensor.numel() and self.finite:
+            self._check_values(name, tensor.to(torch.float64))
+
+    def _check_values(self, name: str, values: Tensor) -> None:
+        """Raise `InputError` unless values meet the requirements."""
+        infinite = int((~values.isfinite()).sum())
+        check(infinite == 0, name, "finite numbers", f"{infinite} of {values.numel()} that are not finite")
+        least = float(values.min())
+        most = float(values.max())
+        is_inside = self.low <= least and most <= self.high and least > self.above
+        check(is_inside, name, interval(self.low, self.high, self.above), least if most <= self.high else most)
+        is_ascending = not self.ascending or bool((values.diff() > 0).all())
+        check(is_ascending, name, "ascending numbers", "unsorted ones")
+        if self.simplex:
+            error = float((values.sum(-1) - 1).abs().max())
+            expected = "numbers that sum to 1 along the last dimension"
+            check(error <= 1e-2, name, expected, f"sums that differ from 1 by {error:.2g}")
 
 
 class Json:
     """Base of the requirements of a JSON value; any value meets its own."""
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
         """Raise `InputError` unless a value meets the requirements; add the sizes that it determines to `sizes`."""
 
 
 @dataclass(frozen=True)
 class Number(Json):
-    """Requirement of a JSON value: a finite number."""
+    """Requirement of a JSON value: a finite number.
+
+    Attributes:
+        low: least value.
+        high: largest value.
+        above: number that it is above.
+        size: size that it stands for, such as `K`; then it is a whole number from 1 on.
+        whole: whether it is a whole number.
+    """
 
     low: float = -math.inf
     high: float = math.inf
@@ -73,25 +102,36 @@ class Number(Json):
     size: _Size | None = None
     whole: bool = False
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        whole = self.whole or self.size is not None
-        check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", excerpt(value))
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
+        is_whole = self.whole or self.size is not None
+        expected = "a whole number" if is_whole else "a finite number"
+        check(is_number(value, whole=is_whole), name, expected, excerpt(value))
+        number = cast(float, value)
         if self.size is not None:
-            check(value >= 1 and _fits(self.size, value, sizes), name, f"{self.size}, at least 1", excerpt(value))
-        inside = self.low <= value <= self.high and value > self.above
-        check(inside, name, interval(self.low, self.high, self.above), excerpt(value))
+            agrees = number >= 1 and _agrees(self.size, int(number), sizes)
+            check(agrees, name, f"{self.size}, at least 1", excerpt(value))
+        is_inside = self.low <= number <= self.high and number > self.above
+        check(is_inside, name, interval(self.low, self.high, self.above), excerpt(value))
 
 
 class Flag(Json):
     """Requirement of a JSON value: true or false."""
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
         check(isinstance(value, bool), name, "true or false", excerpt(value))
 
 
 @dataclass(frozen=True)
 class Array(Json):
-    """Requirement of a JSON value: a list, of items of one kind or with a kind for each."""
+    """Requirement of a JSON value: a list.
+
+    Attributes:
+        of: kind of all items, or a kind for each.
+        size: number of items, or a name for it; None for any.
+        least: least number of items.
+        ascending: whether each item is above the one before.
+        distinct: whether all items differ.
+    """
 
     of: Json | tuple[Json, ...]
     size: _Size | None = None
@@ -99,46 +139,61 @@ class Array(Json):
     ascending: bool = False
     distinct: bool = False
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
+        items = cast(Sequence[Any], value)
         size = len(self.of) if isinstance(self.of, tuple) else self.size
-        fits = size is None or _fits(size, len(value), sizes)
-        check(fits, name, f"{size} items", f"{len(value)}" + (f" with {sizes}" if sizes else ""))
-        check(len(value) >= self.least, name, f"at least {self.least} items", len(value))
-        kinds = self.of if isinstance(self.of, tuple) else [self.of] * len(value)
-        for place, (item, kind) in enumerate(zip(value, kinds, strict=True)):
+        has_size = size is None or _agrees(size, len(items), sizes)
+        check(has_size, name, f"{size} items", f"{len(items)}" + (f" with {sizes}" if sizes else ""))
+        check(len(items) >= self.least, name, f"at least {self.least} items", len(items))
+        kinds = self.of if isinstance(self.of, tuple) else [self.of] * len(items)
+        for place, (item, kind) in enumerate(zip(items, kinds, strict=True)):
             kind.check(f"{name}[{place}]", item, sizes)
-        grows = not self.ascending or all(a < b for a, b in pairwise(value))
-        check(grows, name, "ascending numbers", excerpt(value))
-        check(not self.distinct or len(set(value)) == len(value), name, "items that differ", "repeated items")
+        is_ascending = not self.ascending or all(a < b for a, b in pairwise(items))
+        check(is_ascending, name, "ascending numbers", excerpt(value))
+        is_distinct = not self.distinct or len(set(items)) == len(items)
+        check(is_distinct, name, "items that differ", "repeated items")
 
 
 @dataclass(frozen=True)
 class Text(Json):
-    """Requirement of a JSON value: a string without control characters."""
+    """Requirement of a JSON value: a string without control characters.
+
+    Attributes:
+        options: the strings that are allowed; None for any.
+    """
 
     options: tuple[str, ...] | None = None
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
-        fits = isinstance(value, str) and (self.options is None or value in self.options)
-        named = f"one of {', '.join(self.options)}" if self.options else "no text"
-        check(fits, name, "text" if self.options is None else named, excerpt(value))
-        check(is_plain(value), name, "text without control characters", excerpt(value))
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
+        expected = "text"
+        if self.options is not None:
+            expected = f"one of {', '.join(self.options)}" if self.options else "no text"
+        is_option = isinstance(value, str) and (self.options is None or value in self.options)
+        check(is_option, name, expected, excerpt(value))
+        check(is_plain(cast(str, value)), name, "text without control characters", excerpt(value))
 
 
 @dataclass(frozen=True)
 class Object(Json):
-    """Requirement of a JSON value: an object."""
+    """Requirement of a JSON value: an object.
+
+    Attributes:
+        keys: kinds of the values, by key.
+        others: kind of the values of other keys; None allows no others.
+        required: keys that must be there.
+    """
 
     keys: Mapping[str, Json] = field(default_factory=dict)
     others: Json | None = None
     required: tuple[str, ...] = ()
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
         check(isinstance(value, Mapping), name, "an object", excerpt(value))
+        values = cast(Mapping[str, Any], value)
         for key in self.required:
-            check(key in value, f"{name}.{key}", "a value", "nothing")
-        for key, item in value.items():
+            check(key in values, f"{name}.{key}", "a value", "nothing")
+        for key, item in values.items():
             kind = self.keys.get(key, self.others)
             check(kind is not None, name, f"no other keys than {', '.join(self.keys)}", excerpt(key))
             if kind is not None:
@@ -147,11 +202,15 @@ class Object(Json):
 
 @dataclass(frozen=True)
 class Maybe(Json):
-    """Requirement of a JSON value: null, or a value that meets another requirement."""
+    """Requirement of a JSON value: null, or a value that meets another requirement.
+
+    Attributes:
+        of: that requirement.
+    """
 
     of: Json
 
-    def check(self, name: str, value: Any, sizes: _Sizes) -> None:
+    def check(self, name: str, value: object, sizes: _Sizes) -> None:
         if value is not None:
             self.of.check(name, value, sizes)
 
@@ -161,13 +220,26 @@ CLASSES = Array(Text(), "K", least=1, distinct=True)  # names of the K classes o
 
 @dataclass(frozen=True)
 class Schema:
-    """Requirements of a whole file."""
+    """Requirements of a whole file.
+
+    Attributes:
+        tensors: requirements of the tensors, by name.
+        record: requirements of the JSON values, by name.
+    """
 
     tensors: Mapping[str, Field]
     record: Mapping[str, Json] = field(default_factory=dict)
 
     def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> None:
-        """Raise `InputError` unless tensors and record meet the requirements."""
+        """Check that tensors and record meet the requirements.
+
+        Args:
+            tensors: by name.
+            record: JSON values by name; None for none.
+
+        Raises:
+            InputError: one does not, is missing, or is not required.
+        """
         sizes: _Sizes = {}
         values = record or {}
         for name, kind in self.record.items():
@@ -175,17 +247,29 @@ class Schema:
             kind.check(name, values.get(name), sizes)
         for name in tensors:
             check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", excerpt(name))
-        for name, each in self.tensors.items():
-            check(name in tensors or each.optional, name, "a tensor", "nothing")
+        for name, field_ in self.tensors.items():
+            check(name in tensors or field_.optional, name, "a tensor", "nothing")
             if name in tensors:
-                each.check(name, tensors[name], sizes)
-        shared = [name for name, each in self.tensors.items() if each.dtype is None and not each.mixed]
-        free = {tensors[name].dtype for name in shared if name in tensors}
-        check(len(free) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, free))))
+                field_.check(name, tensors[name], sizes)
+        types = {
+            tensors[name].dtype
+            for name, field_ in self.tensors.items()
+            if name in tensors and field_.dtype is None and not field_.mixed
+        }
+        check(len(types) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, types))))
 
 
-def check_content(where: object, value: Any, kind: Json) -> None:
-    """Raise `DataError` with the name of a file unless its content meets the requirements."""
+def check_content(where: object, value: object, kind: Json) -> None:
+    """Check that the content of a file meets the requirements.
+
+    Args:
+        where: name of the file.
+        value: its content, a JSON value.
+        kind: the requirements.
+
+    Raises:
+        DataError: it does not.
+    """
     try:
         kind.check("", value, {})
     except InputError as error:
@@ -193,7 +277,18 @@ def check_content(where: object, value: Any, kind: Json) -> None:
 
 
 def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
-    """Requirements of the tensors of an `nn.Sequential` with two hidden layers, each followed by an activation."""
+    """List the requirements of the tensors of an `nn.Sequential` with two hidden layers, each with an activation.
+
+    Args:
+        name: name of the module.
+        inputs: number of inputs.
+        hidden: number of units of a hidden layer.
+        outputs: number of outputs.
+        largest: largest magnitude of a value.
+
+    Returns:
+        The requirements by name.
+    """
     layers: Sequence[tuple[_Size, _Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
     tensors = {}
     for number, (out, into) in enumerate(layers):
@@ -203,17 +298,38 @@ def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, large
 
 
 def interval(low: float, high: float, above: float = -math.inf) -> str:
-    """Write a range in words."""
+    """Write a range in words.
+
+    Args:
+        low: least number.
+        high: largest number.
+        above: number that all are above; then `low` does not count.
+
+    Returns:
+        The words.
+    """
     least, most = (f"{bound:,}" if isinstance(bound, int) else f"{bound:g}" for bound in (low, high))
+    has_least = low > -math.inf
+    has_most = high < math.inf
     if above > -math.inf:
-        return f"numbers above {above:g}" + (f", up to {most}" if high < math.inf else "")
-    if high == math.inf:
-        return f"numbers from {least}" if low > -math.inf else "numbers"
-    return f"numbers from {least} to {most}" if low > -math.inf else f"numbers up to {most}"
+        return f"numbers above {above:g}" + (f", up to {most}" if has_most else "")
+    if has_least and has_most:
+        return f"numbers from {least} to {most}"
+    if has_least:
+        return f"numbers from {least}"
+    return f"numbers up to {most}" if has_most else "numbers"
 
 
 def is_number(value: object, *, whole: bool = False) -> bool:
-    """Whether a JSON value is a finite number; with `whole`, whether it is a finite whole number."""
+    """Tell whether a JSON value is a finite number.
+
+    Args:
+        value: the value.
+        whole: whether it must be a whole number, too.
+
+    Returns:
+        Whether it is.
+    """
     if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
         return False
     try:
@@ -223,12 +339,26 @@ def is_number(value: object, *, whole: bool = False) -> bool:
 
 
 def is_plain(text: str) -> bool:
-    """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs."""
+    """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs.
+
+    Args:
+        text: the text.
+
+    Returns:
+        Whether it is.
+    """
     return not re.search("[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text)
 
 
 def excerpt(value: object) -> str:
-    """A value as error messages print it: on one line and short."""
+    """Write a value as error messages print it: on one line and short.
+
+    Args:
+        value: any value.
+
+    Returns:
+        The text.
+    """
     try:
         text = ascii(value)
     except (ValueError, RecursionError):  # integers too long to print, lists too deep
@@ -236,12 +366,13 @@ def excerpt(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _fits(size: _Size, number: int, sizes: _Sizes) -> bool:
-    """Whether a number agrees with a size; a size that was unknown is known from then on."""
+def _agrees(size: _Size, number: int, sizes: _Sizes) -> bool:
+    """Tell whether a number agrees with a size; a name that was unknown is known from then on."""
     if isinstance(size, int):
         return size == number
     for sign, factor in (("+", -1), ("-", 1)):
         name, separator, offset = size.partition(sign)
         if separator:
-            return sizes.setdefault(name, number + factor * int(offset)) == number + factor * int(offset)
+            wanted = number + factor * int(offset)
+            return sizes.setdefault(name, wanted) == wanted
     return sizes.setdefault(size, number) == number

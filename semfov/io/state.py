@@ -15,21 +15,21 @@ _KEY = "_extra_state"
 class StatedModule(nn.Module):
     """Base of modules whose settings, as bytes of JSON, are in their state; one without them is loaded, too."""
 
-    _told: ClassVar[tuple[str, ...]] = ()
+    _setting_names: ClassVar[tuple[str, ...]] = ()
     """Names of the settings that are no parameters."""
 
     def _stated(self) -> dict[str, Any]:
-        """The settings that are no parameters, as JSON values."""
-        return {name: getattr(self, name) for name in self._told}
+        """List the settings that are no parameters, as JSON values."""
+        return {name: getattr(self, name) for name in self._setting_names}
 
     def get_extra_state(self) -> Tensor:
-        """The settings as bytes of JSON."""
+        """Write the settings as bytes of JSON."""
         return torch.frombuffer(bytearray(json.dumps(self._stated()).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Refuse the state of a module with other settings."""
-        own, theirs = json.loads(json.dumps(self._stated())), json.loads(bytes(state.tolist()))
-        for name, value in own.items():
+        theirs = json.loads(bytes(state.tolist()))
+        for name, value in json.loads(json.dumps(self._stated())).items():  # as JSON, where tuples are lists
             if theirs.get(name, value) != value:
                 raise InputError(
                     f"state_dict: expected the state of a {type(self).__name__} with {name} {value!r:.200}, got one "
@@ -48,5 +48,12 @@ class StatedModule(nn.Module):
 
 
 def without_settings(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The parameters and buffers of a `state_dict`."""
+    """Select the parameters and buffers of a `state_dict`.
+
+    Args:
+        state: the state.
+
+    Returns:
+        The state without the settings of modules.
+    """
     return {name: tensor for name, tensor in state.items() if name.rpartition(".")[2] != _KEY}

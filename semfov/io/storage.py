@@ -22,19 +22,39 @@ _CHECKSUM = "sha256"
 
 
 def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
-    """Write tensors and a record of JSON values to a file atomically; the same content gives the same bytes."""
+    """Write tensors and a record to a file atomically; the same content gives the same bytes.
+
+    Args:
+        path: the file.
+        tensors: by name.
+        record: JSON values by name.
+
+    Raises:
+        DataError: it cannot be written.
+    """
     from safetensors.torch import save
 
-    whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    verified = {**record, _CHECKSUM: checksum(whole, record)}
+    stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    verified = {**record, _CHECKSUM: checksum(stored, record)}
     header = {_KEY: json.dumps(verified, sort_keys=True, allow_nan=False)}
-    content = save(whole, header)
+    content = save(stored, header)
     # The file is written here, because `safetensors` reports a full disk by an error that is not an `OSError`.
     write_bytes(path, content)
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed."""
+    """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed.
+
+    Args:
+        path: the file.
+        kind: the value `kind` of its record.
+
+    Returns:
+        Tensors and record.
+
+    Raises:
+        DataError: it is missing, damaged, of another kind or of a later version.
+    """
     from safetensors import SafetensorError, safe_open
 
     check_regular(path)
@@ -62,15 +82,35 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
 
 
 def check_version(path: str | PathLike[str], record: Mapping[str, Any]) -> None:
-    """Refuse a file of a later version; that of a correction (its third number) has the same form."""
+    """Refuse a file of a later version; that of a correction (its third number) has the same form.
+
+    Args:
+        path: the file.
+        record: its record.
+
+    Raises:
+        DataError: the version is later.
+    """
     written = str(record.get("version", ""))
-    theirs, ours = ([int(n) for n in re.findall(r"\d{1,9}", each)[:2]] for each in (written, __version__))
-    if theirs > ours:
+    if _form(written) > _form(__version__):
         raise DataError(f"{path}: written by semfov {written}, which is newer than this one, {__version__}; update it")
 
 
+def _form(version: str) -> list[int]:
+    """Take the first two numbers of a version."""
+    return [int(number) for number in re.findall(r"\d{1,9}", version)[:2]]
+
+
 def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> str:
-    """Compute a sha256 over the record and over the names, shapes, types and bytes of the tensors."""
+    """Compute a sha256 over the record and over the names, shapes, types and bytes of the tensors.
+
+    Args:
+        tensors: by name.
+        record: JSON values by name; None for none.
+
+    Returns:
+        Hexadecimal digits.
+    """
     digest = hashlib.sha256(json.dumps(record or {}, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
@@ -83,12 +123,30 @@ _KIND = "cached-tensors"
 
 
 def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors atomically, with a checksum, the key of the inputs they depend on, and the name of their file."""
+    """Write tensors atomically, with a checksum.
+
+    Args:
+        path: the file.
+        key: of the inputs that the tensors depend on; it is kept with them, and so is the name of the file.
+        tensors: by name.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     write_file(path, tensors, {"kind": _KIND, "key": key, "file": path.name})
 
 
 def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str, Tensor] | None:
-    """Read the tensors that `write_tensors` wrote to this file under this key; None for another key, file or schema."""
+    """Read the tensors that `write_tensors` wrote.
+
+    Args:
+        path: the file.
+        key: of the inputs that the tensors depend on.
+        schema: requirements of the tensors; None for none.
+
+    Returns:
+        The tensors; None where they are damaged, or were written under another key or to another file.
+    """
     try:
         tensors, record = read(path, _KIND)
         if schema is not None:
@@ -99,7 +157,14 @@ def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str
 
 
 def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
-    """Convert tensors to bytes in the safetensors format."""
+    """Convert tensors to bytes in the safetensors format.
+
+    Args:
+        tensors: by name.
+
+    Returns:
+        The bytes.
+    """
     from safetensors.torch import save
 
     # A view of a larger tensor may share its memory with another one, which the format refuses.
@@ -107,7 +172,14 @@ def pack_tensors(tensors: Mapping[str, Tensor]) -> bytes:
 
 
 def unpack_tensors(data: bytes) -> dict[str, Tensor]:
-    """Convert the bytes of `pack_tensors` back to tensors."""
+    """Convert the bytes of `pack_tensors` back to tensors.
+
+    Args:
+        data: the bytes.
+
+    Returns:
+        The tensors by name.
+    """
     from safetensors.torch import load
 
     return load(data)

@@ -9,7 +9,14 @@ _FORMULAS = ("=", "+", "-", "@")  # first characters of a formula in spreadsheet
 
 
 def pixels(value: float) -> float:
-    """Round a place in a table to a hundredth of a pixel, or of a degree."""
+    """Round a place in a table.
+
+    Args:
+        value: in pixels or degrees.
+
+    Returns:
+        The place, to a hundredth.
+    """
     return round(value, 2)
 
 
@@ -24,6 +31,12 @@ def digits(value: float | None) -> float | None: ...
 def digits(value: float | None) -> float | None:
     """Round a number in a table, such as a probability, to four digits.
 
+    Args:
+        value: the number; None for none.
+
+    Returns:
+        The number, or None.
+
     >>> digits(0.123456789), digits(8.803147466096561e-06)
     (0.1235, 8.803e-06)
     """
@@ -31,7 +44,13 @@ def digits(value: float | None) -> float | None:
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    r"""A table as CSV; the first row holds the headings, and text that a spreadsheet takes for a formula gets a quote.
+    r"""Write a table as CSV; text that a spreadsheet takes for a formula gets a quote.
+
+    Args:
+        rows: the first one holds the headings.
+
+    Returns:
+        The text.
 
     >>> csv_text([["picture", "x"], ["=1+1.jpg", -3.5]])
     "picture,x\n'=1+1.jpg,-3.5\n"
@@ -42,6 +61,7 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def _plain(value: object) -> object:
+    """Put a quote before text that is a formula; numbers as text are none."""
     if not isinstance(value, str) or len(value) < 2:
         return value
     try:
