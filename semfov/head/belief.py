@@ -31,9 +31,16 @@ class _SceneLook(Look):
 
 @dataclass(frozen=True)
 class SceneBelief(Belief):
-    """Belief about the S cells of a scene: a target there `(1, S, 2)`, and if no fixated cell has it; or all classes.
+    """Belief about the S cells of a scene, of which each takes that of the view whose gaze came closest to it.
 
-    Of each cell `(1, S)`: distance of the closest fixation, number of its pose or -1, and whether it was fixated.
+    Attributes:
+        values: of one target `(1, S, 2)`, its probability, and that if no fixated cell has it; or of all classes
+            `(1, S, K+1)`.
+        closest: `(1, S)`, distance of the closest fixation; infinite where none was.
+        owner: `(1, S)`, number of the pose of that fixation; -1 where none was.
+        examined: `(1, S)`, whether the cell was fixated.
+        looks: `(1,)`, number of looks.
+        views: for each pose, the belief about the cells of its view; None where none was.
     """
 
     values: Tensor
@@ -66,10 +73,12 @@ class SceneObserver(Observer):
     def __init__(self, inner: Target | LearnedMap, views: Views, *, prior: float | None = None) -> None:
         super().__init__()
         check(prior is None or 0 < prior < 1, "prior", "a probability between 0 and 1", prior)
-        self.inner, self.views, self.prior = inner, views, prior
+        self.inner = inner
+        self.views = views
+        self.prior = prior
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> SceneBelief:
-        """The belief before the first look; `grid` is the strip of all views."""
+        """Make the belief before the first look; `grid` is the strip of all views."""
         check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
@@ -78,43 +87,53 @@ class SceneObserver(Observer):
         return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), never)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
-        """Evidence of a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
-        high = self.views.world.size[1]
-        pose = int((float(fixation[0, 1]) + 0.5) // high)
-        point = fixation - fixation.new_tensor([0, pose * high])
+        """Weigh a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
+        height = self.views.world.size[1]
+        pose = int((float(fixation[0, 1]) + 0.5) // height)
+        point = fixation - fixation.new_tensor([0, pose * height])
         inner = self.inner.weigh(detections, point, self.views.view_grid, target)
         return _SceneLook(pose, inner, self.views.gaze_cell[self.views.grid.cell_of(fixation)])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
-        belief, look = own(belief, SceneBelief, "belief"), own(look, _SceneLook, "look")
-        views, grid, pose = self.views, self.views.view_grid, look.pose
+        belief = own(belief, SceneBelief, "belief")
+        look = own(look, _SceneLook, "look")
+        views = self.views
+        pose = look.pose
         values = belief.values
         if not bool(belief.looks):
             values = self._unseen(look.inner, values)
         before = belief.views[pose]
-        view = self.inner.update(self.inner.start(1, grid, values) if before is None else before, look.inner)
+        if before is None:
+            before = self.inner.start(1, views.view_grid, values)
+        view = self.inner.update(before, look.inner)
         probabilities = views.spread(self._probabilities(view), pose).mT
         cells = views.visible[pose]
+        is_owner = belief.owner[0, cells] == pose
         nearest = torch.minimum(
             views.distances[pose][int(look.inner.fixated)],
-            torch.where(belief.owner[0, cells] == pose, belief.closest[0, cells], torch.inf),
+            torch.where(is_owner, belief.closest[0, cells], torch.inf),
         )
-        mine = (nearest <= belief.closest[0, cells]) | (belief.owner[0, cells] == pose)
-        at = cells[mine]
-        values, closest, owner = values.clone(), belief.closest.clone(), belief.owner.clone()
-        values[0, at], closest[0, at], owner[0, at] = probabilities[mine], nearest[mine], pose
+        # The view takes the cells to which its gaze came closest, and renews those that it had.
+        takes = (nearest <= belief.closest[0, cells]) | is_owner
+        taken = cells[takes]
+        values = values.clone()
+        closest = belief.closest.clone()
+        owner = belief.owner.clone()
+        values[0, taken] = probabilities[takes]
+        closest[0, taken] = nearest[takes]
+        owner[0, taken] = pose
         examined = belief.examined.scatter(-1, look.gaze[:, None], True)
         after = (*belief.views[:pose], view, *belief.views[pose + 1 :])
         return SceneBelief(values, closest, owner, examined, belief.looks + 1, after)
 
     def _probabilities(self, view: Belief) -> Tensor:
-        """Belief about the cells of a view, `(C, cells)`."""
+        """Take the belief about the cells of a view, `(C, cells)`."""
         if isinstance(self.inner, Target):
             return torch.cat([view.probability(0), view.chance(0)])
         return view.class_probabilities()[0].mT
 
     def _unseen(self, look: EvidenceLook, like: Tensor) -> Tensor:
-        """Values `(1, S, C)` of cells that were never seen."""
+        """Compute the values `(1, S, C)` of cells that were never seen."""
         if isinstance(self.inner, Target) and self.prior is not None:
             return torch.full_like(like, self.prior)
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)

@@ -94,16 +94,19 @@ class _CameraScene(Sphere):
             raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
         names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
         missing = [name for name in names if not hasattr(camera, name)]
-        remedy = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
-        check(not missing, "camera", f"a camera with {', '.join(names)}", remedy)
+        got = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
+        check(not missing, "camera", f"a camera with {', '.join(names)}", got)
         fields = check_fields(camera.fields)
         for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
             check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
             _check_degrees(name, limits)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
-        picture, pan, tilt = (width, width // 2), camera.pan, camera.tilt
-        super().__init__(picture, camera.size, pan=pan, tilt=tilt, fields=fields, speeds=camera.speeds)
-        self.camera, self.color = camera, color
+        super().__init__(
+            (width, width // 2), camera.size, pan=camera.pan, tilt=camera.tilt, fields=fields, speeds=camera.speeds
+        )
+        self.camera = camera
+        self.color = color
+        # By the pose that was asked for, a small copy of the last frame, and the pose where it was taken.
         self._frames: dict[tuple[float, ...], tuple[Tensor, Tensor]] = {}
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -113,45 +116,47 @@ class _CameraScene(Sphere):
             frame = self.camera.look_at((pan, tilt), field)
             if not isinstance(frame, CameraFrame):
                 return self._image_of(frame, pose, pose)
-            at = pose.new_tensor([*frame.direction, field if frame.field is None else frame.field])
-            off = max(float(Sphere.turn(self, at, pose)), abs(float(at[2]) - field))
-            if off <= field / 10:
-                return self._image_of(frame.image, at, pose)
+            real_pose = pose.new_tensor([*frame.direction, field if frame.field is None else frame.field])
+            error = max(float(Sphere.turn(self, real_pose, pose)), abs(float(real_pose[2]) - field))
+            if error <= field / 10:
+                return self._image_of(frame.image, real_pose, pose)
         expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {_TRIES} attempts"
-        got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*at.tolist())
+        got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*real_pose.tolist())
         raise DataError(f"camera: expected {expected}, got {got}; wait in look_at until the camera has arrived")
 
-    def _image_of(self, picture: ImageLike, at: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """A frame as an image of the right size, and its pose; a small copy is kept for drawing."""
+    def _image_of(self, picture: ImageLike, real_pose: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Take a frame as an image of the right size, with its real pose; a small copy is kept for drawing."""
         image = as_image(picture, color=self.color, argument="frame")
         got = image.shape[-1], image.shape[-2]
         check(got == tuple(self.size), "frame", f"{self.size[0]} × {self.size[1]} pixels, as `size` has it", got)
         width = min(self.size[0], _DRAWING_WIDTH)
-        small = resized(image.mul(255).byte().cpu(), (max(1, round(width * self.size[1] / self.size[0])), width))[0]
-        self._frames[tuple(pose.tolist())] = small, at
-        return image, at
+        height = max(1, round(width * self.size[1] / self.size[0]))
+        small = resized(image.mul(255).byte().cpu(), (height, width))[0]
+        self._frames[tuple(pose.tolist())] = small, real_pose
+        return image, real_pose
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """The larger of the movements in pan and tilt."""
+        """Compute the larger of the movements in pan and tilt."""
         pan = (one[..., 0] - other[..., 0]).abs()
         if self.around:
             pan = torch.minimum(pan, 360 - pan)
         return torch.maximum(pan, (one[..., 1] - other[..., 1]).abs())
 
     def image(self) -> Tensor | None:
-        """A panorama of the last frames from all poses, grey where the camera never looked; None before the first."""
+        """Draw a panorama of the last frames from all poses, grey where none was; None before the first."""
         if not self._frames:
             return None
-        size = min(_DRAWN, self.picture[0]), min(_DRAWN, self.picture[0]) // 2
-        y, x = torch.meshgrid(torch.arange(size[1]), torch.arange(size[0]), indexing="ij")
-        directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), size)
-        canvas = torch.full((3, size[0] * size[1]), 0.5)
-        for frame, at in self._frames.values():
-            width, height = frame.shape[-1], frame.shape[-2]
-            points, inside = Camera(at, (width, height)).points(directions)
+        columns = min(_DRAWN, self.picture[0])
+        rows = columns // 2
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), (columns, rows))
+        canvas = torch.full((3, columns * rows), 0.5)
+        for frame, pose in self._frames.values():
+            height, width = frame.shape[-2:]
+            points, inside = Camera(pose, (width, height)).points(directions)
             x, y = points[inside].round().long().unbind(-1)
             canvas[:, inside] = frame[:, y.clamp(0, height - 1), x.clamp(0, width - 1)].float() / 255
-        return canvas.unflatten(-1, size[::-1])
+        return canvas.unflatten(-1, (rows, columns))
 
 
 def _check_degrees(name: str, limits: Sequence[float]) -> None:

@@ -59,7 +59,7 @@ class SearchGain(LookGain):
         self.foresight = foresight
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Expected gain of each action.
+        """Compute the expected gain of each action.
 
         Args:
             belief: the belief over the scene.
@@ -73,13 +73,13 @@ class SearchGain(LookGain):
         chance = belief.probability(0)[0]
         sharpness = views.acuity(belief.closest[0])
         weighted = chance * views.world.area
-        here_found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
-        gains = torch.zeros_like(here_found)
+        found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
+        gains = torch.zeros_like(found)
         for pose in poses:
             cells = views.visible[pose]
-            aside = (self._acuity[pose] - sharpness[cells]).clamp(min=0) @ weighted[cells]
-            rows = slice(pose * views.cells, (pose + 1) * views.cells)
-            gains[rows] = here_found[rows] + self.foresight * aside
+            sharper = (self._acuity[pose] - sharpness[cells]).clamp(min=0) @ weighted[cells]
+            actions = slice(pose * views.cells, (pose + 1) * views.cells)
+            gains[actions] = found[actions] + self.foresight * sharper
         return gains
 
 
@@ -109,13 +109,15 @@ class ExploreGain(LookGain):
 
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
-        self.model, self.unseen = model, unseen
+        self.model = model
+        self.unseen = unseen
         side = views.view_grid.columns
-        third = torch.tensor([side // 5, side // 2, side - 1 - side // 5])
-        self._landings = (third[:, None] * side + third).flatten()
+        # After a turn the eye lands near the corners, the sides or the middle of a view.
+        places = torch.tensor([side // 5, side // 2, side - 1 - side // 5])
+        self._landings = (places[:, None] * side + places).flatten()
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Expected gain of each action.
+        """Compute the expected gain of each action.
 
         Args:
             belief: the belief over the scene.
@@ -127,20 +129,20 @@ class ExploreGain(LookGain):
         """
         views = self.views
         probabilities = belief.class_probabilities()
-        has_view = belief.owner[0] >= 0
-        worth = torch.where(has_view, 0.0, self.unseen * views.world.area)
+        is_seen = belief.owner[0] >= 0
+        unseen_worth = torch.where(is_seen, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
             cells = views.visible[pose]
-            rows = torch.arange(views.cells) if pose == here else self._landings
-            total = self._acuity[pose][rows] @ worth[cells]
-            some = has_view[cells]
-            if bool(some.any()):
-                old = cells[some]
-                distance = views.distances[pose][rows][:, some]
-                each = self.model.gain(probabilities[:, old], belief.closest[:, old], belief.looks, distance[None])[0]
-                total = total + each @ views.world.area[old]
-            gains[pose * views.cells + rows] = total
+            fixated = torch.arange(views.cells) if pose == here else self._landings
+            gain = self._acuity[pose][fixated] @ unseen_worth[cells]
+            is_seen_here = is_seen[cells]
+            if bool(is_seen_here.any()):
+                seen = cells[is_seen_here]
+                distance = views.distances[pose][fixated][:, is_seen_here][None]
+                learned = self.model.gain(probabilities[:, seen], belief.closest[:, seen], belief.looks, distance)[0]
+                gain = gain + learned @ views.world.area[seen]
+            gains[pose * views.cells + fixated] = gain
         return gains
 
 
@@ -169,19 +171,29 @@ class PerSecond(AcquisitionFunction):
 
     def __init__(self, gain: LookGain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
         super().__init__()
-        self.gain, self.speeds, self.action = gain, speeds, action
+        self.gain = gain
+        self.speeds = speeds
+        self.action = action
         tiling = chain.from_iterable(chain.from_iterable(gain.views.tiling))
         self.poses = [*tiling] if poses is None else [*poses]
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(1, A)`."""
+        """Compute the values of all actions.
+
+        Args:
+            belief: the belief over the scene.
+            visited: not used: actions may be taken again.
+
+        Returns:
+            `(1, A)`, expected gains per second; `OUT` for actions that must not be chosen.
+        """
         views = self.gain.views
         values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
         allowed = torch.zeros(len(views), dtype=torch.bool)
         allowed[self.poses] = True
         if self.speeds is not None:
             values = values / views.durations(self.action, self.speeds)
-            here = views.poses[self.action // views.cells]
-            turn = views.world.turn(here.expand_as(views.poses), views.poses)
+            pose = views.poses[self.action // views.cells]
+            turn = views.world.turn(pose.expand_as(views.poses), views.poses)
             allowed &= (self.speeds.turn(turn) == 0) | (turn >= self.speeds.dead_zone)
         return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]

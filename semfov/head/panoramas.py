@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.scene import Annotation, ComposedScenes, Scene, Scenes
@@ -18,7 +19,13 @@ _RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))  # for each ring, its latitude in deg
 
 
 class _Patch(NamedTuple):
-    """The position of a photograph on the sphere."""
+    """The position of a photograph on the sphere.
+
+    Attributes:
+        scene: number of the photograph.
+        pose: of a camera that looks straight at it.
+        box: `(x1, y1, x2, y2)` of the photograph in its slot, in pixels of the plane.
+    """
 
     scene: int
     pose: tuple[float, float, float]
@@ -64,17 +71,20 @@ class Panoramas(ComposedScenes):
     ) -> None:
         check(len(rings) > 0, "rings", "at least one ring", rings)
         for latitude, number in rings:
-            fits = -90 <= latitude <= 90 and number >= 1
-            check(fits, "rings", "pairs of a latitude from -90 to 90 degrees and a number of slots", rings)
+            is_ring = -90 <= latitude <= 90 and number >= 1
+            check(is_ring, "rings", "pairs of a latitude from -90 to 90 degrees and a number of slots", rings)
         check(0 < slot < 180, "slot", "an angle between 0 and 180 degrees", slot)
         check(width >= 2 and width % 2 == 0, "width", "an even number of pixels", width)
         super().__init__(scenes.classes, count, seed)
-        self.scenes, self.rings, self.slot, self.fill = scenes, rings, slot, fill
+        self.scenes = scenes
+        self.rings = rings
+        self.slot = slot
+        self.fill = fill
         self.size = width, width // 2
         self.fingerprint = json_sha256([_VERSION, scenes.fingerprint, rings, slot, width, count, seed, fill])
 
     def patches(self, index: int) -> list[_Patch]:
-        """The photographs of a panorama, ring by ring.
+        """List the photographs of a panorama, ring by ring.
 
         Args:
             index: number of the panorama.
@@ -83,7 +93,8 @@ class Panoramas(ComposedScenes):
             One patch for each slot.
         """
         generator = self._generator(index)
-        slots, count = sum(number for _, number in self.rings), len(self.scenes)
+        slots = sum(number for _, number in self.rings)
+        count = len(self.scenes)
         rounds = -(-slots // count)
         order = np.concatenate([generator.permutation(count) for _ in range(rounds)])[:slots].tolist()
         places = []
@@ -92,40 +103,47 @@ class Panoramas(ComposedScenes):
             places += [((turn + 360 * n / number) % 360 - 180, latitude) for n in range(number)]
         patches = []
         for scene, (yaw, pitch) in zip(order, places, strict=True):
-            (wide, high), (width, height) = _SLOT, self.scenes.annotation(scene).size
-            scale = min(wide / width, high / height)
-            x, y = (wide - width * scale) / 2, (high - height * scale) / 2
-            patches.append(_Patch(scene, (yaw, pitch, self.slot), (x, y, wide - x, high - y)))
+            width, height = self.scenes.annotation(scene).size
+            slot_width, slot_height = _SLOT
+            scale = min(slot_width / width, slot_height / height)
+            x = (slot_width - width * scale) / 2
+            y = (slot_height - height * scale) / 2
+            patches.append(_Patch(scene, (yaw, pitch, self.slot), (x, y, slot_width - x, slot_height - y)))
         return patches
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a panorama."""
         canvas = torch.full((3, self.size[1], self.size[0]), self.fill)
         for patch in self.patches(index):
-            camera = Camera(torch.tensor(patch.pose), _SLOT)
-            x1, y1, x2, y2 = patch.box
-            # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
-            scale = self.size[0] / (2 * math.pi) / float(camera.focal)
-            image = self.scenes[patch.scene].image[None]
-            shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
-            image = F.interpolate(image, shape, mode="bilinear", antialias=True)
-            (frame,) = (
-                Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT)).panorama_boxes(self.size).tolist()
-            )
-            columns = torch.arange(math.floor(frame[0]), math.ceil(frame[2])) % self.size[0]
-            rows = torch.arange(math.floor(frame[1]), min(math.ceil(frame[3]), self.size[1]))
-            pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
-            points, _ = camera.points(panorama_directions(pixels.flatten(0, 1), self.size))
-            low, high = points.new_tensor([x1, y1]) - 0.5, points.new_tensor([x2, y2]) - 0.5
-            inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
-            place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
-            projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
-            row, column = inside.nonzero().unbind(-1)
-            canvas[:, rows[row], columns[column]] = projection[:, row, column]
+            self._paint(canvas, patch)
         return self._scene(index, "panorama", canvas)
 
+    def _paint(self, canvas: Tensor, patch: _Patch) -> None:
+        """Paint a photograph into a panorama `(3, H, W)`."""
+        camera = Camera(torch.tensor(patch.pose), _SLOT)
+        x1, y1, x2, y2 = patch.box
+        # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
+        scale = self.size[0] / (2 * math.pi) / float(camera.focal)
+        image = self.scenes[patch.scene].image[None]
+        shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
+        image = F.interpolate(image, shape, mode="bilinear", antialias=True)
+        # The pixels of the panorama that it may cover; a seam does not cut them.
+        region = Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT))
+        left, top, right, bottom = region.panorama_boxes(self.size)[0].tolist()
+        columns = torch.arange(math.floor(left), math.ceil(right)) % self.size[0]
+        rows = torch.arange(math.floor(top), min(math.ceil(bottom), self.size[1]))
+        pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
+        points, _ = camera.points(panorama_directions(pixels.flatten(0, 1), self.size))
+        low = points.new_tensor([x1, y1]) - 0.5
+        high = points.new_tensor([x2, y2]) - 0.5
+        inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
+        place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
+        projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
+        row, column = inside.nonzero().unbind(-1)
+        canvas[:, rows[row], columns[column]] = projection[:, row, column]
+
     def regions(self, index: int) -> Regions:
-        """The exact regions of the objects of a panorama: boxes in the planes of their photographs.
+        """Find the exact regions of the objects of a panorama: boxes in the planes of their photographs.
 
         Args:
             index: number of the panorama.
@@ -133,9 +151,11 @@ class Panoramas(ComposedScenes):
         Returns:
             One region for each object.
         """
-        poses, boxes = [], []
+        poses = []
+        boxes = []
         for patch in self.patches(index):
-            annotation, (x1, y1, x2, y2) = self.scenes.annotation(patch.scene), patch.box
+            annotation = self.scenes.annotation(patch.scene)
+            x1, y1, x2, y2 = patch.box
             width, height = annotation.size
             scale = annotation.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
             boxes.append(annotation.boxes * scale + annotation.boxes.new_tensor([x1, y1] * 2))
@@ -143,7 +163,7 @@ class Panoramas(ComposedScenes):
         return Regions(torch.cat(boxes), Camera(torch.cat(poses), _SLOT))
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a panorama, without composing its pixels.
+        """List the objects of a panorama, without composing its pixels.
 
         Args:
             index: number of the panorama.
@@ -158,7 +178,7 @@ class Panoramas(ComposedScenes):
         return Annotation(self.regions(index).panorama_boxes(self.size), labels, crowd, self.size)
 
     def digest(self, index: int) -> str:
-        """SHA-256 hash of everything that the pixels of a panorama depend on.
+        """Compute the SHA-256 hash of everything that the pixels of a panorama depend on.
 
         Args:
             index: number of the panorama.

@@ -26,15 +26,36 @@ _VIEW = (416, 312)  # default `(width, height)` of a view in pixels
 
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
-    """Raise `InputError` unless fields of view are ascending angles below 180 degrees."""
-    fits = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
-    fits = fits and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
-    check(fits, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
+    """Check that fields of view are ascending angles below 180 degrees.
+
+    Args:
+        fields: in degrees.
+
+    Returns:
+        The fields.
+
+    Raises:
+        InputError: they are not.
+    """
+    are_numbers = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
+    are_angles = are_numbers and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
+    check(are_angles, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
     return tuple(float(field) for field in fields)
 
 
 class _Scene:
-    """Base of the scenes that a head looks around in; the cells `scene` have centres `(S, D)` and areas `(S,)`."""
+    """Base of the scenes that a head looks around in.
+
+    Attributes:
+        scene: the cells of the scene.
+        size: `(width, height)` of a view in pixels.
+        fields: fields of view in degrees, narrowest first.
+        speeds: of eye and head.
+        centres: `(S, D)`, points of the scene in the middle of its cells.
+        area: `(S,)`, areas of the cells, 1 on average.
+        closed: whether the left and the right border of the picture meet.
+        still: whether two views from one pose are equal, as those of a picture are.
+    """
 
     scene: Grid
     size: tuple[int, int]
@@ -42,28 +63,43 @@ class _Scene:
     speeds: Speeds
     centres: Tensor
     area: Tensor
-    closed: bool = False  # whether the left and the right border of the picture meet
-    still: bool = True  # whether two views from one pose are equal, as those of a picture are
+    closed: bool = False
+    still: bool = True
 
     _drawn: Tensor | LargePicture | None = None
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """The picture from a pose `(3,)`, `(3, h, w)` in [0, 1], and the pose where it was taken."""
+        """View the scene from a pose.
+
+        Args:
+            pose: `(3,)`, as `poses` lists them.
+
+        Returns:
+            The picture `(3, h, w)` in [0, 1], and the pose where it was taken.
+        """
         raise InputError(
             "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
         )
 
     def look_at(self, direction: tuple[float, float], field: float) -> Tensor:
-        """The view `(3, h, w)` in a direction, pan to the right and tilt up in degrees, of a field of view across."""
+        """View the scene in a direction.
+
+        Args:
+            direction: pan to the right and tilt up, in degrees.
+            field: field of view across, in degrees.
+
+        Returns:
+            `(3, h, w)`.
+        """
         return self.view(torch.tensor([*direction, field]))[0]
 
     def image(self) -> Tensor | LargePicture | None:
-        """The picture of the whole scene for drawing, opened or `(3, H, W)`; None where only its geometry is known."""
+        """Give the picture of the whole scene for drawing, opened or `(3, H, W)`; None for a geometry alone."""
         return self._drawn
 
 
 def _angle_between(one: Tensor, other: Tensor) -> Tensor:
-    r"""Angle between directions `(..., 3)` of any length in degrees, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
+    r"""Compute angles in degrees between directions `(..., 3)`, :math:`\operatorname{atan2}(|a × b|, a · b)`."""
     one, other = torch.broadcast_tensors(one, other)
     sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
     return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
@@ -89,8 +125,12 @@ class Sphere(_Scene):
         check(0 < cell <= 90, "cell", "a positive angle of at most 90 degrees", cell)
         check(-360 <= pan[0] <= pan[1] <= 360, "pan", "limits in degrees, left and right", pan)
         check(-90 <= tilt[0] <= tilt[1] <= 90, "tilt", "limits from -90 to 90 degrees, down and up", tilt)
-        self.picture, self.size, self.cell = picture, size, cell
-        self.pan, self.tilt, self.fields = pan, tilt, check_fields(fields)
+        self.picture = picture
+        self.size = size
+        self.cell = cell
+        self.pan = pan
+        self.tilt = tilt
+        self.fields = check_fields(fields)
         self.around = pan[1] - pan[0] >= 360  # whether the head turns all the way round
         self.speeds = Speeds() if speeds is None else speeds
         self.scene = Grid(round(360 / cell), round(180 / cell), picture)
@@ -99,57 +139,102 @@ class Sphere(_Scene):
         self.area = weight / weight.mean()
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels `(N, 2)` of the view from a pose at directions `(N, 3)`, and whether they are inside it `(N,)`."""
+        """Find the pixels of a view that show points of the scene.
+
+        Args:
+            points: `(N, D)`.
+            pose: `(3,)`, of the view.
+
+        Returns:
+            Pixels `(N, 2)`, and whether they are inside the view, `(N,)`.
+        """
         return Camera(pose, self.size).points(points)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Directions `(N, 3)` that pixels `(N, 2)` of the view from a pose show."""
+        """Find the points of the scene that pixels of a view show.
+
+        Args:
+            points: `(N, 2)`, pixels.
+            pose: `(3,)`, of the view.
+
+        Returns:
+            `(N, D)`.
+        """
         return Camera(pose, self.size).directions(points)
 
     def pixels_of(self, points: Tensor) -> Tensor:
-        """Pixels `(N, 2)` of the panorama at directions `(N, 3)`."""
+        """Find the pixels `(N, 2)` of the whole picture at points `(N, D)` of the scene."""
         return panorama_points(points, self.picture)
 
     def angles_of(self, points: Tensor) -> Tensor:
-        """Pan from -180 to 180 degrees, and tilt, as a head would turn to directions `(N, 3)`, `(N, 2)`."""
+        """Compute pan from -180 to 180 degrees, and tilt, of a head that turns to directions `(N, 3)`; → `(N, 2)`."""
         x, y, z = points.unbind(-1)
         return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angles `(...)` in degrees between the optical axes of two cameras, for poses `(..., 3)`."""
+        """Compute by which angle the head turns from one pose to another.
+
+        Args:
+            one: `(..., 3)`.
+            other: `(..., 3)`.
+
+        Returns:
+            `(...)` in degrees, between the optical axes.
+        """
         middle = torch.tensor([[0.0, 0.0]])
-        return _angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
+        axis = Camera(one, (1, 1)).directions(middle)[..., 0, :]
+        other_axis = Camera(other, (1, 1)).directions(middle)[..., 0, :]
+        return _angle_between(axis, other_axis)
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angles `(...)` in degrees by which the eye turns between pixels `(..., 2)` of a view."""
+        """Compute by which angle the eye turns between two pixels of a view.
+
+        Args:
+            one: `(..., 2)`.
+            other: `(..., 2)`.
+            field: field of view in degrees.
+
+        Returns:
+            `(...)` in degrees.
+        """
         camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
-        rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
-        return _angle_between(*rays)
+        ray = camera.directions(one.reshape(-1, 2)).view(*one.shape[:-1], 3)
+        other_ray = camera.directions(other.reshape(-1, 2)).view(*other.shape[:-1], 3)
+        return _angle_between(ray, other_ray)
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Rings of poses, or arcs between limits, half a window apart; every second of every second ring tiles."""
-        high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
-        middle, reach = (self.tilt[0] + self.tilt[1]) / 2, (self.tilt[1] - self.tilt[0]) / 2
-        number = math.floor(reach / (high / 2))
-        left, width = self.pan[0], min(self.pan[1] - self.pan[0], 360)
+        """List the poses of a field of view: rings, or arcs between limits, half a window apart.
+
+        Args:
+            field: field of view in degrees.
+
+        Returns:
+            Rings of poses `(3,)`, of which every second pose of every second ring tiles the scene.
+        """
+        height = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
+        middle = (self.tilt[0] + self.tilt[1]) / 2
+        reach = (self.tilt[1] - self.tilt[0]) / 2
+        number = math.floor(reach / (height / 2))  # rings above the middle, and below it
+        start = self.pan[0]
+        width = min(self.pan[1] - self.pan[0], 360)
         rings = []
         for row in range(-number, number + 1):
-            pitch = middle + row * high / 2
+            pitch = middle + row * height / 2
             # In a ring that tiles, the sides of neighbouring windows meet even at the corners nearest to the horizon.
             tiles = (row + number) % 2 == 0
-            low = max(abs(pitch) - high / 2, 0) if tiles else abs(pitch)
-            count = 2 * math.ceil(width * math.cos(math.radians(low)) / field - 1e-9)
+            lowest = max(abs(pitch) - height / 2, 0) if tiles else abs(pitch)
+            count = 2 * math.ceil(width * math.cos(math.radians(lowest)) / field - 1e-9)
             # The ends of an arc are both poses; those of a ring are the same one.
             steps = range(count if self.around else count + 1)
-            rings.append([torch.tensor([width * n / max(count, 1) + left, pitch, field]) for n in steps])
+            rings.append([torch.tensor([width * n / max(count, 1) + start, pitch, field]) for n in steps])
         return rings
 
     def places(self, boxes: Tensor, pose: Tensor) -> Regions:
-        """Regions of the sphere that boxes `(M, 4)` in the view from a pose cover."""
+        """Find the regions of the sphere that boxes `(M, 4)` in the view from a pose cover."""
         return Regions(boxes, Camera(pose.expand(len(boxes), 3), self.size))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        """Smallest boxes `(M, 4)` in the panorama around boxes of a view; a seam does not cut them."""
+        """Find the smallest boxes `(M, 4)` in the panorama around boxes of a view; a seam does not cut them."""
         return self.places(boxes, pose).panorama_boxes(self.picture)
 
 
@@ -230,28 +315,34 @@ class _Plane(_Scene):
             degree = min(640 / 60, min(width, height * size[0] / size[1]) / max(fields))
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
-        self.size, self.cell, self.degree = size, cell, degree
+        self.size = size
+        self.cell = cell
+        self.degree = degree
         self.speeds = Speeds() if speeds is None else speeds
-        across, up = width / degree / 2, height / degree / 2
-        self.pan, self.tilt = (-across, across), (-up, up)
+        across = width / degree / 2
+        up = height / degree / 2
+        self.pan = (-across, across)
+        self.tilt = (-up, up)
         self.scene = Grid(max(1, round(2 * across / cell)), max(1, round(2 * up / cell)), self.picture)
         self.centres = self.scene.centres
         self.area = torch.ones(len(self.scene))
 
     def _box(self, pose: Tensor) -> tuple[int, int, int, int]:
-        """The window of a pose in whole pixels."""
+        """Find the window `(x1, y1, x2, y2)` of a pose in whole pixels."""
         pan, tilt, field = pose.tolist()
         width = field * self.degree
         height = width * self.size[1] / self.size[0]
-        wide, high = max(1, round(width)), max(1, round(height))
-        x1 = round(self.picture[0] / 2 + pan * self.degree - width / 2)
-        y1 = round(self.picture[1] / 2 - tilt * self.degree - height / 2)
+        columns = max(1, round(width))
+        rows = max(1, round(height))
+        x = round(self.picture[0] / 2 + pan * self.degree - width / 2)
+        y = round(self.picture[1] / 2 - tilt * self.degree - height / 2)
         # Windows at the border of the picture may be rounded to a place one pixel beyond it.
-        within = tuple(min(max(a, 0), b) for a, b in ((x1, self.picture[0] - wide), (y1, self.picture[1] - high)))
-        inside = abs(within[0] - x1) <= 1 and abs(within[1] - y1) <= 1 and min(within) >= 0
-        what = f"a window inside {self.picture[0]} × {self.picture[1]} pixels"
-        check(inside, "pose", what, (x1, y1, x1 + wide, y1 + high))
-        return within[0], within[1], within[0] + wide, within[1] + high
+        x1 = min(max(x, 0), self.picture[0] - columns)
+        y1 = min(max(y, 0), self.picture[1] - rows)
+        is_inside = abs(x1 - x) <= 1 and abs(y1 - y) <= 1 and min(x1, y1) >= 0
+        expected = f"a window inside {self.picture[0]} × {self.picture[1]} pixels"
+        check(is_inside, "pose", expected, (x, y, x + columns, y + rows))
+        return x1, y1, x1 + columns, y1 + rows
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         x1, y1, x2, y2 = self._box(pose)
@@ -268,33 +359,34 @@ class _Plane(_Scene):
         return points
 
     def angles_of(self, points: Tensor) -> Tensor:
-        """Degrees to the right of and above the middle of the picture."""
+        """Compute degrees to the right of and above the middle of the picture."""
         middle = points.new_tensor(self.picture) / 2 - 0.5
         return (points - middle) * points.new_tensor([1.0, -1.0]) / self.degree
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Distance between the middles of two windows."""
+        """Compute the distance between the middles of two windows."""
         return torch.linalg.vector_norm(one[..., :2] - other[..., :2], dim=-1)
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Distance between the points that two pixels show, in degrees."""
+        """Compute the distance between the points that two pixels show, in degrees."""
         return torch.linalg.vector_norm(one - other, dim=-1) * (field / self.size[0])
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Windows that lie inside the picture."""
+        """List the windows of a field of view that lie inside the picture, half a window apart, in rows."""
         width = field * self.degree
         height = width * self.size[1] / self.size[0]
-        fits = round(width) <= self.picture[0] and round(height) <= self.picture[1]
+        is_inside = round(width) <= self.picture[0] and round(height) <= self.picture[1]
         got = f"{field} degrees, {width:.0f} × {height:.0f} pixels; give narrower `fields`, or a smaller `degree`"
-        largest = f"a window inside the picture of {self.picture[0]} × {self.picture[1]} pixels"
-        check(fits, "field", largest, got)
-        sides = [*zip(self.picture, (width, height), strict=True)]
-        steps = [2 * math.ceil(length / side - 1 - 1e-9) for length, side in sides]
-        across, down = (
-            [(length - side) * (n / max(most, 1) - 0.5) / self.degree for n in range(most + 1)]
-            for (length, side), most in zip(sides, steps, strict=True)
-        )
+        expected = f"a window inside the picture of {self.picture[0]} × {self.picture[1]} pixels"
+        check(is_inside, "field", expected, got)
+        across = self._middles(self.picture[0], width)
+        down = self._middles(self.picture[1], height)
         return [[torch.tensor([x, -y, field]) for x in across] for y in down]
+
+    def _middles(self, length: int, side: float) -> list[float]:
+        """Spread windows of a side over a length, half a window apart at most; middles in degrees from its middle."""
+        steps = 2 * math.ceil(length / side - 1 - 1e-9)
+        return [(length - side) * (n / max(steps, 1) - 0.5) / self.degree for n in range(steps + 1)]
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         return Boxes(self.boxes(boxes, pose))
@@ -347,7 +439,7 @@ class Flat(_Plane):
         super().__init__(picture, size, fields, speeds, degree, cell)
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """The content of the window, resampled to the size of a view."""
+        """Read the window, resampled to the size of a view."""
         if self.opened is None:
             return super().view(pose)
         pixels = self.opened.read(self._box(pose)).float()[None] / 255

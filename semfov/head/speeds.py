@@ -55,7 +55,7 @@ class Speeds:
         check_number(self.look, "look", 1e-6, 1e6)
 
     def saccade(self, angle: Tensor) -> Tensor:
-        """Duration of saccades.
+        """Compute the duration of saccades.
 
         Args:
             angle: `(...)`, amplitudes in degrees.
@@ -66,7 +66,7 @@ class Speeds:
         return torch.where(angle > _STILL, self.eye_start + self.eye * angle, 0.0)
 
     def turn(self, angle: Tensor) -> Tensor:
-        """Duration of turns of the head.
+        """Compute the duration of turns of the head.
 
         Args:
             angle: `(...)`, in degrees.
@@ -75,12 +75,13 @@ class Speeds:
             `(...)`, seconds; 0 where the head stays.
         """
         angle = torch.where(angle > _STILL, angle, 0.0)
-        fast = self.head**2 / self.acceleration
-        short = 2 * (angle / self.acceleration).sqrt()
-        return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
+        reaches_speed = self.head**2 / self.acceleration  # degrees after which the head has its full speed, and stops
+        accelerated = 2 * (angle / self.acceleration).sqrt()
+        cruising = angle / self.head + self.head / self.acceleration
+        return torch.where(angle <= reaches_speed, accelerated, cruising)
 
     def duration(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:
-        """Duration of a gaze shift and the look after it: of the slowest movement, of settling, and of the look.
+        """Compute the duration of a gaze shift and its look: of the slowest movement, of settling, and of the look.
 
         Args:
             eye: `(...)`, amplitude of the saccade in degrees.

@@ -1,5 +1,14 @@
-"""The motion of a camera from frame to frame, estimated from the frames by sparse optical flow."""
+"""The motion of a camera from frame to frame, estimated from the frames by sparse optical flow.
 
+    key frame ───────── `_moved` ─────────► last frame ── the step ──► present frame
+    `_key`    ─────────────────── estimated, from `_moved` on ───────►
+
+The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
+present frame fits neither the key frame nor the last one, it becomes the key frame. The last frame before is then kept
+as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
+"""
+
+from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -96,12 +105,18 @@ class KnownPoses:
         Returns:
             The motion since the last frame; none for the first frame.
         """
-        last, self._last = self._last, Motion.of(pose)
+        last = self._last
+        self._last = Motion.of(pose)
         return CameraStep(None if last is None else last.inverse().then(self._last))
 
 
-class _Sight:
-    """A frame reduced to grey, `(h, w)`, and pixels of the frame for one of the reduced one, `(x, y)`."""
+class _GreyFrame:
+    """A frame reduced in size and to grey.
+
+    Attributes:
+        grey: `(h, w)` bytes.
+        ratio: `(x, y)`, pixels of the frame for one of the reduced one.
+    """
 
     def __init__(self, cv2: Any, frame: NDArray[np.uint8]) -> None:
         self._cv2 = cv2
@@ -150,11 +165,11 @@ class CameraMotion:
             import cv2
         self._cv2: Any = cv2
         self.patience = patience
-        self._key: _Sight | None = None
-        self._moved = _STILL  # from the key frame to the last frame, in reduced pixels
-        self._last: _Sight | None = None
-        self._lost: _Sight | None = None  # the last frame before a disturbance
-        self._waited = 0
+        self._key: _GreyFrame | None = None  # None before the first frame
+        self._moved = _STILL  # `(3, 3)`, from the key frame to the last frame, in reduced pixels
+        self._last: _GreyFrame | None = None
+        self._lost: _GreyFrame | None = None  # the last frame before a disturbance, while it may still be found
+        self._waited = 0  # frames since that one
 
     def step(self, frame: NDArray[np.uint8]) -> CameraStep:
         """Take the next frame, and estimate its motion.
@@ -165,99 +180,124 @@ class CameraMotion:
         Returns:
             The motion since the last frame; none for the first frame, and where the two do not fit together.
         """
-        now = _Sight(self._cv2, frame)
-        last, self._last = self._last, now
+        present = _GreyFrame(self._cv2, frame)
+        last = self._last
+        self._last = present
         if last is None or self._key is None:
-            self._key = now
+            self._key = present
             return CameraStep(None)
-        motion = self._since_last(self._key, last, now)
+        motion = self._since_last(self._key, last, present)
         if motion is None and self._lost is None:
-            self._lost, self._waited = last, 0
+            self._lost = last
+            self._waited = 0
         if self._lost is None:
             return CameraStep(motion)
-        self._waited += 1
-        found = self._between(self._lost, now, _STILL)
-        recovered = None if found is None else _at_full_size(found, now.ratio)
-        if recovered is not None or self._waited >= self.patience:
-            self._lost = None
+        recovered = self._recover(self._lost, present)
         return CameraStep(motion, recovered, waits=self._lost is not None)
 
-    def _since_last(self, key: _Sight, last: _Sight, now: _Sight) -> Motion | None:
-        """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
-        moved = self._between(key, now, self._moved)
-        if moved is None and last is not key:
-            key, self._moved = last, _STILL
-            moved = self._between(last, now, _STILL)
-        if moved is None:
-            self._key, self._moved = now, _STILL
-            # Nothing can be followed where there is no texture, and nothing moves where two frames are the same.
-            return Motion.still() if _largest_change(last.grey, now.grey) < _SAME else None
-        since = moved @ np.linalg.inv(self._moved)
-        if _largest_shift(since, now.grey.shape) * max(now.ratio) < _STILL_SHIFT:
-            return Motion.still()
-        renew = _share_in_view(moved, now.grey.shape) < _LEAST_IN_VIEW
-        self._key, self._moved = (now, _STILL) if renew else (key, moved)
-        return _at_full_size(since, now.ratio)
+    def _recover(self, lost: _GreyFrame, present: _GreyFrame) -> Motion | None:
+        """Compare the present frame with the last one before a disturbance, which is given up after a while."""
+        self._waited += 1
+        similarity = self._between(lost, present, _STILL)
+        if similarity is not None or self._waited >= self.patience:
+            self._lost = None
+        return None if similarity is None else _at_full_size(similarity, present.ratio)
 
-    def _between(self, first: _Sight, now: _Sight, guess: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _since_last(self, key: _GreyFrame, last: _GreyFrame, present: _GreyFrame) -> Motion | None:
+        """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
+        moved = self._between(key, present, self._moved)
+        if moved is None and last is not key:
+            key = last
+            self._moved = _STILL
+            moved = self._between(last, present, _STILL)
+        if moved is None:
+            self._begin_at(present)
+            # Nothing can be followed where there is no texture, and nothing moves where two frames are the same.
+            return Motion.still() if _largest_change(last.grey, present.grey) < _SAME else None
+        since = moved @ np.linalg.inv(self._moved)
+        if _largest_shift(since, present.grey.shape) * max(present.ratio) < _STILL_SHIFT:
+            return Motion.still()
+        if _share_in_view(moved, present.grey.shape) < _LEAST_IN_VIEW:
+            self._begin_at(present)
+        else:
+            self._key = key
+            self._moved = moved
+        return _at_full_size(since, present.ratio)
+
+    def _begin_at(self, frame: _GreyFrame) -> None:
+        """Make a frame the key frame, from which nothing has moved."""
+        self._key = frame
+        self._moved = _STILL
+
+    def _between(
+        self, first: _GreyFrame, present: _GreyFrame, guess: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
         """Estimate the similarity `(3, 3)` between two reduced frames; None where they do not fit together."""
-        if first.grey.shape != now.grey.shape or len(first.corners) < _LEAST_CORNERS:
+        if first.grey.shape != present.grey.shape or len(first.corners) < _LEAST_CORNERS:
             return None
         cv2 = self._cv2
         expected = cv2.transform(first.corners, guess[:2]).astype(np.float32)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
+        corners, status, _ = cv2.calcOpticalFlowPyrLK(
             first.grey,
-            now.grey,
+            present.grey,
             first.corners,
             expected,
             winSize=_WINDOW,
             maxLevel=_PYRAMID,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        followed = found[:, 0] == 1
+        followed = status[:, 0] == 1
         if followed.sum() < _LEAST_CORNERS:
             return None
         similarity, agree = cv2.estimateAffinePartial2D(
-            first.corners[followed], there[followed], ransacReprojThreshold=_RESIDUAL
+            first.corners[followed], corners[followed], ransacReprojThreshold=_RESIDUAL
         )
         if similarity is None or not _is_plausible(similarity, int(agree.sum()), int(followed.sum())):
             return None
-        if not self._correlates(first.grey, now.grey, similarity):
+        if not self._correlates(first.grey, present.grey, similarity):
             return None
         return np.vstack([similarity, _STILL[2]])
 
-    def _correlates(self, first: NDArray[np.uint8], now: NDArray[np.uint8], similarity: NDArray[np.float64]) -> bool:
-        """Whether a frame, moved, looks like the present one in most blocks with texture that both show."""
+    def _correlates(
+        self, first: NDArray[np.uint8], present: NDArray[np.uint8], similarity: NDArray[np.float64]
+    ) -> bool:
+        """Tell whether a frame, moved, looks like the present one in most blocks with texture that both show."""
         cv2 = self._cv2
-        height, width = now.shape
+        height, width = present.shape
         moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
         shown = cv2.warpAffine(np.ones_like(first), similarity, (width, height), flags=cv2.INTER_NEAREST)
-        columns, rows = _BLOCKS
-        down, across = (
-            np.linspace(0, length, count + 1).astype(int) for length, count in ((height, rows), (width, columns))
-        )
         correlations = []
-        for top, bottom in pairwise(down):
-            for left, right in pairwise(across):
-                block = slice(top, bottom), slice(left, right)
-                if shown[block].size and shown[block].all():
-                    correlations.append(_correlation(moved[block], now[block]))
-        compared = [value for value in correlations if value is not None]
-        agreeing = sum(value >= _ALIKE for value in compared)
-        return len(compared) >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * len(compared)
+        for block in _blocks(height, width):
+            if shown[block].size and shown[block].all():
+                correlation = _correlation(moved[block], present[block])
+                if correlation is not None:
+                    correlations.append(correlation)
+        agreeing = sum(correlation >= _ALIKE for correlation in correlations)
+        return len(correlations) >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * len(correlations)
+
+
+def _blocks(height: int, width: int) -> Iterator[tuple[slice, slice]]:
+    """Divide a frame into blocks; yields their rows and columns."""
+    columns, rows = _BLOCKS
+    edges_down = np.linspace(0, height, rows + 1).astype(int)
+    edges_across = np.linspace(0, width, columns + 1).astype(int)
+    for top, bottom in pairwise(edges_down):
+        for left, right in pairwise(edges_across):
+            yield slice(top, bottom), slice(left, right)
 
 
 def _is_plausible(similarity: NDArray[np.float64], agreeing: int, followed: int) -> bool:
-    """Whether enough corners agree with a similarity `(2, 3)`, and it is no leap of scale or turn."""
+    """Tell whether enough corners agree with a similarity `(2, 3)`, and it is no leap of scale or turn."""
     scale = float(np.hypot(similarity[0, 0], similarity[1, 0]))
     turn = float(np.degrees(np.arctan2(similarity[1, 0], similarity[0, 0])))
-    enough = agreeing >= max(_LEAST_CORNERS, _LEAST_SHARE * followed)
-    return enough and 1 / _MOST_SCALE <= scale <= _MOST_SCALE and abs(turn) <= _MOST_TURN
+    has_support = agreeing >= max(_LEAST_CORNERS, _LEAST_SHARE * followed)
+    return has_support and 1 / _MOST_SCALE <= scale <= _MOST_SCALE and abs(turn) <= _MOST_TURN
 
 
 def _correlation(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float | None:
-    """Pearson's correlation of two blocks; None where neither has texture."""
-    a, b = first.astype(np.float32), second.astype(np.float32)
+    """Compute Pearson's correlation of two blocks; None where neither has texture, 0 where one has none at all."""
+    a = first.astype(np.float32)
+    b = second.astype(np.float32)
     spread = float(a.std()), float(b.std())
     if max(spread) < _TEXTURE:
         return None
@@ -267,36 +307,39 @@ def _correlation(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float |
 
 
 def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -> Motion:
-    """The motion of a frame, from that of its reduced copy, whose pixel 0 is the mean of the frame's first ones."""
+    """Convert the motion of a reduced copy to that of the frame; pixel 0 of the copy is the mean of its first ones."""
     across, down = ratio
     enlarge = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
     return Motion(enlarge @ similarity @ np.linalg.inv(enlarge))
 
 
 def _largest_change(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Mean difference of two frames in grey values, of the block where it is largest; infinite for other sizes."""
+    """Find the largest mean difference of a block of two frames, in grey values; infinite for other sizes."""
     if first.shape != second.shape:
         return float("inf")
     difference = np.abs(first.astype(np.int16) - second)
     rows = np.array_split(difference, min(_BLOCKS[1], len(difference)))
-    blocks = (block for row in rows for block in np.array_split(row, min(_BLOCKS[0], row.shape[1]), axis=1))
-    return max(float(block.mean()) for block in blocks)
+    means = []
+    for row in rows:
+        blocks = np.array_split(row, min(_BLOCKS[0], row.shape[1]), axis=1)
+        means += [float(block.mean()) for block in blocks]
+    return max(means)
 
 
 def _corners_of(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """The corners of a frame `(h, w)`, homogeneous, `(3, 4)`."""
+    """List the corners of a frame `(h, w)`, homogeneous, `(3, 4)`."""
     height, width = shape
     return np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], dtype=np.float64)
 
 
 def _largest_shift(similarity: NDArray[np.float64], shape: tuple[int, ...]) -> float:
-    """How far a similarity moves a corner of the frame at most, in pixels."""
+    """Compute how far a similarity moves a corner of the frame at most, in pixels."""
     corners = _corners_of(shape)
     return float(np.linalg.norm((similarity @ corners - corners)[:2], axis=0).max())
 
 
 def _share_in_view(similarity: NDArray[np.float64], shape: tuple[int, ...]) -> float:
-    """About the share of a frame that is still in view after a motion, by the upright box around it."""
+    """Estimate the share of a frame that is still in view after a motion, by the upright box around it."""
     height, width = shape
     x, y, _ = similarity @ _corners_of(shape)
     across = max(min(x.max(), width) - max(x.min(), 0), 0) / width

@@ -42,8 +42,8 @@ class Motion:
         matrix = np.array(self.matrix, dtype=np.float64)
         expected = "a 3 × 3 matrix that maps a frame to a frame (np.vstack adds (0, 0, 1) to a 2 × 3 one)"
         check(matrix.shape == (3, 3), "motion", expected, f"shape {matrix.shape}")
-        whole = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > _LEAST_AREA
-        check(whole and matrix[2, 2] != 0, "motion", expected, matrix.tolist())
+        keeps_area = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > _LEAST_AREA
+        check(keeps_area and matrix[2, 2] != 0, "motion", expected, matrix.tolist())
         object.__setattr__(self, "matrix", matrix / matrix[2, 2])
 
     @classmethod
@@ -66,7 +66,8 @@ class Motion:
         >>> Motion.similarity(turn=90).points(torch.tensor([[1.0, 0.0]])).round(decimals=6)
         tensor([[0., 1.]])
         """
-        cosine, sine = scale * math.cos(math.radians(turn)), scale * math.sin(math.radians(turn))
+        cosine = scale * math.cos(math.radians(turn))
+        sine = scale * math.sin(math.radians(turn))
         return cls(np.array([[cosine, -sine, shift[0]], [sine, cosine, shift[1]], [0.0, 0.0, 1.0]]))
 
     @classmethod
@@ -142,8 +143,9 @@ class Motion:
         Returns:
             `(..., 4)` in pixels of the second frame.
         """
-        low, high = boxes[..., :2], boxes[..., 2:]
+        low = boxes[..., :2]
+        high = boxes[..., 2:]
         centre = (low + high) / 2
         half = (high - low) / 2 * self.scale_at(centre)[..., None]
-        there = self.points(centre)
-        return torch.cat([there - half, there + half], -1)
+        moved = self.points(centre)
+        return torch.cat([moved - half, moved + half], -1)

@@ -409,8 +409,8 @@ class GlimpseEvidence(Pretrained):
             metadata=record["metadata"],
             thresholds=_restored_thresholds(record),
             certainty=_restored_certainty(record),
-            verification=verification and Verification(thresholds=_restored_thresholds(verification)),
-            photograph=photograph and _restored_photograph(photograph, record["classes"], tensors),
+            verification=None if verification is None else Verification(thresholds=_restored_thresholds(verification)),
+            photograph=None if photograph is None else _restored_photograph(photograph, record["classes"], tensors),
         )
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
@@ -444,7 +444,7 @@ def _photograph_record(photograph: PhotographEvidence | None) -> dict[str, objec
 
 def _restored_thresholds(record: Mapping[str, Any]) -> Thresholds | None:
     thresholds = record["thresholds"]
-    return thresholds and Thresholds(**thresholds)
+    return None if thresholds is None else Thresholds(**thresholds)
 
 
 def _restored_certainty(record: Mapping[str, Any]) -> Certainty | None:
