@@ -39,8 +39,8 @@ class Record(Conversion):
     A record is the list of its looks (`looks`, or by iteration) and what its kind adds. Its objects are one set: those
     that `describe` counts, `plot` draws and `objects` returns. All points and boxes are in pixels of the picture.
 
-    `describe`, `why_it_ended` and `words` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a picture,
-    tables, fixations in the format of human data, and a file.
+    `describe`, `why_it_ended` and `words` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a
+    picture, tables, fixations in the format of human data, and a file.
 
     Attributes:
         classes: names of the classes, background first.
