@@ -23,7 +23,7 @@ _SETTINGS = ("columns", "rows", "fixations", "max_target_area", "holdout", "seed
 """Settings of the fit that the exponent depends on."""
 
 
-class SearchSettings(Protocol):
+class StoredSearches(Protocol):
     """Settings of searches over stored looks."""
 
     @property
@@ -64,7 +64,7 @@ def mean_hits(holdout: int, rates: dict[int, float]) -> dict[str, float]:
 
 
 def hit_rates(
-    config: SearchSettings,
+    config: StoredSearches,
     scenes: Scenes,
     samples: Samples,
     observer: Semantic,
