@@ -19,8 +19,11 @@ Id = int | str
 Entry = dict[str, Any]
 """An object of the file, by its fields."""
 
-ABSENT, PARTIAL = "neg_category_ids", "not_exhaustive_category_ids"
-"""Fields of an image in LVIS: categories that it surely lacks, and those of which not every object is annotated."""
+ABSENT = "neg_category_ids"
+"""Field of an image in LVIS: categories that it surely lacks."""
+
+PARTIAL = "not_exhaustive_category_ids"
+"""Field of an image in LVIS: categories of which not every object is annotated."""
 
 _LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
 _BEYOND = 0.2  # share of boxes that leave their pictures from which on they may be corners

@@ -60,13 +60,14 @@ def sheet(classes: Sequence[str]) -> Scene:
     scenes = EmbeddedScenes(classes, count=len(PHOTOGRAPHS))
     prints = [_single(scenes, index) for index in range(len(scenes))]
     rows = [prints[0::2], prints[1::2]]
-    width = max(sum(scene.size[0] + _MARGIN for scene in row) for row in rows) + _MARGIN
+    widths = [sum(scene.size[0] for scene in row) for row in rows]
     heights = [max(scene.size[1] for scene in row) for row in rows]
+    width = max(total + _MARGIN * len(row) for total, row in zip(widths, rows, strict=True)) + _MARGIN
     paper = torch.full((3, sum(heights) + _MARGIN * 3, width), _PAPER)
     boxes: list[Tensor] = []
     top = _MARGIN
-    for row, height in zip(rows, heights, strict=True):
-        gap = (width - sum(scene.size[0] for scene in row)) // (len(row) + 1)
+    for row, row_width, height in zip(rows, widths, heights, strict=True):
+        gap = (width - row_width) // (len(row) + 1)
         left = gap
         for scene in row:
             right = left + scene.size[0]

@@ -245,8 +245,8 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
         array = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{argument}: expected numbers (x, y), or several such pairs, got {points!r:.80}") from None
-    # A copy, as the caller may go on writing to the array.
     check(array.shape[-1:] == (2,), argument, "(x, y), or several such pairs", points)
+    # A copy, as the caller may go on writing to the array.
     return torch.from_numpy(array.copy())
 
 
@@ -260,7 +260,12 @@ def as_positions(values: Tensor, like: Tensor | torch.dtype | None = None) -> Te
     Returns:
         The positions.
     """
+    dtype = values.dtype
+    device = values.device
+    if isinstance(like, Tensor):
+        dtype = like.dtype
+        device = like.device
+    elif like is not None:
+        dtype = like
     # Half precision is off by pixels from 2,048 on, and whole numbers cut the fractions of what is added to them.
-    dtype = like if isinstance(like, torch.dtype) else (values if like is None else like).dtype
-    device = like.device if isinstance(like, Tensor) else values.device
     return values.to(device, torch.promote_types(dtype, torch.float32))

@@ -121,7 +121,9 @@ class Mosaics(ComposedScenes):
 
     def annotation(self, index: int) -> Annotation:
         """Return the objects of a mosaic, without composing its image."""
-        boxes, labels, crowd = [], [], []
+        boxes = []
+        labels = []
+        crowd = []
         for tile in self.tiles(index):
             objects = self.scenes.annotation(tile.scene)
             x1, y1, x2, y2 = tile.box

@@ -184,8 +184,12 @@ def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage
     present: list[int] = annotation.labels.unique().tolist()
     if max_area is None:
         return present
-    boxes, labels, size = annotation.boxes, annotation.labels, annotation.size
-    return [label for label in present if box_coverage(boxes[labels == label], size, coverage) <= max_area]
+    targets = []
+    for label in present:
+        boxes = annotation.boxes[annotation.labels == label]
+        if box_coverage(boxes, annotation.size, coverage) <= max_area:
+            targets.append(label)
+    return targets
 
 
 class ComposedScenes(Scenes):

@@ -100,7 +100,11 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
 def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
     """List what is in a folder, without names that begin with a dot: notes of the system, such as ._a.jpg of Apple."""
     paths = folder.rglob("*") if recursive else folder.iterdir()
-    return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    return [path for path in paths if not _is_hidden(path.relative_to(folder))]
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def _warn_of_mosaics(folder: Path) -> None:
@@ -421,11 +425,11 @@ class _Recording:
 
     def _prepare(self) -> None:
         """Let a camera or a stream keep the newest frame alone, where it can, and give 16 bits as they are."""
-        cv2, recorder = self._cv2, self._recorder
-        recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        codes = {int(recorder.get(key)) for key in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC)}
+        cv2 = self._cv2
+        self._recorder.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        codes = {int(self._recorder.get(key)) for key in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC)}
         if self._white is not None and codes & _SIXTEEN_BITS:
-            recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+            self._recorder.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
     def _picture(self, pixels: Values) -> Picture:
         """Note a frame that was read, and date it by the clock of the stream."""

@@ -220,7 +220,8 @@ class _Tiles:
         is_plain = page.compression == 1 and page.predictor == 1 and page.fillorder == 1
         self._has_plain_rows = self._is_one_strip and is_plain and all(page.databytecounts)
         if page.is_tiled:
-            self.width, self.height = page.tilewidth, page.tilelength
+            self.width = page.tilewidth
+            self.height = page.tilelength
         else:
             self.width = self._size[0]
             self.height = min(_ROWS, self._size[1]) if self._has_plain_rows else page.rowsperstrip

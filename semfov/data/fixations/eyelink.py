@@ -255,8 +255,9 @@ def _share_out(fixations: Iterable[_Fixation], views: Sequence[_View]) -> None:
 
 def _of_one_eye(fixations: Sequence[_Fixation], eye: str | None) -> list[_Fixation]:
     """Take the fixations of an eye; None takes the right one where it has any."""
-    sides = {fixation.eye for fixation in fixations}
-    side = eye[0].upper() if eye is not None else "R" if "R" in sides else "L"
+    if eye is None:
+        eye = "right" if any(fixation.eye == "R" for fixation in fixations) else "left"
+    side = eye[0].upper()
     return [fixation for fixation in fixations if fixation.eye == side]
 
 

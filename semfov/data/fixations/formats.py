@@ -407,7 +407,8 @@ def _points_and_durations(
     Raises:
         DataError: the lists do not belong together.
     """
-    x, y = trial[keys[0]], trial[keys[1]]
+    x = trial[keys[0]]
+    y = trial[keys[1]]
     times = trial.get(keys[2])
     check_data(len(x) == len(y), name, "as many Y as X", f"{len(x)} X and {len(y)} Y")
     points = np.array([*zip(x, y, strict=True)], dtype=np.float64)

@@ -35,7 +35,8 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
     stimuli = {name: index for index, name in enumerate(pictures)}
     unknown = [record.picture for record in fixations if record.picture not in stimuli]
     check(not unknown, "pictures", "all pictures of the fixations", f"none named {unknown[:1]}")
-    people = {name: index for index, name in enumerate(sorted({record.subject for record in fixations}))}
+    subjects = sorted({record.subject for record in fixations})
+    people = {name: index for index, name in enumerate(subjects)}
     return FixationTrains.from_fixation_trains(
         xs=[record.points[:, 0] + 0.5 for record in fixations],
         ys=[record.points[:, 1] + 0.5 for record in fixations],
