@@ -92,7 +92,7 @@ class MaxPool(nn.Module):
 
 
 class Route(nn.Module):
-    """Concatenate the channels of earlier layers, or one of `groups` equal parts of each."""
+    """The channels of earlier layers, concatenated, or of one of `groups` equal parts of each."""
 
     def __init__(self, groups: int = 1, group: int = 0) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ class Route(nn.Module):
 
 
 class Shortcut(nn.Module):
-    """Add the output of an earlier layer to the output of the previous one, and activate."""
+    """The sum of the output of an earlier layer and that of the previous one, activated."""
 
     def __init__(self, activation: str) -> None:
         super().__init__()
@@ -156,15 +156,15 @@ class _Shape(NamedTuple):
 
 
 class _Builder:
-    """Makes layers from sections, one after the other, and keeps track of what they return and read.
+    """A maker of layers from sections, one after the other, that keeps track of what they return and read.
 
     Attributes:
         shapes: shapes of the outputs of the layers made so far.
         sources: the layers that each of them reads, -1 for the image.
-    """
 
-    # `_here` is the shape of the last output, before the first layer that of the image. `_pixels` are those of the
-    # image at the input size of the cfg, and `_parameters` those of all layers so far, for the limits.
+    `_here` is the shape of the last output, before the first layer that of the image. `_pixels` are those of the image
+    at the input size of the cfg, and `_parameters` those of all layers so far, for the limits.
+    """
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         width, height = size
