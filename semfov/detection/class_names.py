@@ -28,7 +28,7 @@ _PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no 
 
 
 class UnnamedClasses(InputError):
-    """A model has scores of so many classes, and no names for them."""
+    """The error of a model with scores of some classes, and no names for them; `count` is the number of the classes."""
 
     def __init__(self, count: int, file: Path) -> None:
         super().__init__(
