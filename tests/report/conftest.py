@@ -109,7 +109,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         lattice=lattice,
         classes=classes,
         target=2,
-        looks=looks,
+        window_looks=looks,
         values=(float("inf"), 0.5, 0.25),
         candidates=objects,
         decision=decision,
