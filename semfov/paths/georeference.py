@@ -38,13 +38,13 @@ def georeference(source: str) -> PlaceOnEarth | None:
     if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
         return None
     with needing("rasterio", f"source: {source}", '"semfov[geo]"'):
-        from rasterio.warp import transform
+        from rasterio import warp
 
     system, affine = _system_and_transform(source)
     if system is None or affine.is_identity:  # a system alone does not say where the picture lies
         return None
     try:
-        longitude, latitude = transform(system, "EPSG:4326", [affine.c], [affine.f])
+        longitude, latitude = warp.transform(system, "EPSG:4326", [affine.c], [affine.f])
     except Exception:  # a system of its own, such as that of a building site, has no place on earth; of any error
         return None
     if not np.isfinite([*longitude, *latitude]).all():
@@ -55,7 +55,7 @@ def georeference(source: str) -> PlaceOnEarth | None:
         column, row = points.T
         x = affine.a * column + affine.b * row + affine.c
         y = affine.d * column + affine.e * row + affine.f
-        return np.stack(transform(system, "EPSG:4326", x, y)[:2], -1)
+        return np.stack(warp.transform(system, "EPSG:4326", x, y)[:2], -1)
 
     return place
 
