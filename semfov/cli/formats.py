@@ -262,7 +262,7 @@ class CocoResults(ResultsFormat):
         names = [canonical_name(name) for name in record.classes]
         results = []
         for result in record.to_coco(image_id, range(1, len(names))):
-            class_name = names[result["category_id"]]
+            class_name = names[int(result["category_id"])]
             if class_name in categories:
                 results.append({**result, "category_id": categories[class_name]})
         return {"image_id": image_id, "classes": list(categories), "parts": results}

@@ -17,7 +17,7 @@ from semfov.data.classes import canonical_name
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
-from semfov.detection.exchange import category_ids, coco_results, named_detections
+from semfov.detection.exchange import CocoResult, category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text, digits, pixels
@@ -276,7 +276,7 @@ class Conversion(Outcome, OtherWords):
 
     def to_coco(
         self, image_id: int | str = 1, categories: Sequence[int | str] | Sequence[Mapping[str, Any]] | None = None
-    ) -> list[Values]:
+    ) -> list[CocoResult]:
         """Convert the objects to COCO results, for `pycocotools.COCO.loadRes`.
 
         Args:
