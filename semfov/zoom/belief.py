@@ -147,8 +147,10 @@ class ZoomBelief:
             window: the window, which may reach beyond the picture.
         """
         x1, y1, x2, y2 = window.cells
-        x1, y1 = max(x1, 0), max(y1, 0)
-        x2, y2 = min(x2, self.lattice.columns), min(y2, self.lattice.rows)
+        x1 = max(x1, 0)
+        y1 = max(y1, 0)
+        x2 = min(x2, self.lattice.columns)
+        y2 = min(y2, self.lattice.rows)
         if x1 >= x2 or y1 >= y2:
             return
         unexplored = self.unexplored.numpy()[y1:y2, x1:x2]

@@ -102,7 +102,8 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         self, target: int, likely: float, forgetting: Forgetting | None = None, prior: Prior | None = None
     ) -> None:
         super().__init__(forgetting, prior)
-        self.target, self.likely = target, likely
+        self.target = target
+        self.likely = likely
         self._next = 0
 
     _look: SearchLook

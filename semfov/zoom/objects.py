@@ -115,7 +115,8 @@ def _fused(index: Tensor, detected: DetectedBoxes) -> Tensor:
     and the magnifications m; index `(M,)` → `(M, 4)`.
     """
     overlaps = Overlaps.among(detected.boxes.float().numpy())
-    first, second = overlaps.first, overlaps.second
+    first = overlaps.first
+    second = overlaps.second
     chosen = index.numpy()
     labels = detected.labels.numpy()
     is_whole = ~detected.cut.numpy()

@@ -42,7 +42,8 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
     maps = torch.stack([best, (best > 0).to(best), (best > _CLEAR).to(best)])
     by_span: dict[int, tuple[Tensor, Tensor]] = {}
     top = scores
-    height, width = 1, 1  # of the windows that `top` is pooled over
+    height = 1  # of the windows that `top` is pooled over
+    width = 1
     for span in sorted(spans):
         # The peaks of each size are taken over those of the next smaller one.
         top = _slide(top, 0, min(span, rows), height)
