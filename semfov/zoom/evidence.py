@@ -39,9 +39,11 @@ CASE = 10
 _LARGEST = 1e6
 _SUMMARY = 3  # numbers that summarise the hints in a window (`semfov.zoom.pooling`)
 
-# Inputs and hidden units of the networks.
-_SHAPE, _SHAPE_WIDTH = 7, 24
-_RATE, _RATE_WIDTH = 14, 32
+# Inputs and hidden units of the networks g, λ and j.
+_SHAPE = 7
+_SHAPE_WIDTH = 24
+_RATE = 14
+_RATE_WIDTH = 32
 _JUDGE_WIDTH = 16
 
 

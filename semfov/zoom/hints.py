@@ -65,7 +65,7 @@ class Gist:
         level, column, row = action
         cells = _GistCells.of_window(lattice, level, column, row)
         hint_boxes = hints.boxes.float().numpy()
-        detection_boxes, labels = _sure_detections(detections)
+        detection_boxes, labels = _found_objects(detections)
         # One call for the cells of both: most of its time does not depend on the number of boxes.
         numbers = cells.numbers_of(np.concatenate([hint_boxes, detection_boxes]))
         hint_cells = numbers[: len(hint_boxes)]
@@ -139,12 +139,12 @@ class _GistCells(NamedTuple):
         return down * columns + across
 
 
-def _sure_detections(detections: Detections) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def _found_objects(detections: Detections) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Take the boxes `(M, 4)` of detections that count as found objects, and their classes from 0 `(M,)`."""
     scores = detections.scores[0, :, 1:].detach().float().numpy()
-    sure = np.flatnonzero(scores.max(1, initial=0) >= DETECTION_SCORE)
-    boxes = detections.boxes[0].detach().float().numpy()[sure]
-    return boxes, scores[sure].argmax(1)
+    rows = np.flatnonzero(scores.max(1, initial=0) >= DETECTION_SCORE)
+    boxes = detections.boxes[0].detach().float().numpy()[rows]
+    return boxes, scores[rows].argmax(1)
 
 
 def _log_sides(boxes: NDArray[np.float32], magnification: float) -> NDArray[np.float32]:

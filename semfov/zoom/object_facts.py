@@ -19,7 +19,8 @@ from semfov.zoom.certainty import FACTS
 SAME = 0.5  # intersection over union from which on two boxes are the same object
 
 _PART = 0.8  # share of the area of a cut box from which on it shows the object that it lies in
-_LEAST, _MOST = 0.01, 0.999  # scores beyond are counted as these
+_LEAST = 0.01  # scores below, and above the next one, count as these
+_MOST = 0.999
 _SMALLEST = 6.0  # side in canvas pixels from which on a look should show an object
 _EDGE = 2.0  # canvas pixels from the border of a window within which it may cut an object
 _USUAL_AGREEMENT = 0.6  # about the mean overlap of other boxes with that of an object, where there are any
@@ -87,13 +88,20 @@ class Overlaps(NamedTuple):
         """
         x1, y1, x2, y2 = np.ascontiguousarray(boxes.T)
         order = x1.argsort(kind="stable")
-        one, other = neighbours(x1[order], x2[order])
-        one, other = order[one], order[other]
-        shared = intersection(x1, y1, x2, y2, one, other)
+        ranks = neighbours(x1[order], x2[order])  # pairs that overlap from left to right
+        first = order[ranks[0]]
+        second = order[ranks[1]]
+        shared = intersection(x1, y1, x2, y2, first, second)
         meets = shared > 0
-        one, other, shared = one[meets], other[meets], shared[meets]
-        area = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)
-        return cls(np.concatenate([one, other]), np.concatenate([other, one]), np.concatenate([shared, shared]), area)
+        first = first[meets]
+        second = second[meets]
+        shared = shared[meets]
+        return cls(
+            first=np.concatenate([first, second]),
+            second=np.concatenate([second, first]),
+            shared=np.concatenate([shared, shared]),
+            area=np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0),
+        )
 
     @property
     def union(self) -> _Floats:
@@ -146,7 +154,8 @@ def object_facts(
     chosen = index.numpy()
 
     overlaps = Overlaps.among(boxes)
-    first, second = overlaps.first, overlaps.second
+    first = overlaps.first
+    second = overlaps.second
     iou = overlaps.iou()
     object_of = object_of_box(chosen, len(boxes))
     of_object = object_of[first]  # the object of the first box of each pair, or -1
@@ -232,8 +241,9 @@ def _better_neighbours(
     one = object_of[overlaps.first[pair]]
     other = object_of[overlaps.second[pair]]
     is_worse = (best[other] > best[one]) | ((best[other] == best[one]) & (other < one))
-    pair, one, other = pair[is_worse], one[is_worse], other[is_worse]
-    weight = 1 / (1 + np.exp(-best[other]))
+    pair = pair[is_worse]
+    worse = one[is_worse]
+    weight = 1 / (1 + np.exp(-best[other[is_worse]]))
     alike = same_class[pair]
     overlap = iou[pair] * weight
     inside = overlaps.share_of(overlaps.first)[pair] * weight
@@ -241,13 +251,14 @@ def _better_neighbours(
 
     def largest(values: _Floats, among: _Flags) -> _Floats:
         measure = np.zeros(len(best), np.float32)
-        np.maximum.at(measure, one[among], values[among])
+        np.maximum.at(measure, worse[among], values[among])
         return measure
 
     return largest(overlap, alike), largest(inside, alike), largest(around, alike), largest(overlap, ~alike)
 
 
 def _logit(scores: _Floats) -> _Floats:
+    """Compute the log odds of scores."""
     inside = np.clip(scores, _LEAST, _MOST)
     return np.log(inside / (1 - inside))
 
