@@ -32,7 +32,7 @@ class Range:
     noun: str | None = None
 
     def __repr__(self) -> str:
-        """The range in words, such as `from 1 to 100`."""
+        """Write the range in words, such as `from 1 to 100`."""
         if self.above is not None and self.below is not None:
             return f"above {self.above:g} and below {self.below:g}"
         return interval(self.low, self.high, -math.inf if self.above is None else self.above).removeprefix("numbers ")

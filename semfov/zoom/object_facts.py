@@ -279,9 +279,12 @@ def _should_show(
         `(M, N)`, and the logarithms (base 2) of the sides of the boxes, `(M,)`.
     """
     side = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(1)
+    first_edges = windows[:, :2]
+    last_edges = windows[:, 2:]
+    margin = _EDGE / scale[:, None]
     # The border of the picture cuts no object.
-    low = np.where(windows[:, :2] > 0, windows[:, :2] + _EDGE / scale[:, None], -np.inf)
-    high = np.where(windows[:, 2:] < np.array(size) - 0.5, windows[:, 2:] - _EDGE / scale[:, None], np.inf)
+    low = np.where(first_edges > 0, first_edges + margin, -np.inf)
+    high = np.where(last_edges < np.array(size) - 0.5, last_edges - margin, np.inf)
     inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
     visible = inside & (side[:, None] + np.log2(scale) >= math.log2(_SMALLEST))
     if latest:

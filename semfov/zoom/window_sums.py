@@ -75,9 +75,11 @@ class WindowSums:
         self._span = len(weight)
         self._read_cells = read_cells
         rows, columns = shape
-        self._sums = np.zeros([max(rows - self._span, 0) + 1, max(columns - self._span, 0) + 1], np.float32)
+        down = max(rows - self._span, 0) + 1
+        across = max(columns - self._span, 0) + 1
+        self._sums = np.zeros((down, across), np.float32)
         # Column n holds the weights of a window that starts at cell n. One matrix serves both axes, in part.
-        starts = np.arange(max(self._sums.shape))
+        starts = np.arange(max(down, across))
         self._band = np.zeros((len(starts) + self._span - 1, len(starts)), np.float32)
         self._band[starts + np.arange(self._span)[:, None], starts] = weight[:, None]
         self.changed: CellBox | None = (0, 0, columns, rows)

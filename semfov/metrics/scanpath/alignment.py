@@ -97,20 +97,27 @@ def multimatch(
     i, j = _aligned(_distances(u, v))
     u = u[i]
     v = v[j]
-    turn = np.abs(np.arctan2(u[:, 1], u[:, 0]) - np.arctan2(v[:, 1], v[:, 0]))
+    turn = np.abs(_directions(u) - _directions(v))
     angle = np.minimum(turn, 2 * np.pi - turn)
-    lengths = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
+    shift = np.linalg.norm(u - v, axis=1)
+    stretch = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
+    distance = np.linalg.norm(a[i] - b[j], axis=1)
     duration = float("nan")
     if durations is not None:
         s, t = _checked_durations(durations, len(a), len(b))
         duration = _duration_similarity(s[i], t[j])
     return MultiMatch(
-        shape=max(0.0, 1 - float(np.median(np.linalg.norm(u - v, axis=1))) / (2 * diagonal)),
+        shape=max(0.0, 1 - float(np.median(shift)) / (2 * diagonal)),
         direction=1 - float(np.median(angle)) / np.pi,
-        length=max(0.0, 1 - float(np.median(lengths)) / diagonal),
-        position=max(0.0, 1 - float(np.median(np.linalg.norm(a[i] - b[j], axis=1))) / diagonal),
+        length=max(0.0, 1 - float(np.median(stretch)) / diagonal),
+        position=max(0.0, 1 - float(np.median(distance)) / diagonal),
         duration=duration,
     )
+
+
+def _directions(vectors: _Array) -> _Array:
+    """Compute the directions `(n,)` of vectors `(n, 2)` in radians."""
+    return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
 
 
 def _distances(first: _Array, second: _Array) -> _Array:
@@ -137,6 +144,7 @@ def _duration_similarity(s: _Array, t: _Array) -> float:
 def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Find the rows and columns of the cheapest path through a matrix, from its end to its start."""
     rows, columns = cost.shape
+    # total[i, j] is the least sum of a path through the first i rows and j columns; a border of infinity spares checks.
     total = np.full((rows + 1, columns + 1), np.inf)
     total[0, 0] = 0
     for i in range(rows):

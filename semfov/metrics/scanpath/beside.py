@@ -113,7 +113,7 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
     our_points = ours.resized(size).points
     their_points = [fixations.resized(size).points for fixations in viewed]
     comparison = ScanpathComparison()
-    for name, measure in _measures(size).items():
+    for name, measure in _Measures(size).by_name().items():
         people = _among_people(measure, their_points)
         comparison[name] = BesidePeople(measure(our_points, their_points), people)
     return comparison
@@ -185,63 +185,75 @@ def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], pic
     return viewed
 
 
-def _measures(size: tuple[int, int]) -> dict[str, _Measure]:
-    """List the measures of points against those of several others, in a picture of `(width, height)`, by name."""
-    longer = max(size)
+class _Measures:
+    """Measures of the points of a scanpath against those of several others, in a picture of `(width, height)`."""
 
-    def inside(points: _Points) -> _Points:
-        return points[Fixations("", "", points, size).inside]
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.longer = max(size)
 
-    def words(points: _Points) -> list[int]:
-        return [int(cell) for cell in cell_labels(inside(points), _CELLS, _CELLS, size)]
+    def by_name(self) -> dict[str, _Measure]:
+        """List the measures by name, in the order of the table."""
+        return {
+            **{
+                f"MultiMatch {name}": self._multimatch_of(name) for name in ("shape", "direction", "length", "position")
+            },
+            "sequence score": _averaged(_unless_empty(sequence_score, self._words)),
+            "edit distance": _averaged(_unless_empty(_share_of_edits, self._words)),
+            "ScanMatch": _averaged(_unless_empty(self._scanmatch, self._inside)),
+            "time warping": _averaged(_unless_empty(self._warping, self._inside)),
+            "time delay embedding": _averaged(_unless_empty(self._embedding, self._inside)),
+            "saccade lengths": self._lengths,
+            "saccade directions": self._directions,
+            "NSS": self._in_density(nss),
+            "AUC": self._in_density(auc),
+        }
 
-    def multimatch_of(dimension: str) -> _Measure:
+    def _inside(self, points: _Points) -> _Points:
+        """Select the points inside the picture."""
+        return points[Fixations("", "", points, self.size).inside]
+
+    def _words(self, points: _Points) -> list[int]:
+        """List the cells of the points inside the picture."""
+        return [int(cell) for cell in cell_labels(self._inside(points), _CELLS, _CELLS, self.size)]
+
+    def _multimatch_of(self, dimension: str) -> _Measure:
         def similarity(one: _Points, other: _Points) -> float:
-            return float(getattr(multimatch(one, other, size), dimension))
+            return float(getattr(multimatch(one, other, self.size), dimension))
 
         return _averaged(similarity)
 
-    def edits(one: list[int], other: list[int]) -> float:
-        return edit_distance(one, other) / max(len(one), len(other))
+    def _scanmatch(self, one: _Points, other: _Points) -> float:
+        return scanmatch(one, other, self.size)
 
-    def scanmatch_in(one: _Points, other: _Points) -> float:
-        return scanmatch(one, other, size)
+    def _warping(self, one: _Points, other: _Points) -> float:
+        return dynamic_time_warping(one, other) / self.longer
 
-    def warping(one: _Points, other: _Points) -> float:
-        return dynamic_time_warping(one, other) / longer
+    def _embedding(self, one: _Points, other: _Points) -> float:
+        return time_delay_embedding(one, other) / self.longer
 
-    def embedding(one: _Points, other: _Points) -> float:
-        return time_delay_embedding(one, other) / longer
+    def _lengths(self, points: _Points, others: Sequence[_Points]) -> float:
+        return length_distance(saccades([points])[0], saccades(others)[0]) / self.longer
 
-    def lengths(points: _Points, others: Sequence[_Points]) -> float:
-        return length_distance(saccades([points])[0], saccades(others)[0]) / longer
-
-    def directions(points: _Points, others: Sequence[_Points]) -> float:
+    def _directions(self, points: _Points, others: Sequence[_Points]) -> float:
         return direction_distance(saccades([points])[1], saccades(others)[1])
 
-    def in_density(score: Callable[[_Points, _Points, _Points], NDArray[np.float64]]) -> _Measure:
-        """Score fixations in the density of the others."""
+    def _in_density(self, score: Callable[[_Points, _Points, _Points], NDArray[np.float64]]) -> _Measure:
+        """Make a measure that scores fixations in the density of the others."""
+        columns, rows = (max(1, round(side * _LONGEST / self.longer)) for side in self.size)
 
         def measure(points: _Points, others: Sequence[_Points]) -> float:
-            columns, rows = (max(1, round(side * _LONGEST / longer)) for side in size)
-            density = _people_density(np.concatenate([inside(other) for other in others]), size, (rows, columns))
-            x, y = _map_points(inside(points), size, (rows, columns)).T
+            fixated = np.concatenate([self._inside(other) for other in others])
+            density = _people_density(fixated, self.size, (rows, columns))
+            x, y = _map_points(self._inside(points), self.size, (rows, columns)).T
             return _mean(score(density, x, y).tolist())
 
         return measure
 
-    return {
-        **{f"MultiMatch {name}": multimatch_of(name) for name in ("shape", "direction", "length", "position")},
-        "sequence score": _averaged(_unless_empty(sequence_score, words)),
-        "edit distance": _averaged(_unless_empty(edits, words)),
-        "ScanMatch": _averaged(_unless_empty(scanmatch_in, inside)),
-        "time warping": _averaged(_unless_empty(warping, inside)),
-        "time delay embedding": _averaged(_unless_empty(embedding, inside)),
-        "saccade lengths": lengths,
-        "saccade directions": directions,
-        "NSS": in_density(nss),
-        "AUC": in_density(auc),
-    }
+
+def _share_of_edits(one: list[int], other: list[int]) -> float:
+    """Divide the edit distance by the length of the longer sequence."""
+    return edit_distance(one, other) / max(len(one), len(other))
 
 
 def _averaged(score: Callable[[_Points, _Points], float]) -> _Measure:

@@ -173,8 +173,10 @@ def kullback_leibler(people: ArrayLike, model: ArrayLike) -> _Array:
     0.693
     """
     q, p = _densities(people, model)
+    # Where q is 0 the term is 0, whatever p is, though its logarithms are infinite.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(q > 0, q * (np.log(q) - np.log(p)), 0.0).sum(-1))
+        terms = np.where(q > 0, q * (np.log(q) - np.log(p)), 0.0)
+    return np.asarray(terms.sum(-1))
 
 
 def _pair(first: ArrayLike, second: ArrayLike) -> tuple[_Array, _Array]:
@@ -251,7 +253,7 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     array([0.875])
     """
     values, fixated = _looked_up(maps, x, y)
-    ascending = np.sort(values.reshape(-1, values.shape[-1] * values.shape[-2]), axis=-1)
+    ascending = np.sort(values.reshape(-1, _pixel_count(values)), axis=-1)
     by_map = fixated.reshape(len(ascending), -1)
     areas = [_share_below(pixels, scores) for pixels, scores in zip(ascending, by_map, strict=True)]
     return np.reshape(areas, fixated.shape)
@@ -288,7 +290,7 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     is_usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
     check(is_usable, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
-    uniform = floor / (values.shape[-1] * values.shape[-2])
+    uniform = floor / _pixel_count(values)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log((1 - floor) * values / total + uniform))
 
@@ -320,7 +322,7 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     is_normal = bool((np.isfinite(values.max((-1, -2))) & (error <= _ROUNDING)).all())
     got = f"exponentials with sum {totals.flat[error.argmax()]:g}; log_density makes them of maps"
     check(is_normal, "density", "natural logarithms of densities, whose exponentials have sum 1", got)
-    return np.asarray((fixated + np.log(values.shape[-1] * values.shape[-2])) / np.log(2))
+    return np.asarray((fixated + np.log(_pixel_count(values))) / np.log(2))
 
 
 def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
@@ -348,6 +350,12 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
     size = density.shape[-2:]
     check(size == baseline.shape[-2:], "baseline", f"densities over {size} pixels, as `density`", baseline.shape[-2:])
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
+
+
+def _pixel_count(maps: _Array) -> int:
+    """Count the pixels of a map; maps `(..., H, W)`."""
+    height, width = maps.shape[-2:]
+    return height * width
 
 
 def _as_maps(maps: ArrayLike) -> _Array:
