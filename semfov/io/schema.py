@@ -190,7 +190,7 @@ class Object(Json):
 
     def check(self, name: str, value: object, sizes: _Sizes) -> None:
         check(isinstance(value, Mapping), name, "an object", excerpt(value))
-        values = cast(Mapping[str, Any], value)
+        values = cast(Mapping[str, object], value)
         for key in self.required:
             check(key in values, f"{name}.{key}", "a value", "nothing")
         for key, item in values.items():
@@ -230,7 +230,7 @@ class Schema:
     tensors: Mapping[str, Field]
     record: Mapping[str, Json] = field(default_factory=dict)
 
-    def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> None:
+    def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, object] | None = None) -> None:
         """Check that tensors and record meet the requirements.
 
         Args:

@@ -21,7 +21,7 @@ _KEY = "semfov"
 _CHECKSUM = "sha256"
 
 
-def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
+def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, object]) -> None:
     """Write tensors and a record to a file atomically; the same content gives the same bytes.
 
     Args:
@@ -81,7 +81,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     return tensors, record
 
 
-def check_version(path: str | PathLike[str], record: Mapping[str, Any]) -> None:
+def check_version(path: str | PathLike[str], record: Mapping[str, object]) -> None:
     """Refuse a file of a later version; that of a correction (its third number) has the same form.
 
     Args:
@@ -101,7 +101,7 @@ def _form(version: str) -> list[int]:
     return [int(number) for number in re.findall(r"\d{1,9}", version)[:2]]
 
 
-def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> str:
+def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, object] | None = None) -> str:
     """Compute a sha256 over the record and over the names, shapes, types and bytes of the tensors.
 
     Args:

@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.errors import InputError, check, values_known
 
 
-def as_numbers(values: Any, argument: str) -> Tensor:
+def as_numbers(values: object, argument: str) -> Tensor:
     """Take numbers of any common type as a tensor of floats.
 
     Args:
@@ -33,7 +33,7 @@ def as_numbers(values: Any, argument: str) -> Tensor:
     return floats
 
 
-def as_outcomes(values: Any, argument: str) -> Tensor:
+def as_outcomes(values: object, argument: str) -> Tensor:
     """Take outcomes of any common type as booleans.
 
     Args:
@@ -96,7 +96,7 @@ def _plain(label: Any) -> Hashable:
     return value
 
 
-def _as_tensor(values: Any, argument: str) -> Tensor:
+def _as_tensor(values: object, argument: str) -> Tensor:
     """Take values of any common type as a dense tensor."""
     if isinstance(values, Tensor):
         return values.to_dense() if values.layout != torch.strided else values

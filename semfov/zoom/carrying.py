@@ -74,9 +74,10 @@ def _carried_window(window: Window, motion: Motion, lattice: Lattice) -> Window:
     region = torch.tensor(window.region(lattice), dtype=torch.float64)
     centre = (region[:2] + region[2:]) / 2
     scale = float(motion.scale_at(centre))
-    x1, y1, x2, y2 = box = motion.boxes(region).tolist()
+    x1, y1, x2, y2 = motion.boxes(region).tolist()
     fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, window.fixation[2] / scale
-    return Window(fixation, window.level, nearest_cells(lattice, box), (x1, y1, x2, y2))
+    box = x1, y1, x2, y2
+    return Window(fixation, window.level, nearest_cells(lattice, box), box)
 
 
 def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:

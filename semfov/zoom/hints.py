@@ -75,13 +75,13 @@ class Gist:
         kinds = scores.shape[-1]
         confidence = scores.amax(-1)
         place = torch.from_numpy(hint_cells)
-        strongest = scores.new_zeros(cells.count, kinds)
+        strongest = scores.new_zeros(cells.total, kinds)
         strongest.scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
-        top = confidence.new_zeros(cells.count).scatter_reduce_(0, place, confidence, "amax")
+        top = confidence.new_zeros(cells.total).scatter_reduce_(0, place, confidence, "amax")
         leads = np.flatnonzero(confidence.numpy() == top.numpy()[hint_cells])
-        size = np.zeros(cells.count, np.float32)
+        size = np.zeros(cells.total, np.float32)
         size[hint_cells[leads]] = _log_sides(hint_boxes[leads], lattice.magnifications[level])
-        found = np.zeros((cells.count, kinds), np.bool_)
+        found = np.zeros((cells.total, kinds), np.bool_)
         found[detection_cells, labels] = True
         return Gist(
             level,
@@ -124,7 +124,7 @@ class _GistCells(NamedTuple):
         return cls(scale, (rows, columns), (column * width, row * height), (width * scale, height * scale))
 
     @property
-    def count(self) -> int:
+    def total(self) -> int:
         """Number of cells."""
         rows, columns = self.shape
         return rows * columns

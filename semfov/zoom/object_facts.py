@@ -113,7 +113,7 @@ class Overlaps(NamedTuple):
         union = self.union
         return np.divide(self.shared, union, out=np.zeros_like(self.shared), where=union > 0)
 
-    def share_of(self, box: _Indices) -> _Floats:
+    def share_of(self, box: _Indices) -> NDArray[np.floating]:
         """Compute the share of one of the two boxes that lies in the other; box and result `(P,)`."""
         return self.shared / np.maximum(self.area[box], 1e-6)
 
@@ -249,7 +249,7 @@ def _better_neighbours(
     inside = overlaps.share_of(overlaps.first)[pair] * weight
     around = overlaps.share_of(overlaps.second)[pair] * weight
 
-    def largest(values: _Floats, among: _Flags) -> _Floats:
+    def largest(values: NDArray[np.floating], among: _Flags) -> _Floats:
         measure = np.zeros(len(best), np.float32)
         np.maximum.at(measure, worse[among], values[among])
         return measure

@@ -120,7 +120,7 @@ def _directions(vectors: _Array) -> _Array:
     return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
 
 
-def _distances(first: _Array, second: _Array) -> _Array:
+def _distances(first: NDArray[np.number], second: NDArray[np.number]) -> _Array:
     """Compute the distances of all pairs of vectors; first `(n, d)`, second `(m, d)` → `(n, m)`."""
     return np.asarray(np.linalg.norm(first[:, None] - second[None], axis=-1))
 

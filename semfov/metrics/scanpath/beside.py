@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence, Sized
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +114,8 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
     their_points = [fixations.resized(size).points for fixations in viewed]
     comparison = ScanpathComparison()
     for name, measure in _Measures(size).by_name().items():
-        people = _among_people(measure, their_points)
-        comparison[name] = BesidePeople(measure(our_points, their_points), people)
+        of_people = _among_people(measure, their_points)
+        comparison[name] = BesidePeople(measure(our_points, their_points), of_people)
     return comparison
 
 
@@ -172,8 +172,9 @@ def _fixations_in_file(path: str | PathLike[str], picture: str | None) -> list[F
 
 def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], picture: str | None) -> list[Fixations]:
     """Take fixations and records as fixations; a record without a source is of the same picture as the others."""
-    is_one = isinstance(people, Fixations | Record) or not isinstance(people, Iterable)
-    entries = [people] if is_one else [*people]
+    # What is no sequence is one entry; one that is neither fixations nor a record is refused below.
+    is_sequence = isinstance(people, Iterable) and not isinstance(people, Fixations | Record)
+    entries = [*cast(Iterable[Fixations | Record], people)] if is_sequence else [cast(Fixations | Record, people)]
     recorded = (entry.picture for entry in entries if isinstance(entry, Fixations))
     name = picture or next(recorded, "")
     viewed = []
