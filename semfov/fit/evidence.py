@@ -112,7 +112,7 @@ def _examples_of_scene(run: Looking, config: FitSearchConfig, index: int) -> lis
         return []
     covered = grid.footprint(annotation.boxes)
     detections = run.detections(index)
-    rows = []
+    rows: list[tuple[Tensor, ...]] = []
     for target in targets:
         goal = covered[annotation.labels == target].any(0)
         if goal.all():  # every fixation would find it

@@ -1,9 +1,9 @@
 """The part of a model folder that guides searches: target evidence, compared with raw scores."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -35,8 +35,12 @@ _MOST_ABSENT = 20  # and at most so many of them in a photograph
 _FEW_ALARMS = 10  # with fewer expected false alarms, one of them would push the threshold up
 _RAW_CONFIRM = 0.5  # score from which on agents without fitted models find the target in the fixated cell
 
-_Rule = Callable[[Step, int, Grid], Tensor]
-"""Decides after a step which searches for a target end: numbers of their outcomes, 0 for those that go on."""
+
+class _Rule(Protocol):
+    """What decides which searches for a target end with a step."""
+
+    def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
+        """Return the numbers of their outcomes, 0 for those that go on."""
 
 
 class _Decision(NamedTuple):
@@ -165,7 +169,7 @@ class EvidenceFit(PartFit):
                 looks = StoredLooks(detections, grid, torch.tensor([search.target]))
                 present = bool((labels == search.target).any())
                 for name, (strategy, rule) in ways.items():
-                    ends = partial(rule, target=search.target, grid=grid)  # type: ignore[call-arg]
+                    ends = partial(rule, target=search.target, grid=grid)
                     with torch.inference_mode():
                         steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
                         outcome = OUTCOMES[int(ends(steps[-1]))]
