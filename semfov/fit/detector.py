@@ -134,6 +134,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     started = time.monotonic()
     print("opening the photographs …", flush=True)
     run = Looking(replace(config, out=config.out / "progress"))
+    # Before hours of looks: a photograph that cannot be read ends the fit now.
     unseen = _check_photographs(run)
     folder = FolderFit(config, run)
     counts = class_counts(run, range(len(run.scenes)))

@@ -118,6 +118,7 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
 
 def _check_pictures(config: GazeModelFit, groups: Sequence[Viewed]) -> None:
     """Check that each data set has pictures for all folds."""
+    # The pictures of a data set are in a group for each of their sizes.
     counts = [0] * len(config.fixations)
     for group in groups:
         counts[group.source] += len(group)

@@ -69,6 +69,7 @@ class PartInputs:
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.run = run
+        # Few photographs leave fewer to learn from, in fewer steps, and still some to compare on.
         share = min(len(run.scenes) / _MANY, 1)
         self.config = replace(
             config,
@@ -78,7 +79,7 @@ class PartInputs:
         )
         self.components = len(run.scenes.classes) + 1
         self.absent = 2 if self.components <= _FEW else None
-        shifts = min(_MOST_SHIFTS, self.config.columns * self.config.rows - 1)
+        shifts = min(_MOST_SHIFTS, self.config.columns * self.config.rows - 1)  # until all cells are fixated
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
         self.compared_at = min(5, shifts)
         self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]

@@ -172,7 +172,7 @@ def _look_at(
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
     for number, index in enumerate(track(looked, "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
-        source = StoredWindowLooks(eye, pictures, index, None)
+        source = StoredWindowLooks(eye, pictures, index, None)  # in memory alone: files of looks lack its hints
         with torch.inference_mode():
             looks = source.see([Window.overview(source.lattice), *usual_slices(source.lattice)])
         overview = looks[0]

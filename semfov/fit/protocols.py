@@ -65,6 +65,7 @@ def episodes_of(
     covered = Grid(columns, rows, annotation.size).footprint(annotation.boxes)
     targets = scenes.targets(index) if targets is None else targets
     counts = torch.bincount(labels, minlength=1)
+    # Of classes with as many objects the first one counts as the commonest.
     commonest = max(targets, key=lambda target: (int(counts[target]), -target)) if targets else None
     episodes = []
     for target in targets:
@@ -73,6 +74,7 @@ def episodes_of(
             draw = generator_for("goal", protocol.seed, scenes.ids[index], target)
             goal = goal[torch.randperm(len(goal), generator=draw)]
         cue = _wrong_class(scenes, index, target, protocol.seed) if protocol.control == "wrong-class" else target
+        # A search starts beside its target, so that a target in every cell has none.
         free = (~goal).nonzero()[:, 0]
         if not len(free) or not goal.any():
             continue
@@ -124,6 +126,7 @@ def choose_classes(
     generator = generator_for("classes", seed, scenes.ids[index])
     legal = legal_targets(annotation, max_area)
     present = [legal[place] for place in torch.randperm(len(legal), generator=generator)[:classes].tolist()]
+    # Of all classes, not only of those that may be searched for: a class that is too large is there, too.
     held = set(annotation.labels.tolist())
     others = [target for target in range(1, len(scenes.classes) + 1) if target not in held]
     count = len(present) if absent is None else absent

@@ -56,6 +56,7 @@ class Samples:
             Their detections, a batch of n, and their fixations `(n, 2)`.
         """
         numbers = (self.scenes == index).nonzero()[:, 0]
+        # Detections are in the order of their looks.
         firsts = torch.searchsorted(self.look, numbers).tolist()
         ends = torch.searchsorted(self.look, numbers + 1).tolist()
         looks = []

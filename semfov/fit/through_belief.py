@@ -176,7 +176,7 @@ def fit_through_belief(
     if not searches:
         raise DataError("data: expected a photograph with a class to search for, got none; raise max_target_area")
     trained = starting_model(model).eval()
-    trained.log_alpha.requires_grad_(False)
+    trained.log_alpha.requires_grad_(False)  # stays as it was fitted to single detections
     assert trained.log_miss is not None
     for table in (trained.log_prior, trained.log_miss):
         table.register_hook(_same_for_all_classes)
@@ -196,7 +196,7 @@ def fit_through_belief(
     parameters = [trained.log_exponents, trained.log_prior, trained.log_miss, trained.refutation]
     descend(parameters, loss_of, steps, rate, decay=0.0, clip=None, title="fitting through the belief")
     with torch.no_grad():
-        trained.refutation.clamp_(0, 1)
+        trained.refutation.clamp_(0, 1)  # a share, which the steps do not know
     trained.metadata |= {"method": "search", **metadata}
     return trained.requires_grad_(True)
 

@@ -58,6 +58,7 @@ class VerificationFit(PartFit):
         """Draw searches of the held-out photographs, with spare ones for the choice of the threshold."""
         run = self.run
         judged = self.inputs.judged
+        # A threshold with few false alarms needs many searches without the target.
         spare = min(_MOST_ABSENT, _ABSENT // len(judged))
         photographs = open_photographs(run.eye, run.scenes, judged, self.settings, spare=spare, store=run.store)
         if len(photographs) < 2:

@@ -260,6 +260,7 @@ def _grouped(looks: Iterable[_ViewedPicture], seconds: float = _SECONDS, source:
     by_size: dict[tuple[Placement, tuple[int, int]], list[_ViewedPicture]] = {}
     with torch.inference_mode():
         for features, people in looks:
+            # Fixations may be in pixels of another frame than the picture's.
             size = features.placement.size
             scanpaths = tuple(scanpath.resized(size) for scanpath in people)
             by_size.setdefault((features.placement, features.canvas), []).append((features, scanpaths))
@@ -290,6 +291,7 @@ class Events(NamedTuple):
         """Make the events of a picture of `(height, width)` with cells `(rows, columns)`."""
         before = [torch.zeros(0, LONGEST - 1, 2)]
         for path in paths:
+            # The fixations before each one are a window of the path, padded at its beginning.
             padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
             before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
         points = torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)])
@@ -317,6 +319,7 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
     for group, numbers in zip(groups, pictures, strict=True):
         if len(numbers):
             counts = group.counts[torch.as_tensor(numbers)].sum(0)
+            # Pictures of all sizes have their fixations on the same cells.
             resized = F.interpolate(counts[None, None], total.shape, mode="bilinear")[0, 0]
             smooth = blurred(resized, torch.tensor(blur))
             total += smooth / smooth.sum()

@@ -116,6 +116,7 @@ class MosaicFit:
             The looks by kind, of pictures with closer looks.
         """
         tasks = [(kind, index) for kind in dict.fromkeys(kinds) for index in range(len(self.pictures[kind]))]
+        # Workers store their looks themselves, unless they are on another machine.
         done = run_tasks(
             _look,
             tasks,
@@ -161,6 +162,7 @@ class MosaicFit:
     def fit_survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> None:
         """Fit the numbers of objects of any class that closer looks find; examples by kind."""
         self._seed()
+        # A new one, since a fit may be repeated with a model that has one.
         survey = Survey(model.classes, foresight=model.survey.foresight)
         training = [SurveyExample.of(example) for kind in ("near", "far", "crowded") for example in examples[kind]]
         fit_survey(survey, training, self.config.survey_steps)

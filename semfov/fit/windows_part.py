@@ -153,6 +153,7 @@ def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str
 def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
     """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
     examples = fit.look(("near", "far", "crowded", "judged"))
+    # Each step uses the parts before it.
     model = fit.fit_prediction(examples)
     fit.fit_survey(model, examples)
     report, _ = judge_windows(model, examples["judged"])
@@ -160,6 +161,7 @@ def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
     shipped = [
         GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
     ]
+    # Few photographs: the fits of closer looks stay near the mean of the models shipped for other detectors.
     of_windows = [other.verification for other in shipped if other.verification is not None]
     lines += fit.fit_verification(model, mean_of(of_windows))
     lines += fit.fit_certainty(model)
@@ -187,6 +189,7 @@ def _photograph_recalls(
         history: list[WindowLook] = []
         steps = _steps(source, model)
         for number in range(passes):
+            # When no window is left, recall stays the same.
             step = next(steps, None)
             if step is not None:
                 history.append(step.look)
