@@ -13,27 +13,19 @@ from semfov.io.files import inside, write_text
 from semfov.runs.scene_run import finish
 
 
-class OutSettings(Protocol):
+class OutputSettings(Protocol):
     """Settings of a fit that writes to a folder."""
 
     @property
     def out(self) -> Path:
         """The folder."""
 
-    def yaml(self) -> str:
-        """Write the settings as a file."""
-
-
-class NamedSettings(Protocol):
-    """Settings of a fit that writes a model."""
-
-    @property
-    def out(self) -> Path:
-        """Folder of the model."""
-
     @property
     def name(self) -> str | None:
         """Name of the model; None: that of the detector."""
+
+    def yaml(self) -> str:
+        """Write the settings as a file."""
 
 
 def commit() -> str | None:
@@ -50,12 +42,12 @@ def commit() -> str | None:
         return None
 
 
-def model_path(config: NamedSettings, detector: str) -> Path:
+def model_path(config: OutputSettings, detector: str) -> Path:
     """Return the file of a fitted model in `config.out`, named after the settings' `name` or else the detector."""
     return inside(config.out, f"{config.name or detector}.safetensors")
 
 
-def write_outputs(config: OutSettings, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
+def write_outputs(config: OutputSettings, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
     """Print the report, write it with the settings and the measures to `config.out`, and list the written files.
 
     Args:
